@@ -1,0 +1,1 @@
+"""The estimators, side by side: a file is an estimator, a folder holds parts."""

@@ -1,0 +1,1 @@
+"""Parts of the GTSAM smoothers: keys, factors, robust schedules."""

@@ -1,0 +1,1 @@
+"""Parts of the handwritten filters: beliefs, corrections, gates. Nothing here infers with GTSAM."""

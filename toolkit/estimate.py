@@ -1,0 +1,141 @@
+"""What comes out: the state at one instant, trajectories, landmarks, and everything one run produced."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from toolkit.geometry import Array, IntArray, read_only
+
+Status = Literal["ok", "diverged", "failed"]
+Output = Literal["causal", "final"]
+_NOTHING: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The state at one frame as an estimator knew it.
+
+    ``T_world_imu`` (4, 4); ``v_world`` (3,) m/s and ``bias`` (6,) [accel, gyro] where they are estimated;
+    ``cov`` (d, d) whose first six rows are the pose in GTSAM's order and side (rotation, position, body
+    frame), followed by velocity and biases for d = 15 or by the gyro bias for d = 9. ``info`` holds
+    diagnostics by name; ``nis`` and ``nis_dof`` are understood by the metrics.
+    """
+
+    t_ns: int
+    T_world_imu: Array
+    cov: Array | None = None
+    v_world: Array | None = None
+    bias: Array | None = None
+    info: Mapping[str, float] = _NOTHING
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """States on increasing stamps (N,): poses (N, 4, 4) and, where known, velocities, biases, covariances."""
+
+    t_ns: IntArray
+    T_world_imu: Array
+    v_world: Array | None = None
+    bias: Array | None = None
+    cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "t_ns", read_only(self.t_ns, np.int64))
+        for name in ("T_world_imu", "v_world", "bias", "cov"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __len__(self) -> int:
+        return self.t_ns.size
+
+    @property
+    def positions(self) -> Array:
+        """Positions of the IMU in the world (N, 3) m."""
+        return self.T_world_imu[:, :3, 3]
+
+    @classmethod
+    def of(cls, estimates: "list[Estimate]") -> "Trajectory":
+        """Stack estimates; a field that some of them lack is left out."""
+
+        def stacked(name: str) -> Array | None:
+            values = [getattr(e, name) for e in estimates]
+            return None if not values or any(v is None for v in values) else np.stack(values)
+
+        poses = stacked("T_world_imu")
+        return cls(
+            np.array([e.t_ns for e in estimates], dtype=np.int64),
+            np.empty((0, 4, 4)) if poses is None else poses,
+            stacked("v_world"),
+            stacked("bias"),
+            stacked("cov"),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Landmarks by track: ids (N,) ascending, positions in the world (N, 3) m, covariances (N, 3, 3) or None."""
+
+    track_ids: IntArray
+    points_world: Array
+    cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "track_ids", read_only(self.track_ids, np.int64))
+        object.__setattr__(self, "points_world", read_only(self.points_world))
+
+    def __len__(self) -> int:
+        return self.track_ids.size
+
+    @classmethod
+    def none(cls) -> "Landmarks":
+        """Return a map without landmarks."""
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """What an estimator says when it has seen everything.
+
+    ``converged`` is False where a solve did not converge; ``log`` tells what was recovered on the way and how.
+    """
+
+    trajectory: Trajectory
+    landmarks: Landmarks
+    converged: bool = True
+    log: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Timings:
+    """Seconds of wall clock per step (K,), of the finish and of all, seconds of CPU, peak memory in MB."""
+
+    step_s: Array
+    finish_s: float
+    total_s: float
+    cpu_s: float
+    peak_rss_mb: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One estimator on one sequence: both kinds of output, the map, diagnostics per step, cost and status.
+
+    ``causal`` is what was known at each frame and is None for an estimator that answers only at the end.
+    ``info`` holds the diagnostics of the causal estimates by name, each (N,), NaN where one was not given.
+    """
+
+    estimator: str
+    status: Status
+    causal: Trajectory | None
+    final: Trajectory | None
+    landmarks: Landmarks
+    timings: Timings
+    info: Mapping[str, Array] = field(default_factory=dict)
+    log: tuple[str, ...] = ()
+
+    def trajectory(self, output: Output) -> Trajectory | None:
+        """Return the trajectory of one kind of output."""
+        return self.causal if output == "causal" else self.final

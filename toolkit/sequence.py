@@ -1,0 +1,387 @@
+"""What comes in: one recording as immutable values, and the packets every estimator reads from it.
+
+Observations are sparse, one row a sighting. Motion samples are cut at the frame times once, in
+:meth:`Sequence.packets`, so that every estimator integrates the same interval; one track in ten is withheld
+from all of them and serves the held-out reprojection error.
+"""
+
+import hashlib
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Literal, Self
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray, read_only
+
+NS_PER_S = 1_000_000_000
+GRAVITY_WORLD = (0.0, 0.0, -9.81)
+HELD_OUT_ONE_IN = 10
+
+Pairing = Literal["start", "end", "mean"]
+
+
+def _freeze(value: object, **shapes: tuple[int | None, ...]) -> None:
+    """Make the named array fields of a frozen dataclass read-only and check their shapes (None = any)."""
+    for name, shape in shapes.items():
+        given = getattr(value, name)
+        if given is None:
+            continue
+        integer = name.endswith(("_ns", "_id", "_ids", "frame"))
+        array = read_only(given, np.int64 if integer else np.float64)
+        matches = array.ndim == len(shape) and all(w in (None, s) for s, w in zip(array.shape, shape, strict=True))
+        if not matches:
+            wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
+            raise DataError(f"{type(value).__name__}.{name} has shape {array.shape}, expected {wanted}")
+        object.__setattr__(value, name, array)
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """A rectified stereo pair fixed to the IMU; one measurement is (uL, uR, v) in pixels.
+
+    ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
+    ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
+    variance is half of theirs.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    T_imu_cam: Array
+    cov_uv_px2: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class TwistNoise:
+    """Continuous white-noise densities of a measured body twist, per axis (3,), and of the gyro bias' walk.
+
+    Units: m/s/sqrt(Hz), rad/s/sqrt(Hz), rad/s^2/sqrt(Hz).
+    """
+
+    velocity_noise_density: Array
+    gyro_noise_density: Array
+    gyro_random_walk: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous noise densities of an IMU, with Kalibr's names.
+
+    Units: m/s^2/sqrt(Hz), rad/s/sqrt(Hz), m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz).
+    """
+
+    accel_noise_density: float
+    gyro_noise_density: float
+    accel_random_walk: float
+    gyro_random_walk: float
+
+
+MotionNoise = TwistNoise | ImuNoise
+
+
+@dataclass(frozen=True, eq=False)
+class TwistSamples:
+    """Measured body twists: stamps (S,), linear velocity (S, 3) m/s, angular velocity (S, 3) rad/s, IMU frame.
+
+    ``pairing`` says which sample describes the motion between two stamps: the one at its start, the one at
+    its end, or the mean of both.
+    """
+
+    t_ns: IntArray
+    v_mps: Array
+    w_radps: Array
+    pairing: Pairing = "start"
+
+    def __post_init__(self) -> None:
+        _freeze(self, t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3))
+
+    @property
+    def values(self) -> Array:
+        """Return the samples side by side (S, 6): linear velocity, angular velocity."""
+        return np.hstack([self.v_mps, self.w_radps])
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame."""
+
+    t_ns: IntArray
+    accel_mps2: Array
+    gyro_radps: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
+
+    @property
+    def values(self) -> Array:
+        """Return the samples side by side (S, 6): specific force, angular velocity."""
+        return np.hstack([self.accel_mps2, self.gyro_radps])
+
+
+MotionSamples = TwistSamples | ImuSamples
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Stereo sightings sorted by frame then track: frame index (N,), track id (N,), (uL, uR, v) (N, 3) px."""
+
+    frame: IntArray
+    track_id: IntArray
+    uv_px: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self, frame=(None,), track_id=(None,), uv_px=(None, 3))
+
+    def __len__(self) -> int:
+        return self.frame.size
+
+    def select(self, rows: BoolArray | IntArray) -> "Observations":
+        """Return the rows of a mask (N,) or the rows of an index (M,), in that order."""
+        return Observations(self.frame[rows], self.track_id[rows], self.uv_px[rows])
+
+    @classmethod
+    def sorted(cls, frame: IntArray, track_id: IntArray, uv_px: Array) -> "Observations":
+        """Build from rows in any order."""
+        order = np.lexsort((track_id, frame))
+        return cls(frame[order], track_id[order], uv_px[order])
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Ground truth on its own stamps (N,): poses (N, 4, 4) and, where known, velocities (N, 3), biases (N, 6).
+
+    ``independent`` is False where the truth and the motion samples come from the same instrument, so that
+    agreement with them proves nothing about consistency.
+    """
+
+    t_ns: IntArray
+    T_world_imu: Array
+    v_world: Array | None = None
+    bias: Array | None = None
+    independent: bool = True
+
+    def __post_init__(self) -> None:
+        _freeze(self, t_ns=(None,), T_world_imu=(None, 4, 4), v_world=(None, 3), bias=(None, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The state every estimator starts from, at the first frame.
+
+    ``bias`` (6,) is [accel, gyro]. ``cov`` (15, 15) is in GTSAM's tangent order and side: rotation and
+    position (both body frame), velocity (body frame), accelerometer bias, gyro bias. ``source`` says where
+    it came from.
+    """
+
+    T_world_imu: Array
+    v_world: Array
+    bias: Array
+    cov: Array
+    source: str
+
+    def __post_init__(self) -> None:
+        _freeze(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
+
+
+@dataclass(frozen=True, eq=False)
+class TwistMotion:
+    """The twists of one interval: durations (n,) s, linear (n, 3) m/s and angular velocity (n, 3) rad/s."""
+
+    dt_s: Array
+    v_mps: Array
+    w_radps: Array
+
+
+@dataclass(frozen=True, eq=False)
+class ImuMotion:
+    """The IMU of one interval: durations (n,) s, mid-interval accel (n, 3) m/s^2 and gyro (n, 3) rad/s."""
+
+    dt_s: Array
+    accel_mps2: Array
+    gyro_radps: Array
+
+
+Motion = TwistMotion | ImuMotion
+
+
+@dataclass(frozen=True, eq=False)
+class StereoFrame:
+    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px."""
+
+    t_ns: int
+    track_ids: IntArray
+    uvs_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Packet:
+    """Everything between two frames plus the frame; ``motion`` is None in the first packet."""
+
+    index: int
+    motion: Motion | None
+    frame: StereoFrame
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a sequence comes from: its format, its source, and facts a reader of any result must know."""
+
+    format: str
+    source: str
+    facts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """One recording: calibration, noise, frame stamps (K,), sightings, motion samples, and truth if there is any.
+
+    A sequence may still carry the faults of its file (see :mod:`toolkit.datasets.audit`); only
+    :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2.
+    """
+
+    name: str
+    rig: StereoRig
+    noise: MotionNoise
+    frames_t_ns: IntArray
+    observations: Observations
+    motion: MotionSamples
+    provenance: Provenance
+    prior: Prior | None = None
+    truth: Truth | None = None
+    gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
+
+    def __post_init__(self) -> None:
+        _freeze(self, frames_t_ns=(None,), gravity_world=(3,))
+        if isinstance(self.motion, TwistSamples) != isinstance(self.noise, TwistNoise):
+            raise DataError(f"{self.name}: the motion noise is not of the kind of the motion samples")
+
+    @property
+    def motion_kind(self) -> Literal["twist", "imu"]:
+        """Return the kind of motion samples the sequence has."""
+        return "twist" if isinstance(self.motion, TwistSamples) else "imu"
+
+    @property
+    def frame_count(self) -> int:
+        """Return the number of frames K."""
+        return self.frames_t_ns.size
+
+    @property
+    def duration_s(self) -> float:
+        """Return the seconds from the first frame to the last."""
+        return float(self.frames_t_ns[-1] - self.frames_t_ns[0]) / NS_PER_S if self.frame_count else 0.0
+
+    @cached_property
+    def held_out(self) -> Observations:
+        """The sightings of the tracks no estimator ever sees."""
+        return self.observations.select(is_held_out(self.observations.track_id))
+
+    @cached_property
+    def visible(self) -> Observations:
+        """The sightings the estimators work on."""
+        return self.observations.select(~is_held_out(self.observations.track_id))
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield one packet a frame, in order of time.
+
+        Raises DataError where time does not increase, a value is not finite, or frames lie outside the
+        motion samples.
+        """
+        check_runnable(self)
+        first_row = np.searchsorted(self.visible.frame, np.arange(self.frame_count + 1))
+        motions = _cut(self.motion, self.frames_t_ns)
+        for k in range(self.frame_count):
+            rows = slice(first_row[k], first_row[k + 1])
+            frame = StereoFrame(int(self.frames_t_ns[k]), self.visible.track_id[rows], self.visible.uv_px[rows])
+            yield Packet(k, next(motions) if k else None, frame)
+
+    def truncated(self, max_frames: int) -> Self:
+        """Return the first frames of the sequence only; the motion samples stay whole."""
+        if max_frames >= self.frame_count:
+            return self
+        kept = self.observations.select(self.observations.frame < max_frames)
+        return replace(self, frames_t_ns=self.frames_t_ns[:max_frames], observations=kept)
+
+    def content_hash(self) -> str:
+        """Return a SHA-256 over everything an estimator can see and the truth it is scored on."""
+        digest = hashlib.sha256()
+        parts = (self.rig, self.noise, self.observations, self.motion, self.truth, self.prior)
+        for part in (self.frames_t_ns, self.gravity_world, *parts):
+            _feed(digest, part)
+        return digest.hexdigest()
+
+
+def _feed(digest: "hashlib._Hash", value: object) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(str(value.shape).encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif hasattr(value, "__dataclass_fields__"):
+        for f in fields(value):  # type: ignore[arg-type]
+            _feed(digest, getattr(value, f.name))
+    else:
+        digest.update(repr(value).encode())
+
+
+def is_held_out(track_ids: IntArray) -> BoolArray:
+    """Say for each track id (N,) whether it is withheld: one in ten, by a fixed multiplicative hash."""
+    mixed = track_ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    return np.asarray((mixed >> np.uint64(33)) % np.uint64(HELD_OUT_ONE_IN) == 0)
+
+
+def check_runnable(sequence: Sequence) -> None:
+    """Raise DataError unless time increases, values are finite and the motion samples span the frames."""
+    name, motion = sequence.name, sequence.motion
+    if sequence.frame_count < 2:
+        raise DataError(f"{name}: {sequence.frame_count} frame(s); an estimator needs at least two")
+    for what, t_ns in (("frame", sequence.frames_t_ns), ("motion sample", motion.t_ns)):
+        backwards = np.flatnonzero(np.diff(t_ns) <= 0)
+        if backwards.size:
+            raise DataError(
+                f"{name}: the stamp of {what} {backwards[0] + 1} is not after the one before it; "
+                "sort or drop it, or let the audit repair it"
+            )
+    for what, array in (("motion sample", motion.values), ("observation", sequence.observations.uv_px)):
+        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+        if bad.size:
+            raise DataError(
+                f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it, or let the audit repair it"
+            )
+    first, last = sequence.frames_t_ns[[0, -1]]
+    if motion.t_ns.size == 0 or motion.t_ns[0] > first or motion.t_ns[-1] < last:
+        raise DataError(f"{name}: the motion samples do not span the frames; cut the frames to the motion's time")
+
+
+def _cut(samples: MotionSamples, frames_t_ns: IntArray) -> Iterator[Motion]:
+    """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
+    twist = isinstance(samples, TwistSamples)
+    pairing: Pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
+    inside = samples.t_ns[(samples.t_ns > frames_t_ns[0]) & (samples.t_ns < frames_t_ns[-1])]
+    knots = np.union1d(inside, frames_t_ns)
+    dt_s = np.diff(knots) / NS_PER_S
+    rows = _paired(samples.t_ns, samples.values, knots, pairing)
+    starts = np.searchsorted(knots, frames_t_ns)
+    for begin, end in itertools.pairwise(starts):
+        part = (read_only(dt_s[begin:end]), read_only(rows[begin:end, :3]), read_only(rows[begin:end, 3:]))
+        yield TwistMotion(*part) if twist else ImuMotion(*part)
+
+
+def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing) -> Array:
+    """Return the value (n, 6) that stands for each of the n intervals between knots."""
+    if pairing == "start":
+        return values[np.searchsorted(t_ns, knots[:-1], side="right") - 1]
+    if pairing == "end":
+        return values[np.searchsorted(t_ns, knots[1:], side="left")]
+    relative_s, knots_s = (t_ns - knots[0]) / NS_PER_S, (knots - knots[0]) / NS_PER_S
+    at_knots: Array = np.stack([np.interp(knots_s, relative_s, column) for column in values.T], axis=1)
+    return 0.5 * (at_knots[:-1] + at_knots[1:])
