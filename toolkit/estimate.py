@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -11,7 +10,6 @@ from toolkit.geometry import Array, IntArray, read_only
 
 Status = Literal["ok", "diverged", "failed"]
 Output = Literal["causal", "final"]
-_NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +27,7 @@ class Estimate:
     cov: Array | None = None
     v_world: Array | None = None
     bias: Array | None = None
-    info: Mapping[str, float] = _NOTHING
+    info: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

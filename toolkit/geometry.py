@@ -33,7 +33,7 @@ def _coefficient(angle_squared: Array, first: int, closed_form: Callable[[Array,
     """Evaluate one of the trigonometric coefficients of the exponential map at any angle."""
     small = angle_squared < _SMALL_ANGLE_SQUARED
     safe = np.where(small, 1.0, angle_squared)
-    taylor: Array = np.polyval(_cosine_tail(first), np.where(small, angle_squared, 0.0))
+    taylor = np.polyval(_cosine_tail(first), np.where(small, angle_squared, 0.0))
     result: Array = np.where(small, taylor, closed_form(np.sqrt(safe), safe))
     return result
 
@@ -72,7 +72,8 @@ def skew(v: Array) -> Array:
 
 
 def _squared_norm(v: Array) -> Array:
-    return np.einsum("...i,...i->...", v, v)
+    squared: Array = np.einsum("...i,...i->...", v, v)
+    return squared
 
 
 def _spread(x: Array) -> Array:

@@ -10,8 +10,8 @@ TRACKED_PIXEL_SIGMA_PX = 1.0
 # What a noise-free-looking odometer still gets wrong between frames: pairing, wheel slip, lever arm.
 LEAST_VELOCITY_SIGMA_MPS = 0.05
 LEAST_GYRO_SIGMA_RADPS = 0.005
-# Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a MEMS unit: 1e-4 moves it by 1e-3 rad/s in 100 s.
-GYRO_RANDOM_WALK = 1e-4
+# Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: moves it by 2e-4 rad/s in 100 s.
+GYRO_RANDOM_WALK = 2e-5
 
 _MAD_TO_SIGMA = 1.4826
 

@@ -1,0 +1,94 @@
+"""Recordings: one module a source. A file dropped into this package is a new format or a new built-in sequence.
+
+A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both. It imports nothing heavy at its
+top, because all modules are imported to recognise a path. Parts they share live in the sub-package ``parts``.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Protocol, runtime_checkable
+
+from toolkit.errors import DataError
+from toolkit.sequence import Sequence
+
+Maker = Callable[[int], Sequence]
+
+
+@runtime_checkable
+class RecordingFormat(Protocol):
+    """A module that reads one kind of recording; the first line of its docstring is its summary."""
+
+    def recognises(self, path: Path) -> bool:
+        """Say from a glance at the content, never from the name alone, whether the path is of this format.
+
+        A damaged recording of the format should still be recognised: ``load`` then says what is wrong with it.
+        """
+
+    def load(self, path: Path) -> Sequence:
+        """Read the recording, its faults included; raise DataError where it cannot be read at all."""
+
+
+@runtime_checkable
+class BuiltIns(Protocol):
+    """A module whose sequences need no path: name -> maker, which takes a seed (real data ignore it)."""
+
+    BUILT_IN: Mapping[str, Maker]
+
+
+@cache
+def _modules() -> Mapping[str, ModuleType]:
+    """Import every module directly in this package, by the name a user reads."""
+    found = [m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg]
+    return {name.replace("_", "-"): importlib.import_module(f"{__name__}.{name}") for name in found}
+
+
+def _readers() -> dict[str, RecordingFormat]:
+    return {name: module for name, module in _modules().items() if isinstance(module, RecordingFormat)}
+
+
+def formats() -> dict[str, str]:
+    """Return the summary of every format a path can have, by name."""
+    return {name: (_modules()[name].__doc__ or "").partition("\n")[0] for name in _readers()}
+
+
+def built_ins() -> dict[str, Maker]:
+    """Return the maker of every built-in sequence, by name."""
+    offers = [module for module in _modules().values() if isinstance(module, BuiltIns)]
+    return {name: make for offer in offers for name, make in sorted(offer.BUILT_IN.items())}
+
+
+def built_in_names() -> tuple[str, ...]:
+    """Return the names of the sequences that need no path."""
+    return tuple(built_ins())
+
+
+def load_sequence(source: str, seed: int = 0) -> Sequence:
+    """Load a built-in sequence by its name, made with the seed, or a recording by its path.
+
+    Raises DataError where the source is neither, no format recognises it, or it cannot be read.
+    """
+    if source in built_ins():
+        return built_ins()[source](seed)
+    path = Path(source).expanduser()
+    _check_readable(path, source)
+    for reader in _readers().values():
+        if reader.recognises(path):
+            return reader.load(path)
+    raise DataError(f"{source}: its content is of no known format; there are {', '.join(formats())}")
+
+
+def _check_readable(path: Path, source: str) -> None:
+    try:
+        if path.is_dir():
+            next(path.iterdir(), None)
+        else:
+            path.open("rb").close()
+    except FileNotFoundError as error:
+        names = ", ".join(built_in_names())
+        raise DataError(f"{source}: no such file or directory, and the built-in sequences are {names}") from error
+    except OSError as error:
+        raise DataError(f"{source}: cannot be read ({error.strerror}); check the path and its permissions") from error

@@ -1,0 +1,94 @@
+"""The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that left."""
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from toolkit.estimate import Landmarks
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models import stereo
+from toolkit.sequence import StereoFrame, StereoRig
+
+# A smaller disparity leaves the depth uncertain by more than itself at a pixel of noise: wait for a better view.
+LEAST_DISPARITY_PX = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """The landmarks in the state: ids (M,) ascending, points in the world (M, 3) m, covariances (M, 3, 3)."""
+
+    track_ids: IntArray
+    points: Array
+    covs: Array
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a map without landmarks."""
+        return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+    def __len__(self) -> int:
+        return self.track_ids.size
+
+    def match(self, track_ids: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the rows of the map and of the ids (N,) that belong together."""
+        if not len(self) or not track_ids.size:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        slots = np.minimum(np.searchsorted(self.track_ids, track_ids), len(self) - 1)
+        rows = np.flatnonzero(self.track_ids[slots] == track_ids)
+        return slots[rows], rows
+
+    def select(self, slots: IntArray | BoolArray) -> "LandmarkMap":
+        """Return the landmarks at the given rows, which must keep the ids ascending."""
+        return LandmarkMap(self.track_ids[slots], self.points[slots], self.covs[slots])
+
+    def merged(self, other: "LandmarkMap") -> "LandmarkMap":
+        """Return both maps in one; they must not share an id."""
+        ids = np.concatenate([self.track_ids, other.track_ids])
+        order = np.argsort(ids)
+        points, covs = np.concatenate([self.points, other.points]), np.concatenate([self.covs, other.covs])
+        return LandmarkMap(ids[order], points[order], covs[order])
+
+    def corrected(self, rows: BoolArray, points: Array, covs: Array) -> "LandmarkMap":
+        """Return the map with new values (M, 3), (M, 3, 3) where the mask (M,) allows it."""
+        return replace(
+            self,
+            points=np.where(rows[:, None], points, self.points),
+            covs=np.where(rows[:, None, None], covs, self.covs),
+        )
+
+
+def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
+    """Start the landmarks of the given rows of a frame where stereo sees them (Kang, eqs. 3-5).
+
+    Their covariance is the measurement's, carried through the triangulation; rows of too little disparity
+    are left for a later frame.
+    """
+    uvs_px = frame.uvs_px[rows]
+    near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
+    ids, uvs_px = frame.track_ids[rows][near], uvs_px[near]
+    points_cam = stereo.triangulate(uvs_px, rig)
+    T_world_cam = T_world_imu @ rig.T_imu_cam
+    d_point_d_uv = T_world_cam[:3, :3] @ np.linalg.inv(stereo.projection_jacobian(points_cam, rig))
+    points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    return LandmarkMap(ids, points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2))
+
+
+@dataclass
+class Archive:
+    """Collects landmarks as they leave the state; the last value of an id wins."""
+
+    _left: list[LandmarkMap] = field(default_factory=list)
+
+    def add(self, landmarks: LandmarkMap) -> None:
+        """Keep what the filter knew of these landmarks when they left."""
+        if len(landmarks):
+            self._left.append(landmarks)
+
+    def with_current(self, landmarks: LandmarkMap) -> Landmarks:
+        """Return every landmark there ever was, the current ones included."""
+        parts = [*self._left, landmarks]
+        ids = np.concatenate([p.track_ids for p in parts])
+        points, covs = np.concatenate([p.points for p in parts]), np.concatenate([p.covs for p in parts])
+        last = ids.size - 1 - np.unique(ids[::-1], return_index=True)[1]
+        return Landmarks(ids[last], points[last], covs[last])

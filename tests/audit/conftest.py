@@ -1,0 +1,172 @@
+"""Short clean recordings of every kind, and the faults that can be planted in them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.geometry import Array, IntArray, se3
+from toolkit.sequence import NS_PER_S, Observations, Sequence, TwistSamples
+from toolkit.simulation import SCENARIOS, simulate
+
+DURATION_S = 30.0
+
+
+@cache
+def clean(scenario: str = "drive", seed: int = 0) -> Sequence:
+    """Return a simulated recording of thirty seconds."""
+    return simulate(replace(SCENARIOS[scenario], duration_s=DURATION_S), seed)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A fault planted on purpose: its name, the recording with it, and the count the audit owes."""
+
+    fault: str
+    planted: Sequence
+    count: int
+
+
+def with_observations(sequence: Sequence, rows: object = slice(None), **columns: Array | IntArray) -> Sequence:
+    """Return the sequence with some columns of its observations exchanged, then cut to the rows."""
+    o = sequence.observations
+    merged = {"frame": o.frame, "track_id": o.track_id, "uv_px": o.uv_px} | columns
+    return replace(sequence, observations=Observations.sorted(*(merged[c][rows] for c in merged)))
+
+
+def with_samples(sequence: Sequence, rows: object) -> Sequence:
+    """Return the sequence with the motion samples of an index, in that order."""
+    m = sequence.motion
+    kept = {name: getattr(m, name)[rows] for name in m.__dataclass_fields__ if name != "pairing"}
+    return replace(sequence, motion=replace(m, **kept))
+
+
+def turned(sequence: Sequence, turn: Array) -> Sequence:
+    """Return the sequence with its extrinsic written in other body axes."""
+    rig = sequence.rig
+    return replace(sequence, rig=replace(rig, T_imu_cam=se3(turn, np.zeros(3)) @ rig.T_imu_cam))
+
+
+def not_finite(sequence: Sequence) -> Plant:
+    uv_px, values = sequence.observations.uv_px.copy(), sequence.motion.values.copy()
+    uv_px[100:2100:50, 1] = np.nan
+    values[40:100:20, 4] = np.inf
+    m = sequence.motion
+    names = [name for name in m.__dataclass_fields__ if name not in ("t_ns", "pairing")]
+    motion = replace(m, **dict(zip(names, (values[:, :3], values[:, 3:]), strict=True)))
+    return Plant("not-finite", with_observations(replace(sequence, motion=motion), uv_px=uv_px), 40 + 3)
+
+
+def time_order(sequence: Sequence) -> Plant:
+    """Swap frames 10 and 11, and repeat samples 5 and 20."""
+    swapped = np.arange(sequence.frame_count)
+    swapped[[10, 11]] = swapped[[11, 10]]
+    planted = with_observations(sequence, frame=swapped[sequence.observations.frame])
+    planted = replace(planted, frames_t_ns=sequence.frames_t_ns[swapped])
+    samples = np.sort(np.append(np.arange(len(sequence.motion.t_ns)), [5, 20]))
+    return Plant("time-order", with_samples(planted, samples), 1 + 2)
+
+
+def time_gap(sequence: Sequence) -> Plant:
+    """Leave a hole of two seconds in the motion samples, ten seconds after the start."""
+    t_s = (sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    return Plant("time-gap", with_samples(sequence, (t_s <= 10.0) | (t_s >= 12.0)), 1)
+
+
+def outside_motion(sequence: Sequence) -> Plant:
+    """Let the motion samples start with frame 5 and end with the last frame but three."""
+    t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
+    return Plant("outside-motion", with_samples(sequence, (t_ns >= frames[5]) & (t_ns <= frames[-4])), 5 + 3)
+
+
+def no_disparity(sequence: Sequence) -> Plant:
+    uv_px = sequence.observations.uv_px.copy()
+    rows = np.arange(0, len(uv_px), 97)
+    uv_px[rows, 1] = uv_px[rows, 0] + np.arange(rows.size) % 3
+    return Plant("no-disparity", with_observations(sequence, uv_px=uv_px), rows.size)
+
+
+STALE = (40, 60, 61, 90)
+
+
+def stale_frames(sequence: Sequence) -> Plant:
+    """Repeat the pixels of the frame before in four frames, two of which follow each other."""
+    o = sequence.observations
+    uv_px = o.uv_px.copy()
+    row = {(k, i): n for n, (k, i) in enumerate(zip(o.frame.tolist(), o.track_id.tolist(), strict=True))}
+    for k in STALE:
+        for n in np.flatnonzero(o.frame == k):
+            before = row.get((k - 1, int(o.track_id[n])))
+            if before is not None:
+                uv_px[n] = uv_px[before]
+    return Plant("stale-frames", with_observations(sequence, uv_px=uv_px), len(STALE))
+
+
+def returning_tracks(sequence: Sequence) -> Plant:
+    """Hide the tracks seen in frames 30 to 33 from frames 31 and 32."""
+    o = sequence.observations
+    present = [set(o.track_id[o.frame == k].tolist()) for k in (30, 31, 32, 33)]
+    hidden = np.array(sorted(set.intersection(*present)))
+    rows = ~(np.isin(o.track_id, hidden) & np.isin(o.frame, (31, 32)))
+    return Plant("returning-tracks", with_observations(sequence, rows), hidden.size)
+
+
+def mixed_axes(sequence: Sequence) -> Plant:
+    return Plant("mixed-axes", turned(sequence, np.diag([1.0, -1.0, -1.0])), 1)
+
+
+def extrinsic_translation(sequence: Sequence) -> Plant:
+    """Put the camera where inverting a rotation imu -> cam beside the camera's position puts it."""
+    T_imu_cam = sequence.rig.T_imu_cam
+    wrong = se3(T_imu_cam[:3, :3], -T_imu_cam[:3, :3] @ T_imu_cam[:3, 3])
+    return Plant("extrinsic-translation", replace(sequence, rig=replace(sequence.rig, T_imu_cam=wrong)), 1)
+
+
+def twist_lag(sequence: Sequence) -> Plant:
+    """Stamp every twist one sample late, so that it describes the interval before its stamp."""
+    m = sequence.motion
+    assert isinstance(m, TwistSamples)
+    late = np.maximum(np.arange(m.t_ns.size) - 1, 0)
+    return Plant("twist-lag", replace(sequence, motion=replace(m, v_mps=m.v_mps[late], w_radps=m.w_radps[late])), 1)
+
+
+PLANTS: dict[str, Callable[[Sequence], Plant]] = {
+    "not-finite": not_finite,
+    "time-order": time_order,
+    "time-gap": time_gap,
+    "outside-motion": outside_motion,
+    "no-disparity": no_disparity,
+    "stale-frames": stale_frames,
+    "returning-tracks": returning_tracks,
+    "mixed-axes": mixed_axes,
+    "extrinsic-translation": extrinsic_translation,
+    "twist-lag": twist_lag,
+}
+CASES = [
+    (scenario, fault)
+    for scenario in SCENARIOS
+    for fault in PLANTS
+    # An IMU has no velocities to tell a lever arm, and its samples are interpolated, not paired.
+    if scenario == "drive" or fault not in ("extrinsic-translation", "twist-lag")
+]
+
+
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
+def plant(request: pytest.FixtureRequest) -> Plant:
+    """Return each fault planted in each kind of recording that can have it."""
+    scenario, fault = request.param
+    return PLANTS[fault](clean(scenario))
+
+
+@pytest.fixture
+def clean_recording() -> Callable[..., Sequence]:
+    """Return the maker of clean recordings: scenario, seed."""
+    return clean
+
+
+@pytest.fixture
+def planted() -> Callable[[str, Sequence], Sequence]:
+    """Return what plants a fault, by name, in a recording."""
+    return lambda fault, sequence: PLANTS[fault](sequence).planted

@@ -1,0 +1,53 @@
+"""The audit as a whole: clean recordings pass, each planted fault is found, counted, and repaired or kept."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from toolkit.audit import audit, faults
+from toolkit.errors import VislamError
+from toolkit.sequence import Sequence, check_runnable
+
+
+@pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_clean_recording_raises_no_finding_and_is_left_as_it_is(
+    clean_recording: Callable[..., Sequence], scenario: str, seed: int
+) -> None:
+    sequence = clean_recording(scenario, seed)
+    outcome = audit(sequence)
+    assert outcome.findings == ()
+    assert outcome.sequence is sequence
+
+
+def test_a_planted_fault_is_found_counted_and_repaired(plant: Any) -> None:
+    findings = audit(plant.planted).findings
+    assert [(f.fault, f.count, f.repaired, f.blocking) for f in findings] == [(plant.fault, plant.count, True, False)]
+
+
+def test_a_repaired_recording_runs_and_has_no_fault_left(plant: Any) -> None:
+    repaired = audit(plant.planted).sequence
+    check_runnable(repaired)
+    assert audit(repaired).findings == ()
+
+
+def test_a_kept_fault_is_found_blocks_and_is_left_alone(plant: Any) -> None:
+    outcome = audit(plant.planted, keep=frozenset(faults()))
+    found = {f.fault: f for f in outcome.findings}
+    assert found[plant.fault].count == plant.count
+    assert not found[plant.fault].repaired
+    assert found[plant.fault].blocking
+    assert outcome.sequence is plant.planted
+
+
+def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[..., Sequence]) -> None:
+    with pytest.raises(VislamError, match="rust; choose from time-order"):
+        audit(clean_recording(), keep=frozenset({"rust"}))
+
+
+def test_every_fault_has_a_summary_of_one_line() -> None:
+    assert len(faults()) == 11
+    assert all(summary and "\n" not in summary for summary in faults().values())
+
+

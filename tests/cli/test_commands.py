@@ -1,0 +1,98 @@
+"""What the subcommands do when all is well."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toolkit import audit
+from toolkit.audit import Audit, Finding
+from toolkit.report import session
+from toolkit.report.metrics_json import violations
+
+Vislam = Callable[..., int]
+DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10")
+
+
+def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:
+    assert vislam("compare", "drive", "drive-imu", "drive", *DEAD_RECKONING, "--out", "all") == 0
+    assert sorted(path.name for path in Path("all").iterdir()) == ["drive", "drive-2", "drive-imu"]
+    for path in Path("all").iterdir():
+        assert violations(json.loads((path / "metrics.json").read_text())) == []
+
+
+def test_results_go_to_a_new_directory_each_time(vislam: Vislam) -> None:
+    for _ in range(2):
+        assert vislam("compare", "drive", *DEAD_RECKONING) == 0
+    assert len(list(Path("runs").iterdir())) == 2
+
+
+def test_the_command_is_in_the_manifest(vislam: Vislam) -> None:
+    vislam("compare", "drive", *DEAD_RECKONING, "--out", "with space", "--seed", "7")
+    manifest = json.loads(Path("with space/manifest.json").read_text())
+    assert manifest["command"].endswith("--out 'with space' --seed 7")
+    assert manifest["seeds"] == {"sequence": 7}
+
+
+def test_a_start_from_the_truth_is_labelled(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("compare", "drive", *DEAD_RECKONING, "--start", "truth", "--out", "run") == 0
+    start = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("start:"))
+    assert "truth" in start
+
+
+def test_list_names_every_kind_of_part(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("list") == 0
+    listed = capsys.readouterr().out
+    for name in ("dead-reckoning", "kitti00", "drive", "ate_se3_m", *audit.faults()):
+        assert name in listed
+
+
+def test_a_simulated_recording_can_be_compared(vislam: Vislam) -> None:
+    assert vislam("simulate", "flight", "--out", "recordings/flight", "--seed", "3", "--duration", "2") == 0
+    assert vislam("check-data", "recordings/flight") == 0
+    assert vislam("compare", "recordings/flight", *DEAD_RECKONING, "--out", "run") == 0
+
+
+@pytest.mark.parametrize(("repaired", "blocking", "status"), [(True, False, 0), (False, True, 1), (False, False, 0)])
+def test_check_data_fails_on_a_fault_that_stays(
+    vislam: Vislam,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    repaired: bool,
+    blocking: bool,
+    status: int,
+) -> None:
+    finding = Finding("time-gap", 2, repaired, "two frames are 3 s apart", blocking)
+    monkeypatch.setattr(session, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
+    assert vislam("check-data", "drive") == status
+    told = capsys.readouterr().out
+    assert "time-gap" in told
+    assert finding.detail in told
+    assert ("not repaired" in told) == blocking
+
+
+def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[frozenset[str]] = []
+    first, second = list(audit.faults())[:2]
+
+    def listening(sequence: object, keep: frozenset[str]) -> Audit:
+        kept.append(keep)
+        return Audit(sequence, ())
+
+    monkeypatch.setattr(session, "audit", listening)
+    vislam("check-data", "drive")
+    vislam("check-data", "drive", "--no-repair")
+    vislam("check-data", "drive", "--keep", f"{first},{second}")
+    assert kept == [frozenset(), frozenset(audit.faults()), frozenset({first, second})]
+
+
+def test_directory_names_are_plain_and_differ() -> None:
+    assert session.unique_names(["drive", "a/b c", "drive", "..", "drive"]) == [
+        "drive",
+        "a_b_c",
+        "drive-2",
+        "sequence",
+        "drive-3",
+    ]

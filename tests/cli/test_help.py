@@ -1,0 +1,65 @@
+"""Help is quick, complete, and its examples work."""
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from toolkit.cli import simulate
+
+COMMANDS = ("", "compare", "check-data", "list", "simulate")
+STATUSES = ("0", "1", "2", "3", "4", "5", "130")
+_SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
+
+
+def _help(command: str) -> str:
+    words = [*command.split(), "--help"]
+    program = f"import sys; from toolkit.cli import main; sys.exit(main({words!r}))"
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    return told.stdout
+
+
+@pytest.fixture(scope="module")
+def helps() -> dict[str, str]:
+    return {command: _help(command) for command in COMMANDS}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_imports_nothing_slow(command: str) -> None:
+    """The 0.3 s that help may take are kept on any machine if nothing slow is imported on the way."""
+    program = (
+        "import sys; from toolkit.cli import main\n"
+        f"try: main({[*command.split(), '--help']!r})\n"
+        f"finally: print([name for name in {_SLOW!r} if name in sys.modules], file=sys.stderr)"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    assert told.stderr.strip() == "[]"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example_and_the_exit_statuses(helps: dict[str, str], command: str) -> None:
+    assert re.search(r"^  \$ vislam ", helps[command], flags=re.MULTILINE)
+    told = re.findall(r"^  (\d+) ", helps[command], flags=re.MULTILINE)
+    assert tuple(told) == STATUSES
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_examples_in_help_run(helps: dict[str, str], command: str, vislam: Callable[..., int]) -> None:
+    examples = re.findall(r"^  \$ vislam (.*)$", helps[command], flags=re.MULTILINE)
+    assert examples
+    for example in examples:
+        assert vislam(*shlex.split(example)) == 0, example
+
+
+def test_the_scenarios_offered_are_those_there_are() -> None:
+    from toolkit.simulation import SCENARIOS
+
+    assert set(simulate.SCENARIOS) == set(SCENARIOS)
+
+
+def test_version_is_printed(vislam: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("--version") == 0
+    assert re.fullmatch(r"vislam \d+\.\d+\.\d+\n", capsys.readouterr().out)

@@ -1,0 +1,105 @@
+"""The contract of every metric file, and the keys that metrics.json promises."""
+
+import re
+
+import numpy as np
+import pytest
+
+from toolkit import metrics
+from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.geometry import se3
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
+
+KEYS = [
+    "ate_none_m",
+    "ate_se3_m",
+    "ate_yaw_m",
+    "ate_sim3_m",
+    "ate_se3_deg",
+    "rpe_1s_m",
+    "rpe_1s_deg",
+    "rpe_100m_percent",
+    "kitti_t_percent",
+    "kitti_r_deg_per_m",
+    "end_drift_percent",
+    "reproj_median_px",
+    "reproj_rmse_px",
+    "heldout_reproj_median_px",
+    "heldout_reproj_rmse_px",
+    "nis_mean",
+    "coverage_percent",
+    "pairs",
+    "frame_ms_mean",
+    "frame_ms_p95",
+    "frame_ms_max",
+    "total_s",
+    "cpu_s",
+    "peak_rss_mb",
+]
+
+
+T_NS = np.array([0, 100_000_000, 200_000_000])
+TRUTHS = {
+    "none": None,
+    "empty": Truth(np.empty(0), np.empty((0, 4, 4))),
+    "three": Truth(T_NS, se3(np.eye(3), np.outer(np.arange(3.0), [1.0, 0.0, 0.0]))),
+}
+
+
+def bare_sequence(truth):
+    """Three frames, nothing seen."""
+    three = np.full(3, 0.1)
+    return Sequence(
+        name="bare",
+        rig=StereoRig(500.0, 500.0, 320.0, 240.0, 0.2, np.eye(4), np.eye(3)),
+        noise=TwistNoise(three, three, three),
+        frames_t_ns=T_NS,
+        observations=Observations(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 3))),
+        motion=TwistSamples(T_NS, np.zeros((3, 3)), np.zeros((3, 3))),
+        provenance=Provenance("test", "tests/contracts"),
+        truth=truth,
+    )
+
+
+def bare_run(poses):
+    trajectory = Trajectory(T_NS[: len(poses)], poses)
+    timings = Timings(np.empty(0), 0.0, 0.0, 0.0, None)
+    return Run("bare", "failed", trajectory, trajectory, Landmarks.none(), timings)
+
+
+def test_the_keys_are_those_of_metrics_json_in_its_order():
+    assert list(metrics.describe()) == KEYS
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_description_is_one_line(key):
+    line = metrics.describe()[key]
+    assert line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_is_documented(key, request):
+    page = (request.config.rootpath / "docs" / "metrics.md").read_text(encoding="utf-8")
+    assert re.search(rf"`{key}`", page)
+
+
+@pytest.mark.parametrize("output", ["causal", "final"])
+@pytest.mark.parametrize("truth", TRUTHS)
+@pytest.mark.parametrize(
+    "poses",
+    [
+        np.empty((0, 4, 4)),
+        np.full((3, 4, 4), np.nan),
+        np.zeros((3, 4, 4)),
+        np.full((3, 4, 4), 1e300),
+        se3(np.eye(3), np.zeros((3, 3))),
+        se3(np.eye(3), np.zeros((1, 3))),
+    ],
+    ids=["empty", "nan", "zero", "huge", "still", "one"],
+)
+def test_every_key_has_a_finite_value_or_a_reason(output, truth, poses):
+    scores = metrics.score_run(bare_run(poses), output, bare_sequence(TRUTHS[truth]))
+    assert list(scores.values) == KEYS
+    for key, value in scores.values.items():
+        assert np.isfinite(value) if value is not None else scores.notes[key]

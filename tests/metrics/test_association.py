@@ -1,0 +1,106 @@
+"""Which poses are compared, and that a run which tracked little cannot hide it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.estimate import Trajectory
+from toolkit.geometry import se3_exp
+from toolkit.metrics import score_run
+from toolkit.metrics.common.association import associate
+from toolkit.sequence import Truth
+
+PERIOD_NS = 100_000_000
+
+
+def test_stamps_that_differ_by_rounding_are_not_interpolated(drive):
+    poses = drive(30)
+    t_ns = PERIOD_NS * np.arange(30)
+    rounding_ns = np.random.default_rng(0).integers(-60_000, 60_000, 30)  # kitti00's truth: four decimals
+    matched = associate(Trajectory(t_ns, poses), Truth(t_ns + rounding_ns, poses), PERIOD_NS)
+    np.testing.assert_array_equal(matched.estimate, poses)
+
+
+def test_between_frames_the_estimate_moves_on_the_geodesic():
+    twist = np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0])
+    t_ns = PERIOD_NS * np.arange(10)
+    half_ns = t_ns[:-1] + PERIOD_NS // 2
+    truth = Truth(half_ns, se3_exp((half_ns / PERIOD_NS)[:, None] * twist))
+    matched = associate(Trajectory(t_ns, se3_exp((t_ns / PERIOD_NS)[:, None] * twist)), truth, PERIOD_NS)
+    np.testing.assert_allclose(matched.estimate, matched.truth, atol=1e-12)  # a constant twist is a geodesic
+    assert len(matched) == 9
+
+
+def test_a_dense_truth_never_matches_one_estimate_twice(drive):
+    t_ns = PERIOD_NS * np.arange(20)
+    dense_ns = np.arange(0, t_ns[-1] + 1, 1_000_000)  # 1 kHz
+    truth = Truth(dense_ns, se3_exp(np.outer(dense_ns / 1e9, [0, 0, 0, 10.0, 0, 0])))
+    matched = associate(Trajectory(t_ns, se3_exp(np.outer(t_ns / 1e9, [0, 0, 0, 10.0, 0, 0]))), truth, PERIOD_NS)
+    assert len(matched) == dense_ns.size
+    np.testing.assert_allclose(matched.estimate[:, 0, 3], matched.truth[:, 0, 3], atol=1e-12)  # rounding
+
+
+def test_nothing_is_scored_in_a_gap_or_outside_the_estimate(drive):
+    poses, t_ns = drive(40), PERIOD_NS * np.arange(40)
+    kept = np.r_[5:15, 17:30]
+    matched = associate(Trajectory(t_ns[kept], poses[kept]), Truth(t_ns, poses), PERIOD_NS)
+    np.testing.assert_array_equal(matched.t_ns, t_ns[kept])
+
+
+def test_a_gap_does_not_shorten_the_path(drive):
+    poses, t_ns = drive(40), PERIOD_NS * np.arange(40)
+    whole = associate(Trajectory(t_ns, poses), Truth(t_ns, poses), PERIOD_NS)
+    ends = np.array([0, 39])
+    matched = associate(Trajectory(t_ns[ends], poses[ends]), Truth(t_ns, poses), PERIOD_NS)
+    assert matched.path_m[-1] - matched.path_m[0] == whole.path_m[-1]
+
+
+def test_poses_that_are_not_finite_take_no_part_and_lower_the_coverage(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(300), track_count=60)
+    poses = sequence.truth.T_world_imu.copy()
+    poses[40:70] = np.nan
+    poses[100, 1, 3] = np.inf
+    scores = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence)
+    assert scores.values["pairs"] == 269
+    assert scores.values["coverage_percent"] == pytest.approx(100.0 * 269 / 300)
+    assert scores.values["ate_se3_m"] == pytest.approx(0.0, abs=1e-10)  # 300 m in doubles
+    assert "observations scored" in scores.notes["heldout_reproj_median_px"]
+
+
+def test_a_run_that_tracked_a_tenth_shows_it(make_sequence, make_run, drive, perturb):
+    sequence = make_sequence(drive(300), track_count=60)
+    drifting = perturb(sequence.truth.T_world_imu, 2e-3, seed=3)
+    t_ns = sequence.frames_t_ns
+    whole = score_run(make_run(t_ns, drifting), "final", sequence).values
+    tenth = score_run(make_run(t_ns[:30], drifting[:30]), "final", sequence).values
+    assert tenth["ate_se3_m"] < whole["ate_se3_m"]  # looks better ...
+    assert (tenth["coverage_percent"], tenth["pairs"]) == (pytest.approx(10.0), 30)  # ... and says why
+    assert (whole["coverage_percent"], whole["pairs"]) == (100.0, 300)
+
+
+def test_keyframes_do_not_count_as_frames(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(300), track_count=3)
+    every = slice(None, None, 10)
+    run = make_run(sequence.frames_t_ns[every], sequence.truth.T_world_imu[every])
+    values = score_run(run, "final", sequence).values
+    assert values["coverage_percent"] == pytest.approx(10.0)
+    assert values["pairs"] == 30
+
+
+def test_coverage_counts_the_frames_the_truth_can_judge(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(100), track_count=3)
+    truth = Truth(sequence.frames_t_ns[:80] + 128, sequence.truth.T_world_imu[:80])  # ucsd 0027: off by 128 ns, short
+    run = make_run(sequence.frames_t_ns[:80], sequence.truth.T_world_imu[:80])
+    assert score_run(run, "final", replace(sequence, truth=truth)).values["coverage_percent"] == 100.0
+
+
+@pytest.mark.parametrize("kept", [0, 1])
+def test_too_few_matches_leave_reasons_instead_of_numbers(make_sequence, make_run, drive, kept):
+    sequence = make_sequence(drive(50), track_count=20)
+    scores = score_run(make_run(sequence.frames_t_ns[:kept], drive(50)[:kept]), "final", sequence)
+    assert scores.values["pairs"] == kept
+    assert scores.values["coverage_percent"] == pytest.approx(2.0 * kept)
+    for key in ("ate_none_m", "ate_se3_m", "rpe_1s_m", "kitti_t_percent", "end_drift_percent"):
+        assert scores.values[key] is None
+        assert "match" in scores.notes[key]

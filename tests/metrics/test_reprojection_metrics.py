@@ -1,0 +1,213 @@
+"""Both reprojection errors: the in-sample one against gtsam's camera, the held-out one against re-triangulation."""
+
+import itertools
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from toolkit.estimate import Landmarks
+from toolkit.geometry import se3_exp, se3_inverse, transform
+from toolkit.metrics import Judged, held_out, in_sample, score_run
+from toolkit.metrics.common.leave_one_out import predict_left_out
+from toolkit.metrics.common.reprojection import CAP_PX
+from toolkit.models import stereo
+from toolkit.sequence import Observations
+
+HUBER_SIGMAS = 2.796
+
+
+def first_sighting_landmarks(sequence, poses):
+    seen = sequence.visible
+    ids, row = np.unique(seen.track_id, return_index=True)
+    return Landmarks(ids, stereo.triangulate_world(seen.uv_px[row], poses[seen.frame[row]], sequence.rig))
+
+
+def test_in_sample_error_equals_a_loop_over_gtsams_camera(make_sequence, make_run, drive, perturb):
+    sequence = make_sequence(drive(60), track_count=80, pixel_sigma=0.7)
+    poses, rig = perturb(sequence.truth.T_world_imu, 1e-4, seed=1), sequence.rig
+    landmarks = first_sighting_landmarks(sequence, poses)
+    calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
+    points = dict(zip(landmarks.track_ids.tolist(), landmarks.points_world, strict=True))
+    expected = []
+    for frame, track, uv in zip(sequence.visible.frame, sequence.visible.track_id, sequence.visible.uv_px, strict=True):
+        camera = gtsam.StereoCamera(gtsam.Pose3(poses[frame] @ rig.T_imu_cam), calibration)
+        predicted = camera.project(points[int(track)])
+        residual = uv - [predicted.uL(), predicted.uR(), predicted.v()]
+        expected.append(np.sqrt(np.mean(residual**2)))
+    errors_px = in_sample.errors(Judged(make_run(sequence.frames_t_ns, poses, landmarks), "final", sequence))
+    assert max(expected) < CAP_PX
+    np.testing.assert_allclose(errors_px, expected, atol=1e-9)  # 1e3 px from products of a few doubles
+    values = score_run(make_run(sequence.frames_t_ns, poses, landmarks), "final", sequence).values
+    assert values["reproj_median_px"] == pytest.approx(np.median(expected), rel=1e-9)  # the same numbers
+    assert values["reproj_rmse_px"] == pytest.approx(np.sqrt(np.mean(np.square(expected))), rel=1e-9)
+
+
+def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(60), track_count=80)
+    landmarks = first_sighting_landmarks(sequence, sequence.truth.T_world_imu)
+    points = landmarks.points_world.copy()
+    points[0] = transform(sequence.truth.T_world_imu[0], np.array([-500.0, 0.0, 0.0]))
+    points[1] = np.nan
+    run = make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, Landmarks(landmarks.track_ids, points))
+    errors_px = in_sample.errors(Judged(run, "final", sequence))
+    lost = np.isin(sequence.visible.track_id, landmarks.track_ids[:2])
+    assert (errors_px[lost] == CAP_PX).all()
+    assert errors_px[~lost].max() < 1e-9  # exact points, rounding only
+    assert f"{lost.sum()} behind the camera" in score_run(run, "final", sequence).notes["reproj_rmse_px"]
+
+
+def test_landmarks_left_out_are_counted(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(60), track_count=80)
+    landmarks = first_sighting_landmarks(sequence, sequence.truth.T_world_imu)
+    half = Landmarks(landmarks.track_ids[::2], landmarks.points_world[::2])
+    scored = np.isin(sequence.visible.track_id, half.track_ids).sum()
+    scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, half), "final", sequence)
+    assert f"{scored} of {len(sequence.visible)} observations" in scores.notes["reproj_median_px"]
+
+
+def test_without_landmarks_only_the_in_sample_error_is_missing(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(60))
+    scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu), "final", sequence)
+    assert scores.values["reproj_median_px"] is None
+    assert scores.notes["reproj_rmse_px"] == "the estimator has no landmarks"
+    assert scores.values["heldout_reproj_median_px"] is not None
+
+
+def test_held_out_error_is_zero_at_truth_and_grows_with_pose_noise(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(120), track_count=600)
+    truth = sequence.truth.T_world_imu
+    shape = np.random.default_rng(0).normal(size=(120, 6)) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+    medians = []
+    for sigma in (0.0, 1e-4, 3e-4, 1e-3, 3e-3):
+        poses = truth @ se3_exp(sigma * shape)
+        values = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence).values
+        medians.append(values["heldout_reproj_median_px"])
+    assert medians[0] < 1e-9  # rounding of 1e3 px
+    assert all(1.5 * small < large for small, large in itertools.pairwise(medians))
+
+
+def test_held_out_error_needs_no_truth_and_ignores_the_world(make_sequence, make_run, drive, perturb):
+    sequence = replace(make_sequence(drive(120), pixel_sigma=0.5), truth=None)
+    poses = perturb(drive(120), 1e-4, seed=2)
+    moved = se3_exp(np.array([1.0, -2.0, 0.5, 300.0, 20.0, -7.0])) @ poses
+    here = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence)
+    there = score_run(make_run(sequence.frames_t_ns, moved), "final", sequence)
+    for key in held_out.METRICS:
+        assert there.values[key] == pytest.approx(here.values[key], rel=1e-6)  # 300 m of lever times rounding
+    assert here.values["ate_se3_m"] is None
+    assert here.notes["ate_se3_m"] == "the sequence has no ground truth"
+    assert here.values["coverage_percent"] == 100.0
+    assert here.values["pairs"] is None
+
+
+def tracks_of(sequence, poses):
+    """All tracks with three views or more, sorted by track: ids, measurements, camera poses."""
+    seen = sequence.observations
+    order = np.lexsort((seen.frame, seen.track_id))
+    enough = order[np.bincount(seen.track_id)[seen.track_id[order]] >= 3]
+    return seen.track_id[enough], seen.uv_px[enough], (poses @ sequence.rig.T_imu_cam)[seen.frame[enough]]
+
+
+def predict_by_retriangulation(track_ids, uv_px, T_world_cam, rig, left_out):
+    """Triangulate the other views anew by scipy, robustly and in Cartesian coordinates, and predict."""
+    others = np.flatnonzero(track_ids == track_ids[left_out])
+    others = others[others != left_out]
+    sqrt_information = np.linalg.inv(np.linalg.cholesky(rig.cov_uv_px2))
+
+    def robust_residuals(point_world):
+        points_cam = transform(se3_inverse(T_world_cam[others]), point_world)
+        residual = (uv_px[others] - stereo.project(points_cam, rig)) @ sqrt_information.T
+        length = np.linalg.norm(residual, axis=1)
+        huber = np.where(length <= HUBER_SIGMAS, length**2, HUBER_SIGMAS * (2.0 * length - HUBER_SIGMAS))
+        return (residual * (np.sqrt(huber) / np.maximum(length, 1e-12))[:, None]).ravel()
+
+    starts = transform(T_world_cam[others], stereo.triangulate(uv_px[others], rig))
+    solved = [least_squares(robust_residuals, start, xtol=1e-13, ftol=1e-13, gtol=1e-13) for start in starts[:4]]
+    point = min(solved, key=lambda s: s.cost).x
+    return stereo.project(transform(se3_inverse(T_world_cam[left_out]), point), rig)
+
+
+@pytest.mark.parametrize(
+    ("pixel_sigma", "pose_sigma", "tolerance_px"),
+    [
+        (0.5, 0.0, 1e-4),  # no weight below one: both solve the same smooth problem to convergence
+        (1.0, 1e-3, 0.1),  # weights at work: iteratively reweighted against jointly minimised
+    ],
+)
+def test_leaving_a_view_out_equals_triangulating_anew(make_sequence, drive, pixel_sigma, pose_sigma, tolerance_px):
+    sequence = make_sequence(drive(80), track_count=60, pixel_sigma=pixel_sigma)
+    noise = np.random.default_rng(1).normal(0.0, pose_sigma, (80, 6)) * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive(80) @ se3_exp(noise))
+    predicted_px = predict_left_out(track_ids, uv_px, T_world_cam, sequence.rig).uv_px
+    rows = np.random.default_rng(2).choice(len(track_ids), 40, replace=False)
+    anew_px = [predict_by_retriangulation(track_ids, uv_px, T_world_cam, sequence.rig, row) for row in rows]
+    errors_px = np.sqrt(np.mean((predicted_px[rows] - uv_px[rows]) ** 2, axis=1))
+    errors_anew_px = np.sqrt(np.mean((anew_px - uv_px[rows]) ** 2, axis=1))
+    np.testing.assert_allclose(errors_px, errors_anew_px, atol=tolerance_px)
+    assert np.median(errors_px) > 0.3
+
+
+def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew(make_sequence, drive):
+    sequence = make_sequence(drive(80, step_m=0.1), track_count=40, pixel_sigma=0.0)
+    poses = drive(80, step_m=0.1)
+    point = transform(poses[79], np.array([12.0, 3.0, 1.0]))
+    T_world_cam = poses @ sequence.rig.T_imu_cam
+    uv_px = stereo.project(transform(se3_inverse(T_world_cam), point), sequence.rig)
+    uv_px = uv_px + np.random.default_rng(3).normal(0.0, 1.0, uv_px.shape)
+    ids = np.zeros(80, dtype=np.int64)
+    predicted_px = predict_left_out(ids, uv_px, T_world_cam, sequence.rig).uv_px
+    for row in range(0, 80, 8):
+        anew_px = predict_by_retriangulation(ids, uv_px, T_world_cam, sequence.rig, row)
+        # Second-order terms and a weight or two of 79 others: a hundredth of the noise.
+        np.testing.assert_allclose(predicted_px[row], anew_px, atol=0.01)
+
+
+def test_an_outlier_does_not_spoil_the_rest_of_its_track(make_sequence, drive):
+    sequence = make_sequence(drive(80), track_count=60)
+    track_ids, uv_px, T_world_cam = tracks_of(sequence, drive(80))
+    long = np.flatnonzero(np.bincount(track_ids) >= 8)
+    struck = np.array([np.flatnonzero(track_ids == t)[3] for t in long])
+    spoiled = uv_px.copy()
+    spoiled[struck] += np.array([25.0, 20.0, 10.0])
+    predicted = predict_left_out(track_ids, spoiled, T_world_cam, sequence.rig)
+    clean = np.setdiff1d(np.flatnonzero(np.isin(track_ids, long)), struck)
+    np.testing.assert_allclose(predicted.uv_px[struck], uv_px[struck], atol=1e-6)  # told by the other, exact views
+    assert np.median(np.abs(predicted.uv_px[clean] - uv_px[clean])) < 1.5  # Huber bounds the pull; least squares: 3 px
+
+
+def test_points_at_infinity_are_predicted(make_sequence, drive):
+    rig, poses = make_sequence(drive(10), track_count=3).rig, drive(10)
+    T_cam_world = se3_inverse(poses @ rig.T_imu_cam)
+    directions = T_cam_world[:, :3, :3] @ (poses[5] @ rig.T_imu_cam)[:3, :3] @ np.array([0.1, -0.05, 1.0])
+    uv_px = stereo.project(1e12 * directions, rig)
+    predicted = predict_left_out(np.zeros(10, dtype=np.int64), uv_px, poses @ rig.T_imu_cam, rig)
+    np.testing.assert_allclose(predicted.uv_px, uv_px, atol=1e-6)  # 1e12 m for infinity leaves fx b / 1e12
+
+
+def test_tracks_with_fewer_than_three_posed_views_are_counted_not_scored(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(120), track_count=300)
+    ids = sequence.held_out.track_id
+    short = np.isin(ids, np.unique(ids)[:5])
+    first_two = np.concatenate([np.flatnonzero(ids == t)[:2] for t in np.unique(ids)[:5]])
+    kept = np.sort(np.concatenate([np.flatnonzero(~short), first_two]))
+    held = sequence.held_out.select(kept)
+    both = [np.concatenate(c) for c in zip(_columns(sequence.visible), _columns(held), strict=True)]
+    sequence = replace(sequence, observations=Observations.sorted(*both))
+    scores = score_run(make_run(sequence.frames_t_ns, sequence.truth.T_world_imu), "final", sequence)
+    assert f"{len(held) - 10} of {len(held)} observations" in scores.notes["heldout_reproj_median_px"]
+    assert scores.values["heldout_reproj_rmse_px"] < 1e-9  # exact: rounding only
+
+
+def _columns(observations):
+    return observations.frame, observations.track_id, observations.uv_px
+
+
+def test_absurd_poses_end_at_the_cap_and_not_in_an_error(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(60), track_count=200)
+    poses = np.random.default_rng(0).permutation(drive(60)) @ se3_exp(np.full((60, 6), 2.0))
+    poses[:, :3, 3] *= 1e6
+    values = score_run(make_run(sequence.frames_t_ns, poses), "final", sequence).values
+    assert 10.0 < values["heldout_reproj_median_px"] <= CAP_PX

@@ -1,0 +1,113 @@
+"""What the package promises about its answers, and the figures that are read off a run: NIS and cost."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from toolkit import metrics
+from toolkit.metrics import Scores, score_run
+from toolkit.metrics.common.scores import Unavailable, evaluate
+
+
+@pytest.fixture
+def case(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(150), track_count=60)
+
+    def scored(output="causal", poses=sequence.truth.T_world_imu, **changes):
+        return score_run(make_run(sequence.frames_t_ns, poses, **changes), output, sequence)
+
+    return scored
+
+
+def test_nis_is_weighted_by_its_degrees_of_freedom(case):
+    info = {"nis": np.array([np.nan, 30.0, 10.0, 5.0]), "nis_dof": np.array([np.nan, 20.0, 10.0, np.nan])}
+    assert case(info=info).values["nis_mean"] == pytest.approx(40.0 / 30.0)
+
+
+def test_nis_is_one_for_a_consistent_filter(case):
+    rng = np.random.default_rng(0)
+    dof = rng.integers(1, 200, 2000).astype(float)
+    values = case(info={"nis": rng.chisquare(dof), "nis_dof": dof}).values
+    assert values["nis_mean"] == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / dof.sum()))  # four sigma of the mean
+
+
+@pytest.mark.parametrize(
+    ("output", "info", "reason"),
+    [
+        ("final", {"nis": np.ones(3), "nis_dof": np.ones(3)}, "causal"),
+        ("causal", {}, "reports no innovations"),
+        ("causal", {"nis": np.full(3, np.nan), "nis_dof": np.full(3, np.nan)}, "no step"),
+    ],
+)
+def test_nis_is_missing_with_its_reason(case, output, info, reason):
+    scores = case(output, info=info)
+    assert scores.values["nis_mean"] is None
+    assert reason in scores.notes["nis_mean"]
+
+
+def test_cost_is_read_off_the_timings(case):
+    values = case().values
+    assert values["frame_ms_mean"] == pytest.approx(2.0)
+    assert values["frame_ms_max"] == pytest.approx(4.0)
+    assert 2.0 < values["frame_ms_p95"] < 4.0
+    assert (values["total_s"], values["cpu_s"], values["peak_rss_mb"]) == (0.6, 0.7, 123.0)
+
+
+def test_a_failed_run_with_a_partial_trajectory_is_scored(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(150), track_count=60)
+    run = make_run(sequence.frames_t_ns[:75], sequence.truth.T_world_imu[:75], status="failed")
+    assert score_run(run, "causal", sequence).values["coverage_percent"] == pytest.approx(50.0)
+
+
+def test_a_run_that_overflows_has_reasons_instead_of_numbers(case, drive):
+    poses = drive(150).copy()
+    poses[100:, :3, 3] *= 1e200
+    scores = case(poses=poses)
+    json.dumps(scores.values, allow_nan=False)
+    assert scores.values["ate_none_m"] is None
+    assert "finite" in scores.notes["ate_none_m"]
+    assert "too large" in scores.notes["ate_se3_m"]
+    assert scores.values["coverage_percent"] == 100.0
+
+
+def test_an_output_that_does_not_exist_is_refused(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(20), track_count=3)
+    run = make_run(sequence.frames_t_ns, drive(20), causal=None)
+    with pytest.raises(ValueError, match="no causal output"):
+        score_run(run, "causal", sequence)
+
+
+def test_a_value_that_is_not_finite_becomes_none():
+    scores = Scores({"a": math.nan, "b": 1.0}, {"b": "remark"})
+    assert scores.values == {"a": None, "b": 1.0}
+    assert scores.notes == {"a": "the result is not finite", "b": "remark"}
+
+
+def test_one_missing_metric_leaves_the_others_their_values():
+    def missing() -> float:
+        raise Unavailable("because")
+
+    scores = evaluate({"a": missing, "b": lambda: 2.0})
+    assert (scores.values, scores.notes) == ({"a": None, "b": 2.0}, {"a": "because"})
+
+
+def test_a_defect_in_a_metric_passes_through(case, monkeypatch):
+    from toolkit.metrics import drift
+
+    monkeypatch.setattr(drift, "score", lambda judged: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        case()
+
+
+def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case):
+    source = 'from toolkit.metrics import Scores\nORDER = 99\nMETRICS = {"answer": "the answer (1)"}\n'
+    (tmp_path / "dropped_in.py").write_text(source + "def score(judged):\n    return Scores({'answer': 42.0})\n")
+    monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
+    metrics._metric_files.cache_clear()
+    try:
+        assert list(metrics.describe())[-1] == "answer"
+        assert case().values["answer"] == 42.0
+    finally:
+        metrics._metric_files.cache_clear()

@@ -1,0 +1,151 @@
+"""Properties of the metrics that compare with the truth: alignment, invariance, KITTI's figures, end drift."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from toolkit.geometry import about_z, se3, se3_exp
+from toolkit.metrics import score_run
+from toolkit.metrics.common.alignment import fit_se3, fit_sim3, fit_yaw, place_yaw
+from toolkit.metrics.common.scores import Unavailable
+
+ERRORS = ["ate_none_m", "ate_se3_m", "ate_yaw_m", "ate_sim3_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg"]
+ERRORS += ["rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m", "end_drift_percent"]
+
+
+@pytest.fixture
+def score(make_run):
+    def scored(sequence, poses, output="final"):
+        return score_run(make_run(sequence.frames_t_ns, poses), output, sequence)
+
+    return scored
+
+
+@pytest.mark.parametrize("motion", ["twist", "imu"])
+def test_every_error_is_zero_on_truth(make_sequence, drive, score, motion):
+    sequence = make_sequence(drive(400), track_count=3, motion=motion)
+    values = score(sequence, sequence.truth.T_world_imu).values
+    for key in ERRORS:
+        assert values[key] == pytest.approx(0.0, abs=1e-10), key  # 400 m in doubles: 1e-13 a step
+    assert values["pairs"] == 400
+    assert values["coverage_percent"] == 100.0
+
+
+def test_no_error_depends_on_the_estimators_world(make_sequence, drive, perturb, score):
+    sequence = make_sequence(drive(400), track_count=3)
+    estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)
+    moved = se3_exp(np.array([0.5, -0.3, 1.9, 40.0, 5.0, -8.0])) @ estimate
+    here, there = score(sequence, estimate).values, score(sequence, moved).values
+    for key in ERRORS:
+        if key != "ate_yaw_m":  # a tilted world is an error that a fit of heading alone must show
+            assert there[key] == pytest.approx(here[key], rel=1e-9), key  # rounding of 400 m turned about
+    assert there["ate_yaw_m"] > 2.0 * here["ate_yaw_m"]
+
+
+def test_with_an_imu_a_heading_is_free_and_a_tilt_is_an_error(make_sequence, drive, perturb, score):
+    sequence = make_sequence(drive(400), track_count=3, motion="imu")
+    estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)
+    turned = se3(about_z(2.2), np.array([9.0, 1.0, 3.0])) @ estimate
+    tilted = se3_exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])) @ estimate
+    as_is = score(sequence, estimate).values
+    for key in ("ate_none_m", "ate_yaw_m", "end_drift_percent"):
+        assert score(sequence, turned).values[key] == pytest.approx(as_is[key], rel=1e-9)  # rounding only
+        assert score(sequence, tilted).values[key] > 1.2 * as_is[key]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_heading_fit_is_the_least_squares_one(seed):
+    rng = np.random.default_rng(seed)
+    truth = rng.normal(0.0, 20.0, (50, 3))
+    estimate = truth @ about_z(rng.uniform(-3, 3)) + rng.normal(0.0, 4.0, (50, 3)) + 7.0
+
+    def mean_square(parameters):
+        moved = estimate @ about_z(parameters[0]).T + parameters[1:]
+        return np.mean(np.sum((moved - truth) ** 2, axis=1))
+
+    starts = [np.array([yaw, 0.0, 0.0, 0.0]) for yaw in np.linspace(-3.0, 3.0, 7)]
+    best = min(minimize(mean_square, start, method="BFGS", options={"gtol": 1e-9}).fun for start in starts)
+    fit = fit_yaw(truth, estimate)
+    ours = mean_square([np.arctan2(fit.rotation[1, 0], fit.rotation[0, 0]), *fit.translation])
+    assert ours == pytest.approx(best, rel=1e-9)  # at a minimum the cost is flat to second order
+    assert ours <= best * (1.0 + 1e-12)
+
+
+def test_placing_by_heading_recovers_a_pure_heading():
+    truth = se3_exp(np.array([0.1, 0.2, 0.9, 3.0, 4.0, 5.0]))
+    estimate = se3(about_z(1.3), np.array([4.0, 5.0, 6.0])) @ truth
+    placed = place_yaw(truth, estimate).apply(estimate[None])[0]
+    np.testing.assert_allclose(placed, truth, atol=1e-14)  # one product of rotations in doubles
+
+
+def test_a_fit_needs_three_pairs():
+    with pytest.raises(Unavailable, match="needs 3"):
+        fit_se3(np.zeros((2, 3)), np.zeros((2, 3)))
+
+
+def test_scale_has_no_fit_where_the_estimate_stands_still():
+    with pytest.raises(Unavailable, match="all the same"):
+        fit_sim3(np.random.default_rng(0).normal(size=(5, 3)), np.ones((5, 3)))
+
+
+def test_a_mirror_image_is_not_fitted_by_a_mirror():
+    truth = np.random.default_rng(0).normal(size=(20, 3))
+    assert np.linalg.det(fit_se3(truth, truth * [1.0, 1.0, -1.0]).rotation) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_on_a_straight_line_the_rotation_error_is_refused_and_said(make_sequence, score):
+    poses = se3(np.eye(3), np.outer(np.arange(50.0), [1.0, 0.5, 0.1]))
+    sequence = make_sequence(poses, track_count=3)
+    scores = score(sequence, se3_exp(np.array([0.3, 0.0, 0.5, 1.0, 2.0, 3.0])) @ poses)
+    assert scores.values["ate_se3_m"] == pytest.approx(0.0, abs=1e-12)  # 50 m in doubles
+    assert scores.values["ate_se3_deg"] is None
+    assert "line" in scores.notes["ate_se3_deg"]
+    assert "line" in scores.notes["ate_se3_m"]
+
+
+def devkit_errors(truth, estimate):
+    """KITTI's devkit in plain loops: mean of t_err and r_err over all segments."""
+    dist = [0.0]
+    for a, b in itertools.pairwise(truth):
+        dist.append(dist[-1] + float(np.sqrt(((b[:3, 3] - a[:3, 3]) ** 2).sum())))
+    t_errors, r_errors = [], []
+    for first in range(0, len(truth), 10):
+        for length in (100, 200, 300, 400, 500, 600, 700, 800):
+            last = next((k for k in range(first, len(truth)) if dist[k] > dist[first] + length), -1)
+            if last == -1:
+                continue
+            delta_truth = np.linalg.inv(truth[first]) @ truth[last]
+            delta_estimate = np.linalg.inv(estimate[first]) @ estimate[last]
+            error = np.linalg.inv(delta_estimate) @ delta_truth
+            r_errors.append(np.arccos(np.clip(0.5 * (np.trace(error[:3, :3]) - 1.0), -1.0, 1.0)) / length)
+            t_errors.append(np.sqrt((error[:3, 3] ** 2).sum()) / length)
+    return np.mean(t_errors), np.mean(r_errors), len(t_errors)
+
+
+def test_kitti_figures_equal_the_development_kits_loops(make_sequence, drive, perturb, score):
+    sequence = make_sequence(drive(600, step_m=1.7), track_count=3)
+    estimate = perturb(sequence.truth.T_world_imu, 2e-3, seed=4)
+    t_error, r_error, segments = devkit_errors(sequence.truth.T_world_imu, estimate)
+    values = score(sequence, estimate).values
+    assert segments > 200
+    assert values["kitti_t_percent"] == pytest.approx(100.0 * t_error, rel=1e-9)  # rounding of 4x4 inverses
+    # The devkit's arccos loses half the digits of a small angle; the angles here are 0.02 rad and more.
+    assert values["kitti_r_deg_per_m"] == pytest.approx(np.degrees(r_error), rel=1e-9)
+
+
+def test_short_paths_have_no_long_segments(make_sequence, drive, score):
+    sequence = make_sequence(drive(60), track_count=3)
+    scores = score(sequence, sequence.truth.T_world_imu)
+    for key in ("kitti_t_percent", "kitti_r_deg_per_m", "rpe_100m_percent"):
+        assert scores.values[key] is None
+        assert "100 m" in scores.notes[key]
+
+
+def test_end_drift_is_the_last_error_over_the_path(make_sequence, score):
+    poses = se3(np.eye(3), np.outer(np.arange(51.0), [2.0, 0.0, 0.0]))
+    sequence = make_sequence(poses, track_count=3)
+    stretched = se3(np.eye(3), 1.02 * poses[:, :3, 3])
+    # 2 % too long everywhere: 2 m at the end of 100 m; rounding only.
+    assert score(sequence, stretched).values["end_drift_percent"] == pytest.approx(2.0, rel=1e-12)

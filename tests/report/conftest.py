@@ -1,0 +1,75 @@
+"""A made-up comparison: a simulated recording, and runs that are its truth with a known error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Finding
+from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.geometry import Array, about_z, interpolate_poses, se3
+from toolkit.metrics import Scores, describe, score_run
+from toolkit.models.stereo import triangulate_world
+from toolkit.report.comparison import Comparison, Row, outputs_of
+from toolkit.sequence import Sequence
+from toolkit.simulation import DRIVE, simulate
+
+FINDING = Finding("stale-frames", 91, True, "91 of 1106 frames repeat the one before; their tracks end there", False)
+
+
+@pytest.fixture(scope="session")
+def sequence() -> Sequence:
+    return simulate(replace(DRIVE, duration_s=12.0), seed=3)
+
+
+@pytest.fixture(scope="session")
+def comparison(sequence: Sequence) -> Comparison:
+    """Four runs: both outputs, diverged, an answer at the end only, and a failure without any answer."""
+    runs = (
+        _run("steady", sequence, turn_rad=0.02),
+        replace(_run("astray", sequence, turn_rad=0.4, growth=1.06), status="diverged", log=("left the road",)),
+        replace(_run("late", sequence, turn_rad=0.01), causal=None),
+        Run("broken", "failed", None, None, Landmarks.none(), _timings(0), log=("the solve did not converge",)),
+    )
+    return compared(sequence, runs)
+
+
+@pytest.fixture(scope="session")
+def without_truth(sequence: Sequence) -> Comparison:
+    """The same kind of comparison on a recording nobody knows the truth of."""
+    blind = replace(sequence, truth=None)
+    return compared(blind, (_run("steady", sequence, turn_rad=0.02), _run("late", sequence, turn_rad=0.01)))
+
+
+def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:
+    assert sequence.prior is not None
+    rows = tuple(Row(run, output, _scores(run, output, sequence)) for run in runs for output in outputs_of(run))
+    return Comparison(sequence, (FINDING,), sequence.prior, runs, rows)
+
+
+def _scores(run: Run, output: str, sequence: Sequence) -> Scores:
+    if run.status == "failed":
+        return Scores(dict.fromkeys(describe()), dict.fromkeys(describe(), "the run gave no trajectory"))
+    return score_run(run, output, sequence)
+
+
+def _run(name: str, sequence: Sequence, turn_rad: float, growth: float = 1.0) -> Run:
+    """Return the truth, turned more and more up to ``turn_rad`` and stretched by ``growth`` with each frame."""
+    t_ns = sequence.frames_t_ns
+    poses = interpolate_poses(sequence.truth.t_ns, sequence.truth.T_world_imu, t_ns)
+    frames = np.arange(t_ns.size)
+    turned = se3(about_z(turn_rad * frames / t_ns.size), np.zeros(3)) @ poses
+    stretched = se3(turned[:, :3, :3], turned[:, :3, 3] * (growth**frames)[:, None])
+    trajectory = Trajectory(t_ns, stretched)
+    return Run(name, "ok", trajectory, trajectory, _landmarks(sequence, poses), _timings(t_ns.size))
+
+
+def _landmarks(sequence: Sequence, poses: Array) -> Landmarks:
+    seen = sequence.visible
+    ids, first = np.unique(seen.track_id, return_index=True)
+    return Landmarks(ids, triangulate_world(seen.uv_px[first], poses[seen.frame[first]], sequence.rig))
+
+
+def _timings(frames: int) -> Timings:
+    step_s = 1e-3 * (1.0 + 0.3 * np.sin(np.arange(frames)))
+    return Timings(step_s, finish_s=0.4, total_s=0.4 + float(step_s.sum()), cpu_s=0.5, peak_rss_mb=123.0)

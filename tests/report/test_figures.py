@@ -1,0 +1,67 @@
+"""Figures show the data: the same colours everywhere, equal scale from above, no point squashing the rest."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.estimate import Landmarks
+from toolkit.geometry import about_z, se3
+from toolkit.report.comparison import Comparison
+from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
+from toolkit.report.figures.alignment import errors_to, onto_truth, truth_during
+from toolkit.report.figures.style import colour_of
+
+
+def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparison) -> None:
+    drawn = {name: figure for name, _, figure in top_view.draw(comparison)}
+    assert list(drawn) == ["top_steady", "top_astray", "top_late", "top_all"]
+    for figure in drawn.values():
+        assert figure.axes[0].get_aspect() == 1.0
+        assert "[m]" in figure.axes[0].get_xlabel()
+
+
+def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison) -> None:
+    late = comparison.runs[2]
+    points = late.landmarks.points_world.copy()
+    points[:10] = 1e6
+    spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
+    (figure, _) = (figure for _, _, figure in top_view.draw(replace(comparison, runs=(spoiled,))))
+    low, high = figure.axes[0].get_xlim()
+    assert high - low < 500.0
+
+
+def test_every_estimator_has_its_own_colour(comparison: Comparison) -> None:
+    colours = [colour_of(comparison, run.estimator) for run in comparison.runs]
+    assert len(set(colours)) == len(colours)
+
+
+def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Comparison) -> None:
+    sequence, late = comparison.sequence, comparison.runs[2]
+    truth = truth_during(sequence)
+    assert truth is not None
+    moved = se3(about_z(1.2), np.array([5.0, -3.0, 1.0])) @ truth.T_world_imu
+    run = replace(late, final=replace(late.final, t_ns=truth.t_ns, T_world_imu=moved))
+    errors = errors_to(truth, run.final, onto_truth(run, "final", sequence), sequence)
+    assert errors is not None
+    # Positions of 100 m and a fitted angle: some 1e-16 relative of each.
+    assert errors.position_m.max() < 1e-10
+    assert np.abs(errors.heading_deg).max() < 1e-9
+
+
+def test_without_truth_the_figure_says_it_shows_differences(without_truth: Comparison) -> None:
+    (drawn,) = errors_over_time.draw(without_truth)
+    assert "no truth" in drawn.caption
+    assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
+
+
+def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> None:
+    (drawn,) = errors_over_time.draw(comparison)
+    assert drawn.figure.axes[0].get_ylim()[1] < 2.0
+
+
+@pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw])
+def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
+    broken = replace(comparison, runs=comparison.runs[3:], rows=comparison.rows[-1:])
+    assert callable(draw)
+    assert list(draw(broken)) == []

@@ -1,0 +1,130 @@
+"""A run directory is complete or not there, and never takes the place of somebody else's files."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from toolkit.errors import OutputError
+from toolkit.report import run_directory
+from toolkit.report.comparison import Comparison
+from toolkit.report.metrics_json import violations
+from toolkit.report.run_directory import check_run_directory, write_run
+
+
+def write(comparison: Comparison, target: Path) -> None:
+    write_run(comparison, target, command="vislam compare", seed=0)
+
+
+def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
+    target = tmp_path / "runs" / "one"
+    write(comparison, target)
+    files = {str(path.relative_to(target)) for path in target.rglob("*") if path.is_file()}
+    assert {"metrics.json", "report.md", "manifest.json"} <= files
+    assert {f"trajectories/{name}.tum" for name in ("steady_causal", "steady_final", "late_final")} <= files
+    assert "trajectories/late_causal.tum" not in files
+    assert {f"landmarks/{run.estimator}.csv" for run in comparison.runs} <= files
+    figures = ("top_steady", "top_astray", "top_late", "top_all", "errors_over_time", "reprojection", "frame_times")
+    assert {f"figures/{name}.png" for name in figures} <= files
+    assert violations(json.loads((target / "metrics.json").read_text())) == []
+    report = (target / "report.md").read_text()
+    assert all(f"(figures/{name}.png)" in report for name in figures)
+
+
+def test_the_manifest_says_how_to_repeat_the_run(comparison: Comparison, tmp_path: Path) -> None:
+    write(comparison, tmp_path / "run")
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["command"] == "vislam compare"
+    assert manifest["sequence"]["hash"] == comparison.sequence.content_hash()
+    assert all(manifest["versions"][name] for name in ("toolkit", "python", "numpy", "gtsam", "opencv", "scipy"))
+    assert manifest.keys() >= {"git_revision", "seeds", "threads", "cpu", "os", "date", "start"}
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_a_failure_while_writing_leaves_nothing(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(run_directory, "write_figures", fail)
+    with pytest.raises((KeyboardInterrupt, OutputError)):
+        write(comparison, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_while_writing_keeps_the_earlier_run(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(comparison, tmp_path / "run")
+    before = (tmp_path / "run" / "manifest.json").read_bytes()
+
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_directory, "write_figures", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write(comparison, tmp_path / "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert (tmp_path / "run" / "manifest.json").read_bytes() == before
+
+
+def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    rename = Path.rename
+
+    def interrupted(self: Path, other: Path) -> Path:
+        if ".partial-" in self.name:
+            raise KeyboardInterrupt
+        return rename(self, other)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(comparison, target)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert (target / "metrics.json").is_file()
+
+
+def test_an_earlier_run_is_replaced_as_a_whole(comparison: Comparison, tmp_path: Path) -> None:
+    write(comparison, tmp_path / "run")
+    (tmp_path / "run" / "left_over.txt").write_text("from the last time")
+    write(comparison, tmp_path / "run")
+    assert not (tmp_path / "run" / "left_over.txt").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_empty_directory_is_used(comparison: Comparison, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    write(comparison, tmp_path / "run")
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
+@pytest.mark.parametrize("name", ["thesis.tex", "manifest.json"])
+def test_a_foreign_directory_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / name).write_text("{}")
+    with pytest.raises(OutputError, match="other files"):
+        check_run_directory(tmp_path / "mine")
+    assert (tmp_path / "mine" / name).read_text() == "{}"
+
+
+def test_a_file_in_the_way_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        check_run_directory(tmp_path / "file")
+    with pytest.raises(OutputError):
+        check_run_directory(tmp_path / "file" / "run")
+
+
+def test_the_current_directory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="current directory"):
+        check_run_directory(Path())
+
+
+def test_checking_leaves_no_trace(tmp_path: Path) -> None:
+    check_run_directory(tmp_path / "deep" / "down" / "run")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,86 @@
+"""The table says everything a reader needs, in 120 columns, in text and in Markdown."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from toolkit.metrics import Scores
+from toolkit.report.comparison import Comparison
+from toolkit.report.report_md import report_text
+from toolkit.report.table import COLUMNS, as_markdown, as_text, comparison_table
+from toolkit.report.terminal import comparison_text
+
+
+def test_every_output_of_every_run_has_a_line(comparison: Comparison) -> None:
+    lines = as_text(comparison_table(comparison)).splitlines()
+    for row in comparison.rows:
+        assert any(line.split()[:3] == [row.estimator, row.output, row.status] for line in lines)
+
+
+def test_text_and_markdown_have_the_same_cells(comparison: Comparison) -> None:
+    table = comparison_table(comparison)
+    in_markdown = [line.strip("| ").split(" | ") for line in as_markdown(table).splitlines()[2:]]
+    in_text = [line.split() for line in as_text(table).splitlines()[-len(table.rows) :]]
+    assert in_markdown == in_text == [list(row) for row in table.rows]
+
+
+def test_alignments_pairs_and_coverage_are_named(comparison: Comparison) -> None:
+    text = as_text(comparison_table(comparison))
+    for word in ("SE(3)", "yaw", "pairs", "cover"):
+        assert word in text
+
+
+def test_no_line_is_wider_than_120_columns(comparison: Comparison) -> None:
+    assert max(map(len, comparison_text(comparison).splitlines())) <= 120
+
+
+def test_a_table_with_all_columns_fits_120_columns() -> None:
+    words = len("dead-reckoning  causal  diverged")
+    numbers = sum(2 + max(len("12.34"), *map(len, column.heading)) for column in COLUMNS)
+    assert words + numbers <= 120
+
+
+@pytest.mark.parametrize(
+    ("value", "cell"),
+    [(0.123, "0.12"), (15.8, "15.80"), (123.456, "123.46"), (26509.65, "26510"), (3.2e11, "3e+11"), (None, "-")],
+)
+def test_large_numbers_lose_decimals_before_they_take_space(
+    comparison: Comparison, value: float | None, cell: str
+) -> None:
+    row = comparison.rows[0]
+    scores = Scores(row.scores.values | {"ate_yaw_m": value, "ate_se3_m": 1.0}, {})
+    table = comparison_table(replace(comparison, rows=(replace(row, scores=scores),)))
+    cells = dict(zip(table.headings, table.rows[0], strict=True))
+    assert cells.get(("ATE", "yaw", "m"), "-") == cell
+
+
+def test_columns_are_aligned(comparison: Comparison) -> None:
+    lines = as_text(comparison_table(comparison)).splitlines()
+    rule = next(line for line in lines if set(line) <= {"-", " "})
+    ends = [match.end() for match in re.finditer("-+", rule)]
+    for line in lines[lines.index(rule) + 1 :]:
+        assert all(line[end - 1] != " " for end in ends[3:])
+
+
+def test_columns_without_any_value_are_dropped_and_explained(without_truth: Comparison) -> None:
+    text = comparison_text(without_truth)
+    table, _, prose = text.partition("start:")
+    assert "SE(3)" not in table
+    assert "ATE SE(3)" in prose
+    assert "no ground truth" in prose
+
+
+def test_diverged_and_failed_runs_are_explained(comparison: Comparison) -> None:
+    for text in (comparison_text(comparison), report_text(comparison, {})):
+        assert "astray diverged: it ran to the end" in text
+        assert "broken failed: it could not go on" in text
+        assert "the solve did not converge" in text
+
+
+def test_audit_start_and_facts_are_told(comparison: Comparison) -> None:
+    for text in (comparison_text(comparison), report_text(comparison, {})):
+        words = " ".join(text.split())
+        assert comparison.findings[0].detail in words
+        assert comparison.prior.source in words
+        assert all(fact in words for fact in comparison.sequence.provenance.facts)

@@ -1,0 +1,106 @@
+"""What a seed changes, what it does not, and that a simulated recording is clean."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import simulated
+from toolkit.models.stereo import disparity_px
+from toolkit.sequence import check_runnable
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
+
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+
+
+def short(scenario: Scenario) -> Scenario:
+    return replace(scenario, duration_s=3.0)
+
+
+@every_scenario
+def test_the_same_seed_gives_the_same_bits(scenario: Scenario) -> None:
+    assert simulate(short(scenario), 7).content_hash() == simulate(short(scenario), 7).content_hash()
+
+
+@every_scenario
+def test_seeds_differ_in_errors_only(scenario: Scenario) -> None:
+    one, other = simulate(short(scenario), 1), simulate(short(scenario), 2)
+    assert one.truth is not None
+    assert other.truth is not None
+    np.testing.assert_array_equal(one.truth.T_world_imu, other.truth.T_world_imu)
+    np.testing.assert_array_equal(one.truth.v_world, other.truth.v_world)
+    assert one.noise == other.noise
+    assert np.abs(one.motion.values - other.motion.values).min() > 0.0
+    assert one.content_hash() != other.content_hash()
+
+
+@every_scenario
+def test_one_stream_of_errors_does_not_move_another(scenario: Scenario) -> None:
+    plain = simulate(short(scenario), 1)
+    outliers = simulate(replace(short(scenario), camera=replace(scenario.camera, outlier_rate=0.2)), 1)
+    np.testing.assert_array_equal(plain.motion.values, outliers.motion.values)
+    np.testing.assert_array_equal(plain.observations.track_id, outliers.observations.track_id)
+    other_tracks = simulate(replace(short(scenario), camera=replace(scenario.camera, loss_per_frame=0.3)), 1)
+    np.testing.assert_array_equal(plain.motion.values, other_tracks.motion.values)
+    assert plain.prior is not None
+    assert other_tracks.prior is not None
+    np.testing.assert_array_equal(plain.prior.T_world_imu, other_tracks.prior.T_world_imu)
+
+
+def test_twist_and_imu_drive_the_same_road() -> None:
+    twist, imu = simulate(short(DRIVE), 1), simulate(short(DRIVE_IMU), 1)
+    assert twist.truth is not None
+    assert imu.truth is not None
+    np.testing.assert_array_equal(twist.truth.T_world_imu, imu.truth.T_world_imu)
+    np.testing.assert_array_equal(twist.observations.uv_px, imu.observations.uv_px)
+
+
+@every_scenario
+def test_a_recording_is_clean(scenario: Scenario) -> None:
+    for seed in range(3):
+        sequence = simulate(scenario, seed)
+        check_runnable(sequence)
+        assert disparity_px(sequence.observations.uv_px).min() > 0.0
+        assert np.bincount(sequence.observations.frame, minlength=sequence.frame_count).min() >= 40
+        assert (sequence.observations.uv_px >= 0.0).all()
+        width, height = scenario.camera.size_px
+        assert (sequence.observations.uv_px <= [width - 1, width - 1, height - 1]).all()
+
+
+@every_scenario
+def test_tracks_live_as_long_as_a_real_trackers_do(scenario: Scenario) -> None:
+    """The KITTI recordings of the project have 10 to 13 sightings a track, EuRoC's front ends 20 and more."""
+    lives = np.bincount(simulate(scenario, 0).observations.track_id)
+    low, high = (15.0, 35.0) if scenario is FLIGHT else (8.0, 16.0)
+    assert low < lives.mean() < high
+
+
+def test_without_noise_the_stated_noise_stays() -> None:
+    exact = simulate(noise_free(short(FLIGHT)), 0)
+    assert exact.noise == FLIGHT.motion.noise
+    assert exact.prior is not None
+    assert exact.truth is not None
+    np.testing.assert_array_equal(exact.prior.T_world_imu, exact.truth.T_world_imu[0])
+    np.testing.assert_array_equal(exact.truth.bias, 0.0)
+
+
+def test_truth_is_independent_of_the_motion_samples() -> None:
+    truth = simulate(short(FLIGHT), 0).truth
+    assert truth is not None
+    assert truth.independent
+
+
+@pytest.mark.parametrize(("scenario", "limit_s"), [(DRIVE, 1.5), (DRIVE_IMU, 1.5), (FLIGHT, 3.0)])
+def test_a_minute_is_simulated_in_time(scenario: Scenario, limit_s: float) -> None:
+    start = time.process_time()
+    simulate(scenario, 0)
+    assert time.process_time() - start < limit_s
+
+
+def test_the_built_in_recordings_have_names_and_take_a_seed() -> None:
+    assert set(simulated.BUILT_IN) == {"drive", "drive-imu", "flight"}
+    for name, make in simulated.BUILT_IN.items():
+        sequence = make(3)
+        assert sequence.name == name
+        assert "seed 3" in sequence.provenance.source

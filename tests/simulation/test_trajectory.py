@@ -1,0 +1,112 @@
+"""The splines' derivatives against differences, and what makes a road a road."""
+
+import numpy as np
+import pytest
+
+from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log
+from toolkit.simulation.stages import hall, road
+from toolkit.simulation.trajectory import (
+    RotationSpline,
+    Trajectory,
+    UniformKnots,
+    VectorSpline,
+    blending_matrix,
+)
+
+STEP_S = 1e-4
+TRAJECTORIES = {"road": road(20.0).trajectory, "hall": hall(20.0).trajectory}
+AT_S = np.linspace(0.5, 19.5, 191)
+
+
+@pytest.fixture(params=sorted(TRAJECTORIES))
+def trajectory(request: pytest.FixtureRequest) -> Trajectory:
+    return TRAJECTORIES[request.param]
+
+
+def test_velocity_is_the_derivative_of_position(trajectory: Trajectory) -> None:
+    before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
+    difference = (after.T_world_imu[:, :3, 3] - before.T_world_imu[:, :3, 3]) / (2.0 * STEP_S)
+    # Central differences err by step^2 / 6 times the third derivative, about 1e-8, and by rounding / step.
+    np.testing.assert_allclose(trajectory.at(AT_S).v_world, difference, atol=1e-7)
+
+
+def test_acceleration_is_the_derivative_of_velocity(trajectory: Trajectory) -> None:
+    difference = (trajectory.at(AT_S + STEP_S).v_world - trajectory.at(AT_S - STEP_S).v_world) / (2.0 * STEP_S)
+    np.testing.assert_allclose(trajectory.at(AT_S).a_world, difference, atol=1e-7)
+
+
+def test_angular_velocity_is_the_derivative_of_rotation_in_the_body(trajectory: Trajectory) -> None:
+    before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
+    turn = np.swapaxes(before.T_world_imu[:, :3, :3], 1, 2) @ after.T_world_imu[:, :3, :3]
+    np.testing.assert_allclose(trajectory.at(AT_S).w_imu, so3_log(turn) / (2.0 * STEP_S), atol=1e-7)
+
+
+def test_acceleration_and_angular_velocity_have_no_kinks(trajectory: Trajectory) -> None:
+    """At the knots too: a jump would make an IMU's samples no longer integrable."""
+    t_s = np.arange(0.0, 20.0, 1e-3)
+    motion = trajectory.at(t_s)
+    for signal in (motion.a_world, motion.w_imu):
+        second_difference = np.diff(signal, n=2, axis=0)
+        # A kink of slope s would leave 1e-3 s here; the smooth signals leave 1e-6 times their curvature.
+        assert np.abs(second_difference).max() < 1e-4
+
+
+def test_blending_weights_sum_to_one_and_cubic_is_the_textbook_matrix() -> None:
+    cubic = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
+    np.testing.assert_allclose(blending_matrix(4), cubic, atol=1e-15)
+    for order in (4, 5, 6):
+        np.testing.assert_allclose(blending_matrix(order).sum(axis=0), np.eye(order)[0], atol=1e-14)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_a_straight_line_of_control_points_is_a_straight_line(order: int) -> None:
+    knots = UniformKnots(-2.0, 0.5, order)
+    control = np.outer(-2.0 + 0.5 * np.arange(20), [1.0, -2.0, 3.0])
+    t_s = np.linspace(0.0, 4.0, 33)
+    np.testing.assert_allclose(VectorSpline(knots, control).at(t_s), np.outer(t_s, [1.0, -2.0, 3.0]), atol=1e-13)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_a_steady_turn_of_control_rotations_is_a_steady_turn(order: int) -> None:
+    knots, w = UniformKnots(-2.0, 0.5, order), np.array([0.3, -0.5, 0.8])
+    spline = RotationSpline(knots, so3_exp(np.outer(-2.0 + 0.5 * np.arange(20), w)))
+    t_s = np.linspace(0.0, 4.0, 33)
+    rotation, w_body = spline.at(t_s)
+    np.testing.assert_allclose(rotation, so3_exp(np.outer(t_s, w)), atol=1e-13)
+    np.testing.assert_allclose(w_body, np.broadcast_to(w, w_body.shape), atol=1e-13)
+
+
+def test_an_instant_the_spline_does_not_reach_is_refused() -> None:
+    spline = VectorSpline(UniformKnots(0.0, 1.0), np.zeros((10, 3)))
+    for t_s in (1.9, 7.1):
+        with pytest.raises(ValueError, match="more control points"):
+            spline.at(np.array([t_s]))
+
+
+def test_a_car_moves_where_it_points() -> None:
+    motion = road(60.0).trajectory.at(np.linspace(0.0, 60.0, 601))
+    v_imu = np.einsum("nji,nj->ni", motion.T_world_imu[:, :3, :3], motion.v_world)
+    np.testing.assert_allclose(v_imu[:, 1:], 0.0, atol=1e-13)
+    assert v_imu[:, 0].min() > 2.0
+    assert 11.0 < v_imu[:, 0].max() < 13.0
+
+
+def test_a_car_does_not_bank() -> None:
+    motion = road(60.0).trajectory.at(np.linspace(0.0, 60.0, 601))
+    np.testing.assert_allclose(motion.T_world_imu[:, 2, 1], 0.0, atol=1e-14)
+
+
+def test_a_flight_turns_and_accelerates_about_every_axis() -> None:
+    motion = hall(60.0).trajectory.at(np.linspace(0.0, 60.0, 1201))
+    assert np.std(motion.w_imu, axis=0).min() > 0.1
+    assert np.std(motion.a_world, axis=0).min() > 0.2
+    assert 0.7 < np.linalg.norm(motion.v_world, axis=1).mean() < 1.3
+
+
+@pytest.mark.parametrize("stage", [road, hall])
+def test_a_longer_recording_begins_like_a_shorter_one(stage: object) -> None:
+    t_s = np.linspace(0.0, 5.0, 51)
+    assert callable(stage)
+    short, long = stage(5.0).trajectory.at(t_s), stage(50.0).trajectory.at(t_s)
+    drift: Array = se3_log(se3_inverse(short.T_world_imu) @ long.T_world_imu)
+    np.testing.assert_allclose(drift, 0.0, atol=1e-9)

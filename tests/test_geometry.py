@@ -1,0 +1,228 @@
+"""The geometry against three independent oracles: GTSAM, scipy's matrix exponential, and differences."""
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from toolkit import geometry
+from toolkit.geometry import Array
+
+# The series end at angle 0.5; a small-angle threshold set too low or too high shows between 1e-9 and 1e-3.
+ANGLES = [0.0, 1e-12, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 0.1, 0.4999, 0.5, 0.5001, 1.0, 3.0, np.pi - 1e-6, np.pi]
+# A few hundred roundings of numbers of order one.
+ROUNDING = 1e-14
+DIRECTIONS = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [2.0, -1.0, 0.5], [-0.3, 0.2, 0.9]])
+
+
+def unit_directions() -> Array:
+    return np.asarray(DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True))
+
+
+def twists(angle: float) -> Array:
+    translations = np.random.default_rng(3).normal(scale=2.0, size=DIRECTIONS.shape)
+    return np.hstack([angle * unit_directions(), translations])
+
+
+def random_twists(count: int, longest_angle: float = 3.0) -> Array:
+    rng = np.random.default_rng(7)
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    return np.hstack([axis * rng.uniform(0.0, longest_angle, (count, 1)), rng.normal(scale=3.0, size=(count, 3))])
+
+
+def hat(xi: Array) -> Array:
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3], matrix[:3, 3] = geometry.skew(xi[:3]), xi[3:]
+    return matrix
+
+
+def derivative(f: Callable[[Array], Array], at: Array, step: float = 1e-5) -> Array:
+    """Central differences; their error is about step^2 plus rounding / step: 1e-10."""
+    columns = [(f(at + step * e) - f(at - step * e)) / (2.0 * step) for e in np.eye(at.size)]
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_so3_exp_equals_the_matrix_exponential(angle: float) -> None:
+    for phi in angle * unit_directions():
+        np.testing.assert_allclose(geometry.so3_exp(phi), expm(geometry.skew(phi)), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_se3_exp_equals_the_matrix_exponential(angle: float) -> None:
+    for xi in twists(angle):
+        np.testing.assert_allclose(geometry.se3_exp(xi), expm(hat(xi)), atol=5 * ROUNDING)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exponentials_equal_gtsam(angle: float) -> None:
+    # GTSAM 4.3 switches to short series near zero; they agree to 1e-12 at every angle tried here.
+    for xi in twists(angle):
+        np.testing.assert_allclose(geometry.so3_exp(xi[:3]), gtsam.Rot3.Expmap(xi[:3]).matrix(), atol=1e-12)
+        np.testing.assert_allclose(geometry.se3_exp(xi), gtsam.Pose3.Expmap(xi).matrix(), atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [a for a in ANGLES if a < np.pi - 1e-3])
+def test_logarithms_equal_gtsam(angle: float) -> None:
+    for xi in twists(angle):
+        T = geometry.se3_exp(xi)
+        np.testing.assert_allclose(geometry.so3_log(T[:3, :3]), gtsam.Rot3.Logmap(gtsam.Rot3(T[:3, :3])), atol=1e-11)
+        np.testing.assert_allclose(geometry.se3_log(T), gtsam.Pose3.Logmap(gtsam.Pose3(T)), atol=1e-10)
+
+
+@pytest.mark.parametrize("angle", ANGLES[:-1])
+def test_log_undoes_exp_below_pi(angle: float) -> None:
+    for xi in twists(angle):
+        np.testing.assert_allclose(geometry.so3_log(geometry.so3_exp(xi[:3])), xi[:3], atol=ROUNDING)
+        np.testing.assert_allclose(geometry.se3_log(geometry.se3_exp(xi)), xi, atol=10 * ROUNDING)
+
+
+def test_log_keeps_relative_precision_at_tiny_angles() -> None:
+    for angle in (1e-12, 1e-9, 1e-6, 1e-3):
+        phi = angle * unit_directions()
+        np.testing.assert_allclose(geometry.so3_log(geometry.so3_exp(phi)), phi, atol=1e-15 * angle, rtol=1e-13)
+
+
+def test_log_of_a_half_turn_is_one_of_its_two_vectors() -> None:
+    phi = np.pi * unit_directions()
+    logarithm = geometry.so3_log(geometry.so3_exp(phi))
+    sign = np.sign(np.einsum("ni,ni->n", logarithm, phi))[:, None]
+    np.testing.assert_allclose(sign * logarithm, phi, atol=1e-14)
+    np.testing.assert_array_less(np.linalg.norm(logarithm, axis=1), np.pi + 1e-14)
+
+
+def test_log_is_never_longer_than_pi() -> None:
+    beyond = geometry.so3_exp(np.linspace(3.0, 6.5, 40)[:, None] * unit_directions()[3])
+    assert np.linalg.norm(geometry.so3_log(beyond), axis=1).max() <= np.pi + 1e-14
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_so3_jacobians_equal_differences_and_gtsam(angle: float) -> None:
+    for phi in angle * unit_directions():
+        J_r = geometry.so3_right_jacobian(phi)
+        np.testing.assert_allclose(J_r, gtsam.Rot3.ExpmapDerivative(phi), atol=1e-11)
+        inverse = geometry.so3_exp(phi).T
+
+        def moved(x: Array, inverse: Array = inverse) -> Array:
+            return geometry.so3_log(inverse @ geometry.so3_exp(x))
+
+        np.testing.assert_allclose(J_r, derivative(moved, phi), atol=1e-9)
+        np.testing.assert_allclose(geometry.so3_left_jacobian(phi), geometry.so3_exp(phi) @ J_r, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_se3_right_jacobian_equals_differences_and_gtsam(angle: float) -> None:
+    for xi in twists(angle):
+        J_r = geometry.se3_right_jacobian(xi)
+        np.testing.assert_allclose(J_r, gtsam.Pose3.ExpmapDerivative(xi), atol=1e-9)
+        inverse = geometry.se3_inverse(geometry.se3_exp(xi))
+
+        def moved(x: Array, inverse: Array = inverse) -> Array:
+            return geometry.se3_log(inverse @ geometry.se3_exp(x))
+
+        np.testing.assert_allclose(J_r, derivative(moved, xi), atol=3e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_se3_right_jacobian_equals_the_exponential_of_ad(angle: float) -> None:
+    """J_r is the top right block of expm([[-ad, I], [0, 0]]), which knows no small angles at all."""
+    for xi in twists(angle):
+        ad = np.zeros((6, 6))
+        ad[:3, :3] = ad[3:, 3:] = geometry.skew(xi[:3])
+        ad[3:, :3] = geometry.skew(xi[3:])
+        augmented = np.zeros((12, 12))
+        augmented[:6, :6], augmented[:6, 6:] = -ad, np.eye(6)
+        np.testing.assert_allclose(geometry.se3_right_jacobian(xi), expm(augmented)[:6, 6:], atol=2e-13)
+
+
+def test_coefficients_agree_on_both_sides_of_the_series_switch() -> None:
+    below, above = 0.5 - 1e-9, 0.5 + 1e-9
+    for xi in twists(1.0):
+        near, far = (np.concatenate([a * xi[:3], xi[3:]]) for a in (below, above))
+        # A slope of order |translation| over 2e-9 rad.
+        np.testing.assert_allclose(geometry.se3_right_jacobian(near), geometry.se3_right_jacobian(far), atol=2e-8)
+        np.testing.assert_allclose(geometry.se3_exp(near), geometry.se3_exp(far), atol=2e-8)
+
+
+def test_adjoint_equals_gtsam_and_moves_a_twist_across_the_pose() -> None:
+    for xi, eta in zip(random_twists(20), random_twists(20)[::-1], strict=True):
+        T = geometry.se3_exp(xi)
+        np.testing.assert_allclose(geometry.se3_adjoint(T), gtsam.Pose3(T).AdjointMap(), atol=1e-13)
+        moved = geometry.se3_exp(geometry.se3_adjoint(T) @ eta)
+        np.testing.assert_allclose(T @ geometry.se3_exp(eta) @ geometry.se3_inverse(T), moved, atol=1e-11)
+
+
+def test_group_laws_hold_on_batches() -> None:
+    a, b, c = (geometry.se3_exp(x) for x in random_twists(300).reshape(3, 100, 6))
+    inverse, adjoint = geometry.se3_inverse, geometry.se3_adjoint
+    np.testing.assert_allclose((a @ b) @ c, a @ (b @ c), atol=1e-13)
+    np.testing.assert_allclose(a @ inverse(a), np.broadcast_to(np.eye(4), a.shape), atol=1e-14)
+    np.testing.assert_allclose(inverse(a @ b), inverse(b) @ inverse(a), atol=1e-13)
+    np.testing.assert_allclose(adjoint(a @ b), adjoint(a) @ adjoint(b), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(a[:, :3, :3]), 1.0, atol=1e-14)
+
+
+def test_batches_equal_one_at_a_time() -> None:
+    xi = random_twists(12).reshape(3, 4, 6)
+    for function, width in (
+        (geometry.se3_exp, 6),
+        (geometry.se3_right_jacobian, 6),
+        (geometry.so3_exp, 3),
+        (geometry.so3_left_jacobian, 3),
+    ):
+        batch = function(xi[..., :width])
+        single = np.array([[function(x[:width]) for x in row] for row in xi])
+        np.testing.assert_allclose(batch, single, atol=ROUNDING)
+    T = geometry.se3_exp(xi)
+    np.testing.assert_allclose(
+        geometry.se3_log(T), np.array([[geometry.se3_log(x) for x in row] for row in T]), atol=1e-13
+    )
+
+
+def test_transform_applies_the_pose_to_each_point() -> None:
+    T, points = geometry.se3_exp(random_twists(10)), random_twists(10)[:, 3:]
+    expected = [gtsam.Pose3(t).transformFrom(p) for t, p in zip(T, points, strict=True)]
+    np.testing.assert_allclose(geometry.transform(T, points), expected, atol=1e-14)
+    np.testing.assert_allclose(geometry.transform(geometry.se3_inverse(T[0]), geometry.transform(T[0], points)), points)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_quaternions_go_round_and_equal_gtsam(angle: float) -> None:
+    for rotation in geometry.so3_exp(angle * unit_directions()):
+        q = geometry.quaternion_from_rotation(rotation)
+        assert q[3] >= 0.0
+        np.testing.assert_allclose(np.linalg.norm(q), 1.0, atol=1e-15)
+        np.testing.assert_allclose(geometry.rotation_from_quaternion(q), rotation, atol=ROUNDING)
+        np.testing.assert_allclose(gtsam.Rot3.Quaternion(q[3], *q[:3]).matrix(), rotation, atol=ROUNDING)
+        np.testing.assert_allclose(geometry.rotation_from_quaternion(-2.5 * q), rotation, atol=ROUNDING)
+
+
+def test_yaw_is_the_angle_about_z() -> None:
+    yaw = np.linspace(-3.1, 3.1, 23)
+    np.testing.assert_allclose(geometry.yaw_of(geometry.about_z(yaw)), yaw, atol=ROUNDING)
+    np.testing.assert_allclose(geometry.about_z(0.3), gtsam.Rot3.Yaw(0.3).matrix(), atol=ROUNDING)
+
+
+def test_interpolation_hits_the_knots_and_moves_on_the_geodesic() -> None:
+    t_ns = np.array([1_600_000_000_000_000_000, 1_600_000_000_100_000_000, 1_600_000_000_350_000_000])
+    # Steps of less than half a turn: the geodesic is the short one.
+    poses = np.eye(4) @ geometry.se3_exp(np.cumsum(0.3 * random_twists(3), axis=0))
+    np.testing.assert_allclose(geometry.interpolate_poses(t_ns, poses, t_ns), poses, atol=1e-13)
+    step = geometry.se3_log(geometry.se3_inverse(poses[1]) @ poses[2])
+    quarter = geometry.interpolate_poses(t_ns, poses, t_ns[1:2] + 62_500_000)
+    np.testing.assert_allclose(quarter[0], poses[1] @ geometry.se3_exp(0.25 * step), atol=1e-13)
+
+
+def test_skew_is_the_cross_product() -> None:
+    a, b = random_twists(5)[:, 3:], random_twists(5)[::-1, 3:]
+    np.testing.assert_allclose((geometry.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=ROUNDING)
+
+
+def test_read_only_arrays_cannot_be_written() -> None:
+    mine = np.zeros(3)
+    array = geometry.read_only(mine)
+    with pytest.raises(ValueError, match="read-only"):
+        array[0] = 1.0

@@ -1,0 +1,74 @@
+"""What a fault is: a name, its place in the order, and a check that describes it and offers a repaired sequence."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+from toolkit.audit.parts.intervals import Intervals, compare, is_comparable
+from toolkit.audit.parts.vision import CameraMotion, camera_motion
+from toolkit.sequence import Sequence
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault found in a recording, as it is reported.
+
+    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` says
+    that the fault is harmful and still there, so that a check of the recording has to fail.
+    """
+
+    fault: str
+    count: int
+    repaired: bool
+    detail: str
+    blocking: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Symptom:
+    """What a check saw: how often, in words, and the sequence without it.
+
+    ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` says in words what
+    the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks.
+    """
+
+    count: int
+    detail: str
+    treatment: str
+    remedy: Sequence | None
+    harmful: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The sequence as it stands when a fault is checked, with what several checks derive from it."""
+
+    sequence: Sequence
+
+    @cached_property
+    def camera_motion(self) -> CameraMotion:
+        """The camera's own motion over each interval, from the stereo tracks alone."""
+        return camera_motion(self.sequence)
+
+    @cached_property
+    def intervals(self) -> Intervals | None:
+        """What the motion samples and the camera say of each interval; None where that cannot be compared."""
+        return compare(self.sequence, self.camera_motion) if is_comparable(self.sequence) else None
+
+    def after(self, remedy: Sequence) -> "Evidence":
+        """Return the evidence after a repair; what the tracks say is kept where the repair left them alone."""
+        now, before = Evidence(remedy), self.sequence
+        same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
+        if same_tracks and "camera_motion" in self.__dict__:
+            now.__dict__["camera_motion"] = self.camera_motion
+        return now
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One kind of fault. ``after`` names the faults that must have been checked (and repaired) before it."""
+
+    name: str
+    summary: str
+    check: Callable[[Evidence], Symptom | None]
+    after: tuple[str, ...] = ()

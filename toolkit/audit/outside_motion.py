@@ -1,0 +1,32 @@
+"""Frames before the first or after the last motion sample."""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.frames import keep_frames
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the frames no motion sample reaches and cut them off."""
+    sequence = evidence.sequence
+    frames_t_ns, motion_t_ns = sequence.frames_t_ns, sequence.motion.t_ns
+    if motion_t_ns.size == 0:
+        return Symptom(sequence.frame_count, "there are no motion samples", "no frame can be used", remedy=None)
+    covered = (frames_t_ns >= motion_t_ns.min()) & (frames_t_ns <= motion_t_ns.max())
+    count = int(np.sum(~covered))
+    if count == 0:
+        return None
+    return Symptom(
+        count=count,
+        detail=f"{count} of {sequence.frame_count} frames lie outside the time of the motion samples",
+        treatment="cut off",
+        remedy=keep_frames(sequence, np.flatnonzero(covered)),
+    )
+
+
+FAULT = Fault(
+    "outside-motion",
+    "frames before the first or after the last motion sample",
+    check,
+    after=("time-order", "not-finite"),  # a dropped sample at an end uncovers a frame
+)

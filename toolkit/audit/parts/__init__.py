@@ -1,0 +1,1 @@
+"""What several faults share; no file here is a fault."""

@@ -1,0 +1,91 @@
+"""Frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves.
+
+From such a frame on each track follows a different scene point: its steps before and after agree with the
+motion, the step into the stale frame is zero. A standing camera repeats pixels too, and that is no fault: the
+image must have been moving just before and just after.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.neighbours import Neighbours, neighbours
+from toolkit.audit.parts.tracks import by_track, split
+from toolkit.geometry import Array, BoolArray
+from toolkit.sequence import Observations, Sequence
+
+# Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale
+# frame of a moving vehicle and 0 in any other.
+LEAST_SHARE = 0.9
+# Tracks that must survive into the frame: fewer could repeat by chance where pixels are rounded.
+LEAST_TRACKS = 4
+# Upper quartile of the pixel steps that tells a moving camera (far points hardly move). Measured: at least 0.96 px
+# beside a stale frame, at most 0.05 px with the vehicle parked.
+MOVING_PX = 0.5
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the stale frames; every repeated track ends there and a new one starts at the next frame."""
+    sequence = evidence.sequence
+    pairs = neighbours(sequence.observations)
+    step_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before]).max(axis=1)
+    stale = _stale_intervals(sequence.frame_count - 1, pairs, step_px)
+    count = int(stale.sum())
+    if count == 0:
+        return None
+    repeated = np.zeros(len(sequence.observations), dtype=bool)
+    repeated[pairs.after] = stale[pairs.interval] & (step_px == 0.0)
+    return Symptom(
+        count=count,
+        detail=(
+            f"{count} of {sequence.frame_count} frames repeat the pixels of the frame before them exactly while the "
+            f"vehicle moves ({repeated.sum()} sightings)"
+        ),
+        treatment="every repeated track ends there, the repeats are dropped, and a new track starts at the next frame",
+        remedy=_cut_tracks(sequence, repeated),
+    )
+
+
+def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array) -> BoolArray:
+    """Say of each interval whether its tracks stand still between moving ones."""
+    survivors = np.bincount(pairs.interval, minlength=intervals)
+    repeats = np.bincount(pairs.interval[step_px == 0.0], minlength=intervals)
+    frozen = (repeats >= LEAST_SHARE * survivors) & (survivors >= LEAST_TRACKS)
+    moving = _typical_step_px(intervals, pairs, step_px) > MOVING_PX
+    # The nearest interval that is not frozen, on either side; past the ends there is none.
+    index = np.arange(intervals)
+    before = np.maximum.accumulate(np.where(frozen, -1, index))
+    after = np.minimum.accumulate(np.where(frozen, intervals, index)[::-1])[::-1]
+    moving_or_end = np.concatenate([moving, [False]])  # index -1 and index `intervals` both read False
+    stale: BoolArray = frozen & moving_or_end[before] & moving_or_end[after]
+    return stale
+
+
+def _typical_step_px(intervals: int, pairs: Neighbours, step_px: Array) -> Array:
+    """Return the upper quartile of the pixel steps (K - 1,) of each interval, zero where no track survives."""
+    order = np.lexsort((step_px, pairs.interval))
+    first = np.searchsorted(pairs.interval, np.arange(intervals + 1))
+    count = np.diff(first)
+    quartile = np.minimum(first[:-1] + (3 * count) // 4, max(order.size - 1, 0))
+    return np.where(count > 0, step_px[order][quartile], 0.0) if order.size else np.zeros(intervals)
+
+
+def _cut_tracks(sequence: Sequence, repeated: BoolArray) -> Sequence:
+    """Drop the repeated sightings (N,) and give their tracks a new id from the next frame on."""
+    observations = sequence.observations
+    order = by_track(observations)
+    starts = np.zeros(len(observations), dtype=bool)
+    starts[order[1:]] = repeated[order[:-1]]
+    track_id, kept = split(observations, starts), ~repeated
+    cut = Observations.sorted(observations.frame[kept], track_id[kept], observations.uv_px[kept])
+    return replace(sequence, observations=cut)
+
+
+FAULT = Fault(
+    "stale-frames",
+    "frames whose tracks repeat the previous frame's pixels exactly while the vehicle moves",
+    check,
+    # Dropped sightings would hide that a track went through a stale frame.
+    after=("time-order", "returning-tracks"),
+)

@@ -1,0 +1,75 @@
+"""Holes in time: in the motion samples, where nothing tells how the vehicle moved, and in the frames.
+
+A hole in the frames alone is information, for the motion samples bridge it. A hole in the motion samples is a
+fault: whatever is put there is invented, and no noise model covers it. The longest stretch without such a
+hole is kept; stitching the rest on would need a pose nobody measured.
+"""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.frames import keep_frames
+from toolkit.geometry import IntArray
+from toolkit.sequence import NS_PER_S, Sequence
+
+# A step this many times the usual one is a hole; one missing stamp makes 2, two make 3.
+GAP_RATIO = 3.5
+# Motion samples may be further apart than that (a dropped sample of a fast IMU) and still be interpolated.
+MOTION_GAP_S = 1.0
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Find holes in the motion samples (keep the longest stretch between them) or, failing that, in the frames."""
+    sequence = evidence.sequence
+    holes = _holes(sequence.motion.t_ns, MOTION_GAP_S)
+    # Only what lies between the first and the last frame matters.
+    inside = (sequence.motion.t_ns[holes + 1] > sequence.frames_t_ns[:1]) & (
+        sequence.motion.t_ns[holes] < sequence.frames_t_ns[-1:]
+    )
+    return _motion_symptom(sequence, holes[inside]) if inside.any() else _frames_symptom(sequence)
+
+
+def _holes(t_ns: IntArray, least_s: float) -> IntArray:
+    """Return the rows after which the next stamp is too far away."""
+    step_s = np.diff(t_ns) / NS_PER_S
+    if step_s.size == 0:
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero(step_s > max(least_s, GAP_RATIO * float(np.median(step_s))))
+
+
+def _motion_symptom(sequence: Sequence, holes: IntArray) -> Symptom:
+    t_ns = sequence.motion.t_ns
+    longest_s = float((t_ns[holes + 1] - t_ns[holes]).max()) / NS_PER_S
+    # A frame at the very edge of a hole still belongs to the stretch beside it.
+    stretch = np.searchsorted(t_ns[holes + 1], sequence.frames_t_ns, side="right")
+    in_hole = np.searchsorted(t_ns[holes], sequence.frames_t_ns, side="left") > stretch
+    sizes = np.bincount(stretch[~in_hole], minlength=1)
+    kept = np.flatnonzero(~in_hole & (stretch == np.argmax(sizes)))
+    return Symptom(
+        count=holes.size,
+        detail=f"{holes.size} hole(s) in the motion samples, the longest of {longest_s:.2f} s",
+        treatment=f"the longest stretch without one is kept: {kept.size} of {sequence.frame_count} frames",
+        remedy=keep_frames(sequence, kept),
+    )
+
+
+def _frames_symptom(sequence: Sequence) -> Symptom | None:
+    holes = _holes(sequence.frames_t_ns, 0.0)
+    if holes.size == 0:
+        return None
+    longest_s = float(np.diff(sequence.frames_t_ns)[holes].max()) / NS_PER_S
+    return Symptom(
+        count=holes.size,
+        detail=f"{holes.size} hole(s) in the frames, the longest of {longest_s:.2f} s",
+        treatment="the motion samples bridge them",
+        remedy=None,
+        harmful=False,
+    )
+
+
+FAULT = Fault(
+    "time-gap",
+    "holes in the motion samples or in the frames",
+    check,
+    after=("time-order", "not-finite", "outside-motion"),
+)

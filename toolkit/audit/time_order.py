@@ -1,0 +1,46 @@
+"""Stamps of frames or motion samples that repeat, run backwards, or are no time at all."""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.frames import keep_frames
+from toolkit.audit.parts.samples import keep_samples
+from toolkit.geometry import IntArray
+
+# What a cast of NaN to int64 gives.
+NOT_A_TIME = np.iinfo(np.int64).min
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the stamps that are not after all the stamps before them; sort, first of equals kept."""
+    sequence = evidence.sequence
+    frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
+    if frames + samples == 0:
+        return None
+    remedy = sequence
+    if frames:
+        remedy = keep_frames(remedy, _in_order(sequence.frames_t_ns))
+    if samples:
+        remedy = keep_samples(remedy, _in_order(sequence.motion.t_ns))
+    return Symptom(
+        count=frames + samples,
+        detail=f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them",
+        treatment="sorted by time; of equal stamps the first is kept; stamps that are no time are dropped",
+        remedy=remedy,
+    )
+
+
+def _late(t_ns: IntArray) -> int:
+    """Count the stamps that are no time, or not after every valid stamp before them."""
+    latest_before = np.maximum.accumulate(np.concatenate([[NOT_A_TIME], t_ns[:-1]]))
+    return int(np.sum(t_ns <= latest_before)) if t_ns.size else 0
+
+
+def _in_order(t_ns: IntArray) -> IntArray:
+    """Return the rows that sort the stamps, without repeats (the first wins) and without invalid ones."""
+    _, first_row = np.unique(t_ns, return_index=True)
+    rows: IntArray = first_row[t_ns[first_row] != NOT_A_TIME]
+    return rows
+
+
+FAULT = Fault("time-order", "time stamps that repeat, run backwards or are no time at all", check)

@@ -1,0 +1,79 @@
+"""Twist samples that describe another interval than the one they are paired with.
+
+With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
+0 where the sample at the start describes the interval, 1 where that at the end does, 1/2 for their mean. Fitting
+it by least squares favours 1/2 on noisy samples, for a mean has half the noise; the change of the neighbouring
+camera rotations serves as an instrument, which follows the change of the samples but knows nothing of their
+noise, so the answer does not depend on the noise at all.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
+from toolkit.audit.parts.robust import Scalar, slope
+from toolkit.geometry import BoolArray, IntArray
+from toolkit.sequence import Pairing, Sequence, TwistSamples
+
+LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
+# The lag must be known to this and differ from the present pairing's by so many standard errors.
+LARGEST_ERROR = 0.1
+SIGMAS = 5.0
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Measure the lag of the angular velocities; pair the samples by the nearest of start, mean and end."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    if intervals is None or not isinstance(sequence.motion, TwistSamples):
+        return None
+    lag = _lag(sequence, intervals)
+    if lag is None or lag.error > LARGEST_ERROR:
+        return None
+    present = sequence.motion.pairing
+    nearest = min(LAG, key=lambda pairing: abs(LAG[pairing] - lag.value))
+    if nearest == present or abs(lag.value - LAG[present]) < SIGMAS * lag.error:
+        return None
+    return Symptom(
+        count=1,
+        detail=(
+            f"the twist samples describe the motion {lag.value:.2f} +- {lag.error:.2f} of an interval away from its "
+            f'start, which is "{nearest}", not "{present}"'
+        ),
+        treatment=f'an interval is paired with the sample of its "{nearest}"',
+        remedy=replace(sequence, motion=replace(sequence.motion, pairing=nearest)),
+    )
+
+
+def _lag(sequence: Sequence, intervals: Intervals) -> Scalar | None:
+    """Estimate the lag where both frames have a sample and the camera's motion is known on either side."""
+    w_camera = np.zeros((sequence.frame_count - 1, 3))
+    w_camera[intervals.interval] = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    known = np.zeros(sequence.frame_count - 1, dtype=bool)
+    known[intervals.interval] = True
+    sample, follows = _samples_at_frames(sequence)
+    middle = 1 + np.flatnonzero(known[:-2] & known[1:-1] & known[2:] & follows[1:-1])
+    if middle.size < LEAST_INTERVALS:
+        return None
+    w_samples = sequence.motion.values[:, 3:]
+    at_start, at_end = w_samples[sample[middle]], w_samples[sample[middle] + 1]
+    unexplained = w_camera[middle] - at_start
+    instrument = 0.5 * (w_camera[middle + 1] - w_camera[middle - 1])
+    return slope(instrument, at_end - at_start, unexplained - np.median(unexplained, axis=0))
+
+
+def _samples_at_frames(sequence: Sequence) -> tuple[IntArray, BoolArray]:
+    """Return the sample at or after each frame (K,), and which intervals (K - 1,) have just one sample at each end."""
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    sample = np.searchsorted(t_ns, frames_t_ns)
+    at_frame = t_ns[sample] == frames_t_ns
+    return sample, at_frame[:-1] & at_frame[1:] & (np.diff(sample) == 1)
+
+
+FAULT = Fault(
+    "twist-lag",
+    "twist samples that describe another interval than the one they are paired with",
+    check,
+    after=("mixed-axes", "extrinsic-translation"),
+)

@@ -1,0 +1,122 @@
+"""What the subcommands share: the parser, the kinds of arguments and the exit statuses."""
+
+import argparse
+import textwrap
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+
+from toolkit.errors import VislamError
+
+if TYPE_CHECKING:
+    # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
+    Subcommands = argparse._SubParsersAction["Parser"]
+
+_EXIT_STATUSES = """\
+exit status:
+  0    everything ran and ended well
+  1    an estimator diverged or failed (the results are written and say so),
+       or check-data found a fault that is not repaired
+  2    the command line is wrong
+  3    a recording or a truth file cannot be used
+  4    the results cannot be written
+  5    an estimator is unknown or cannot be used here
+  130  interrupted (Ctrl-C or SIGTERM); nothing is left half-written"""
+
+
+class UsageError(VislamError):
+    """A command line that asks for something that does not exist."""
+
+    exit_status: ClassVar[int] = 2
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that keeps the layout of its epilog, takes no abbreviations and reports an error in one line."""
+
+    def __init__(self, *, description: str, **options: Any) -> None:
+        super().__init__(
+            description=textwrap.fill(description, 80),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            **options,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Leave with status 2 and one line on stderr."""
+        self.exit(2, f"vislam: error: {message} (see {self.prog} --help)\n")
+
+
+class ShowVersion(argparse.Action):
+    """Prints the version; looks it up only then, for that takes longer than all the parsing."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        """Print and leave."""
+        from importlib.metadata import version
+
+        print(f"vislam {version('vislam-toolkit')}")
+        parser.exit()
+
+
+def epilog(*examples: str) -> str:
+    """Return the end of a help text: examples that a test executes, and the exit statuses."""
+    lines = "\n".join(f"  $ {example}" for example in examples)
+    return f"example:\n{lines}\n\n{_EXIT_STATUSES}"
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Parse names separated by commas; each counts once."""
+    found = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    if not found:
+        raise argparse.ArgumentTypeError("expected names separated by commas")
+    return found
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return a parser of whole numbers that are no smaller than ``least``."""
+
+    def whole_number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
+        if value < least:
+            raise argparse.ArgumentTypeError(f"expected at least {least}, not {value}")
+        return value
+
+    return whole_number
+
+
+def positive_seconds(text: str) -> float:
+    """Parse a finite duration greater than zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}") from None
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected seconds greater than zero, not {text}")
+    return value
+
+
+def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that keep the audit from repairing; read them with :func:`kept_faults`."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--no-repair", action="store_true", help="report the faults of a recording, repair none")
+    group.add_argument("--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these (see list)")
+
+
+def kept_faults(options: argparse.Namespace, known: Collection[str]) -> frozenset[str]:
+    """Return the faults that are not to be repaired, or raise UsageError for one that does not exist."""
+    if options.no_repair:
+        return frozenset(known)
+    return frozenset(known_names("fault", options.keep, known))
+
+
+def known_names(kind: str, given: Iterable[str], known: Collection[str]) -> list[str]:
+    """Return the names given, or raise UsageError for the first that is not among the known."""
+    checked = list(given)
+    for name in checked:
+        if name not in known:
+            raise UsageError(f"no {kind} is called {name}; there are {', '.join(known)}")
+    return checked

@@ -1,0 +1,91 @@
+"""``vislam compare``: estimators side by side on the same measurements."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults, names
+
+if TYPE_CHECKING:
+    from toolkit.cli.arguments import Subcommands
+
+SEQUENCES = ("kitti00", "drive")
+ESTIMATORS = ("dead-reckoning", "ekf", "batch")
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "compare",
+        help="run estimators on the same measurements and compare them",
+        description="Run estimators on the same measurements of each SEQUENCE and compare them: a table here, and a "
+        "run directory with report, metrics, trajectories, landmarks and figures.",
+        epilog=epilog("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive"),
+    )
+    parser.add_argument(
+        "sequences",
+        metavar="SEQUENCE",
+        nargs="*",
+        default=SEQUENCES,
+        help=f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
+    )
+    parser.add_argument(
+        "--estimators",
+        metavar="NAME,...",
+        type=names,
+        default=ESTIMATORS,
+        help=f"what to compare, see 'vislam list' (default: {','.join(ESTIMATORS)})",
+    )
+    parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="run directory (default: runs/<date and time>)")
+    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
+    add_repair_arguments(parser)
+    parser.add_argument(
+        "--start",
+        choices=("measurements", "truth"),
+        default="measurements",
+        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
+    )
+    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of simulated sequences (default: 0)")
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Compare, print and return 1 where an estimator diverged or failed."""
+    from toolkit.audit import faults
+    from toolkit.cli.arguments import UsageError
+    from toolkit.report.progress import progress_on
+    from toolkit.report.session import Request, compare_all
+    from toolkit.report.terminal import comparison_text
+
+    if options.truth is not None and len(options.sequences) != 1:
+        raise UsageError("--truth goes with exactly one SEQUENCE (see vislam compare --help)")
+    request = Request(
+        sources=tuple(options.sequences),
+        estimators=options.estimators,
+        out=options.out if options.out is not None else _new_run(),
+        truth=options.truth,
+        max_frames=options.max_frames,
+        keep=kept_faults(options, faults()),
+        start=options.start,
+        seed=options.seed,
+        command=shlex.join(options.command_line),
+    )
+    all_ok = True
+    for comparison, directory in compare_all(request, lambda label: progress_on(sys.stderr, label)):
+        print(comparison_text(comparison), f"\nresults: {directory}\n", sep="\n", flush=True)
+        all_ok = all_ok and comparison.all_ok
+    return 0 if all_ok else 1
+
+
+def _new_run() -> Path:
+    """Return a directory named by the local time that does not exist yet."""
+    from datetime import datetime
+
+    stamp = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    free = (Path("runs") / name for name in (stamp, *(f"{stamp}_{n}" for n in range(2, 1000))))
+    return next(path for path in free if not path.exists())

@@ -1,0 +1,42 @@
+"""``vislam list``: every estimator, sequence, format, metric and fault there is."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import epilog
+
+if TYPE_CHECKING:
+    from toolkit.cli.arguments import Subcommands
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "list",
+        help="list estimators, built-in sequences, formats, metrics and faults",
+        description="List what can be named on the command line: estimators, built-in sequences, the formats that "
+        "are recognised, metrics, and the faults the audit knows.",
+        epilog=epilog("vislam list"),
+    )
+    parser.set_defaults(command=command)
+
+
+def command(_options: argparse.Namespace) -> int:
+    """Print the lists."""
+    from toolkit.audit import faults
+    from toolkit.datasets import built_in_names, formats
+    from toolkit.estimator import discover
+    from toolkit.metrics import describe
+    from toolkit.report.terminal import listing_text
+
+    sections = {
+        "estimators": {name: entry.summary() for name, entry in discover().items()},
+        "built-in sequences": dict.fromkeys(built_in_names(), ""),
+        "formats": formats(),
+        "metrics": describe(),
+        "faults": faults(),
+    }
+    print("\n\n".join(listing_text(title, entries) for title, entries in sections.items()))
+    return 0

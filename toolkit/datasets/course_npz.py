@@ -1,0 +1,82 @@
+"""Course recordings (UC San Diego, ECE 276A): npz with twists, stereo features 4 x M x T, and their calibration.
+
+Two generations of key names are read: ``angular_velocity`` with ``imu_T_cam`` (camera -> IMU), and
+``rotational_velocity`` with ``cam_T_imu`` (IMU -> camera). Faults of a file are kept for the audit to find.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.datasets.parts.fields import Fields, check_frame_count
+from toolkit.datasets.parts.npz_archive import NpzArchive, SparseArray, glance, opened
+from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.parts.stereo_rows import observations
+from toolkit.geometry import Array, se3_inverse
+from toolkit.noise import pixel_covariance, twist_noise
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, TwistSamples
+
+_NOT_SEEN = -1.0
+_REQUIRED = (
+    "time_stamps",
+    "linear_velocity",
+    "angular_velocity|rotational_velocity",
+    "K",
+    "b",
+    "imu_T_cam|cam_T_imu",
+)
+_NAMES = {"features"}.union(*(keys.split("|") for keys in _REQUIRED))
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is an npz with at least one of the format's keys."""
+    return bool(_NAMES & glance(path))
+
+
+def load(path: Path) -> Sequence:
+    """Read a recording; its features are streamed and never held dense.
+
+    Raises DataError where the archive is damaged, or a key is missing or not of its shape.
+    """
+    with opened(path) as archive:
+        fields = archive.fields("features")
+        fields.require(*_REQUIRED)
+        t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
+        check_frame_count(path, t_ns.size)
+        sightings = _sightings(archive, t_ns.size)
+    v_mps = fields.array("linear_velocity", 3, t_ns.size).T
+    w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
+    facts = () if len(sightings) else ("no image features in this file",)
+    return Sequence(
+        name=path.stem,
+        rig=_rig(fields),
+        noise=twist_noise(t_ns, v_mps, w_radps),
+        frames_t_ns=t_ns,
+        observations=sightings,
+        motion=TwistSamples(t_ns, v_mps, w_radps),
+        provenance=Provenance("course-npz", str(path), facts),
+    )
+
+
+def _rig(fields: Fields) -> StereoRig:
+    K = fields.constant("K", 3, 3)
+    T_imu_cam = fields.rigid("imu_T_cam") if "imu_T_cam" in fields else se3_inverse(fields.rigid("cam_T_imu"))
+    return StereoRig(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.positive("b"), T_imu_cam, pixel_covariance(2))
+
+
+def _sightings(archive: NpzArchive, frame_count: int) -> Observations:
+    if "features" not in archive.keys:
+        nothing = np.empty(0, dtype=np.int64)
+        return Observations(nothing, nothing, np.empty((0, 3)))
+    features = archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN)
+    return _gather(features)
+
+
+def _gather(features: SparseArray) -> Observations:
+    """Join the coordinates of each sighting; one that lacks a coordinate gets NaN there, for the audit to find."""
+    coordinate, track, frame = features.indices
+    tracks = max(features.shape[1], 1)
+    cell, row = np.unique(frame * tracks + track, return_inverse=True)
+    corners_px: Array = np.full((cell.size, 4), np.nan)
+    corners_px[row, coordinate] = features.value
+    return observations(cell // tracks, cell % tracks, corners_px)

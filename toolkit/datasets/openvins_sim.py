@@ -1,0 +1,151 @@
+"""Exports of the OpenVINS simulator: a folder with calib.json and imu, features and truth_cam as csv or csv.gz.
+
+World z is up; accelerations are specific force; T_imu_cam takes the camera to the IMU, and quaternions (w first) take
+the IMU to the world: so read, the truth reprojects the next frame to 1.2 px with 1 px noise, and not to 8 px or more.
+Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
+"""
+
+import json
+from collections.abc import Iterator
+from json import JSONDecodeError
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.datasets.parts.csv_table import find_table, read_columns
+from toolkit.datasets.parts.fields import Fields, check_frame_count
+from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.parts.stereo_rows import observations
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray, rotation_from_quaternion, se3, se3_inverse
+from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
+
+_CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
+_IMU_COLUMNS = ("timestamp", "ax", "ay", "az", "gx", "gy", "gz")
+_FEATURE_COLUMNS = ("timestamp", "frame", "feature_id", "uL", "vL", "uR", "vR", "in_left", "in_right")
+_TRUTH_COLUMNS = (
+    *("timestamp", "qx", "qy", "qz", "qw", "px", "py", "pz", "vx", "vy", "vz"),
+    *("bax", "bay", "baz", "bgx", "bgy", "bgz"),
+)
+_NOISE_KEYS = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
+_CAMERA_KEYS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_REQUIRED = (
+    *(f"{camera}.{key}" for camera in ("cam0", "cam1") for key in (*_CAMERA_KEYS, "T_imu_cam")),
+    *(f"imu.{key}" for key in _NOISE_KEYS),
+    *("pixel_noise_sigma", "gravity_world"),
+)
+# How far the right camera may be from a pure shift along x of the left one to count as rectified.
+_RECTIFIED_TOLERANCE = 1e-6
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is a folder whose calibration or feature table is of this kind."""
+    calibration, features = path / _CALIBRATION, find_table(path, _FEATURES)
+    if calibration.is_file():
+        return '"cam0"' in calibration.read_text(encoding="utf-8", errors="replace")
+    return features is not None and find_table(path, _IMU) is not None
+
+
+def load(path: Path) -> Sequence:
+    """Read an export, with its truth where it has one; frames outside the IMU's time are dropped.
+
+    Raises DataError where files or columns are missing, damaged or not numeric, or the pair is not rectified.
+    """
+    imu_path, features_path = _tables(path)
+    calibration = _calibration(path / _CALIBRATION)
+    imu = read_columns(imu_path, _IMU_COLUMNS)
+    motion = ImuSamples(stamps_ns(imu_path, "timestamp", imu[:, 0]), imu[:, 1:4], imu[:, 4:7])
+    frames_t_ns, sightings = _frames(features_path, motion.t_ns)
+    check_frame_count(path, frames_t_ns.size)
+    return Sequence(
+        name=path.resolve().name,
+        rig=_rig(calibration),
+        noise=ImuNoise(**{key: calibration.number(f"imu.{key}") for key in _NOISE_KEYS}),
+        frames_t_ns=frames_t_ns,
+        observations=sightings,
+        motion=motion,
+        provenance=Provenance("openvins-sim", str(path), ("simulated by OpenVINS; feature ids return after gaps",)),
+        truth=_truth(path),
+        gravity_world=calibration.constant("gravity_world", 3),
+    )
+
+
+def _tables(folder: Path) -> tuple[Path, Path]:
+    """Return the paths of the IMU and the feature table, or raise DataError listing every file that is missing."""
+    imu, features = find_table(folder, _IMU), find_table(folder, _FEATURES)
+    if imu is None or features is None or not (folder / _CALIBRATION).is_file():
+        there = {_CALIBRATION: (folder / _CALIBRATION).is_file(), _IMU: imu, _FEATURES: features}
+        missing = ", ".join(name for name, found in there.items() if not found)
+        raise DataError(f"{folder}: missing {missing} (tables may be gzipped); copy the whole export")
+    return imu, features
+
+
+def _calibration(path: Path) -> Fields:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: holds a JSON {type(content).__name__}, expected an object; export it again")
+    fields = Fields(path, dict(_leaves(content)))
+    fields.require(*_REQUIRED)
+    return fields
+
+
+def _leaves(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield what a tree of JSON objects holds as arrays with dotted keys; ragged lists become arrays of objects."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, _as_array(value)
+
+
+def _as_array(value: Any) -> Any:
+    try:
+        return np.asarray(value)
+    except ValueError:  # a ragged list has no shape
+        return np.asarray(str(value))
+
+
+def _rig(calibration: Fields) -> StereoRig:
+    left, right = ([calibration.number(f"{camera}.{key}") for key in _CAMERA_KEYS] for camera in ("cam0", "cam1"))
+    T_imu_cam = calibration.rigid("cam0.T_imu_cam")
+    T_left_right = se3_inverse(T_imu_cam) @ calibration.rigid("cam1.T_imu_cam")
+    baseline_m = float(T_left_right[0, 3])
+    shift = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
+    rectified = left == right and not any(left[4:]) and np.allclose(T_left_right, shift, atol=_RECTIFIED_TOLERANCE)
+    if not rectified or baseline_m <= 0.0:
+        raise DataError(f"{calibration.path}: cam0 and cam1 are not a rectified pair; export rectified features")
+    variance_px2 = calibration.positive("pixel_noise_sigma") ** 2
+    # v is the mean of two rows measured independently, so its variance is half.
+    fx_px, fy_px, cx_px, cy_px = left[:4]
+    cov_uv_px2 = variance_px2 * np.diag([1.0, 1.0, 0.5])
+    return StereoRig(fx_px, fy_px, cx_px, cy_px, baseline_m, T_imu_cam, cov_uv_px2)
+
+
+def _frames(path: Path, imu_t_ns: IntArray) -> tuple[IntArray, Observations]:
+    """Return the stamps (K,) of the frames within the IMU's time, and their sightings in both cameras."""
+    table = read_columns(path, _FEATURE_COLUMNS)
+    row_t_ns = stamps_ns(path, "timestamp", table[:, 0])
+    unnamed = np.flatnonzero(~np.isfinite(table[:, 1:3]).all(axis=1))
+    if unnamed.size:
+        raise DataError(f"{path}: row {unnamed[0] + 1} has no frame or feature_id; remove the row")
+    if imu_t_ns.size == 0:
+        raise DataError(f"{path.parent}: the IMU table has no samples; export it again")
+    inside = (row_t_ns >= imu_t_ns[0]) & (row_t_ns <= imu_t_ns[-1])
+    stereo = (table[:, 7:9] == 1.0).all(axis=1)
+    number, first_row = np.unique(table[inside, 1], return_index=True)
+    kept = inside & stereo
+    frame = np.searchsorted(number, table[kept, 1])
+    return row_t_ns[inside][first_row], observations(frame, table[kept, 2].astype(np.int64), table[kept, 3:7])
+
+
+def _truth(folder: Path) -> Truth | None:
+    path = find_table(folder, _TRUTH)
+    if path is None:
+        return None
+    table: Array = read_columns(path, _TRUTH_COLUMNS)
+    T_world_imu = se3(rotation_from_quaternion(table[:, 1:5]), table[:, 5:8])
+    return Truth(stamps_ns(path, "timestamp", table[:, 0]), T_world_imu, table[:, 8:11], table[:, 11:17])

@@ -1,0 +1,107 @@
+"""The named arrays of one recording, with the checks that turn a malformed one into one clear line."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array
+
+# How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """Arrays by key, and the file they were read from; every accessor raises DataError naming file and key."""
+
+    path: Path
+    arrays: Mapping[str, npt.NDArray[np.generic]]
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.arrays
+
+    def require(self, *alternatives: str) -> None:
+        """Raise DataError listing every missing key; ``"a|b"`` is satisfied by either."""
+        missing = [keys for keys in alternatives if not any(key in self for key in keys.split("|"))]
+        if missing:
+            wanted = ", ".join(keys.replace("|", " or ") for keys in missing)
+            raise DataError(f"{self.path}: missing {wanted}; it has {', '.join(sorted(self.arrays)) or 'nothing'}")
+
+    def array(self, key: str, *shape: int | None) -> Array:
+        """Return a numeric array of the given shape (None = any length) as float64, NaN included."""
+        array = self.arrays[key]
+        check_numeric(self.path, key, array.dtype)
+        check_shape(self.path, key, array.shape, shape)
+        return array.astype(np.float64)
+
+    def first_of(self, *keys: str) -> str:
+        """Return the first of the keys that is there; one must be (see :meth:`require`)."""
+        return next(key for key in keys if key in self)
+
+    def vector(self, key: str) -> Array:
+        """Return an array stored as (), (n,), (1, n) or (n, 1) as (n,)."""
+        array = self.arrays[key]
+        check_numeric(self.path, key, array.dtype)
+        if sum(length != 1 for length in array.shape) > 1:
+            raise DataError(f"{self.path}: {key} has shape {array.shape}, expected one row of numbers")
+        return array.astype(np.float64).ravel()
+
+    def constant(self, key: str, *shape: int) -> Array:
+        """Return a finite numeric array of the given shape: a calibration must not have gaps."""
+        array = self.array(key, *shape)
+        if not np.isfinite(array).all():
+            raise DataError(f"{self.path}: {key} is not finite; a calibration needs every value")
+        return array
+
+    def positive(self, key: str) -> float:
+        """Return a single positive number."""
+        value = self.number(key)
+        if value <= 0.0:
+            raise DataError(f"{self.path}: {key} is {value:g}, expected a positive number")
+        return value
+
+    def number(self, key: str) -> float:
+        """Return a single finite number, whatever its number of axes."""
+        vector = self.vector(key)
+        if vector.size != 1 or not np.isfinite(vector[0]):
+            raise DataError(f"{self.path}: {key} has {vector.size} values, expected one finite number")
+        return float(vector[0])
+
+    def rigid(self, key: str) -> Array:
+        """Return a rigid motion (4, 4)."""
+        return check_rigid(self.path, key, self.constant(key, 4, 4))
+
+
+def check_numeric(path: Path, key: str, dtype: np.dtype[np.generic]) -> None:
+    """Raise DataError unless the dtype is one of real numbers."""
+    if dtype.kind == "O":
+        raise DataError(f"{path}: {key} holds objects, which are never unpickled; save it as plain numbers")
+    if dtype.kind not in "fiu":
+        raise DataError(f"{path}: {key} holds {dtype}, expected real numbers")
+
+
+def check_shape(path: Path, key: str, shape: tuple[int, ...], expected: tuple[int | None, ...]) -> None:
+    """Raise DataError unless the shape is the expected one (None = any length)."""
+    fits = len(shape) == len(expected) and all(w in (None, s) for s, w in zip(shape, expected, strict=True))
+    if not fits:
+        wanted = ", ".join("any" if w is None else str(w) for w in expected)
+        raise DataError(f"{path}: {key} has shape {shape}, expected ({wanted})")
+
+
+def check_rigid(path: Path, key: str, T: Array) -> Array:
+    """Return T (4, 4), or raise DataError where it is not a rotation and a translation."""
+    rotation = T[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (off < _RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0 and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])):
+        raise DataError(f"{path}: {key} is not a rotation and a translation (R R^T is off by {off:.2g})")
+    return T
+
+
+def check_frame_count(path: Path, frame_count: int) -> None:
+    """Raise DataError where a recording is too short to estimate any motion."""
+    if frame_count < 2:
+        raise DataError(f"{path}: the recording has {frame_count} frame(s); at least two are needed")

@@ -1,0 +1,271 @@
+"""The project's own recordings: a folder with recording.json (what it is) and recording.npz (the numbers).
+
+The JSON is for people and holds what a person would want to read or change: name, rig, noise, conventions,
+origin. The arrays are compressed and never pickled. A folder is written beside its place and moved there whole.
+"""
+
+import json
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from toolkit.errors import DataError, OutputError
+from toolkit.geometry import Array
+from toolkit.sequence import (
+    ImuNoise,
+    ImuSamples,
+    MotionNoise,
+    MotionSamples,
+    Observations,
+    Pairing,
+    Prior,
+    Provenance,
+    Sequence,
+    StereoRig,
+    Truth,
+    TwistNoise,
+    TwistSamples,
+)
+
+SCHEMA = "vislam.recording/1"
+_TEXT, _ARRAYS = "recording.json", "recording.npz"
+
+Arrays = Mapping[str, np.ndarray[Any, Any]]
+Text = dict[str, Any]
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is a recording of this format: its folder, or the JSON file in it; damaged ones too."""
+    try:
+        with _text_file(path).open("rb") as file:
+            return b'"vislam.recording/' in file.read(4096)
+    except OSError:
+        return False
+
+
+def load(path: Path) -> Sequence:
+    """Read a recording from its folder, or from the JSON file in it.
+
+    Raises DataError where a file is missing, damaged or contradicts the other; values that are merely
+    suspicious (NaN, reversed time) are left for the audit.
+    """
+    text_file = _text_file(path)
+    text, arrays = _read_text(text_file), _read_arrays(text_file.parent / _ARRAYS)
+    try:
+        sequence = _sequence(text, arrays)
+    except KeyError as error:
+        raise DataError(f"{text_file.parent}: {error.args[0]} is missing; save the recording again") from error
+    except (AttributeError, TypeError, ValueError) as error:
+        raise DataError(f"{text_file.parent}: a field does not fit ({error}); save the recording again") from error
+    except DataError as error:
+        raise DataError(f"{text_file.parent}: {error}") from error
+    _check_whole(sequence, text, text_file)
+    return sequence
+
+
+def save(sequence: Sequence, directory: Path) -> None:
+    """Write a recording to a folder, whole or not at all; a recording that is there already is replaced.
+
+    Raises OutputError where the folder holds anything else or cannot be written.
+    """
+    directory = Path(directory)
+    foreign = [entry.name for entry in _entries(directory) if entry.name not in (_TEXT, _ARRAYS)]
+    if foreign:
+        raise OutputError(f"{directory} holds {foreign[0]}, which is no part of a recording; choose another folder")
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
+            finished = Path(workshop) / "finished"
+            finished.mkdir()
+            np.savez_compressed(finished / _ARRAYS, **_to_arrays(sequence))
+            text = json.dumps(_to_text(sequence), indent=2, ensure_ascii=False)
+            (finished / _TEXT).write_text(text + "\n", encoding="utf-8")
+            _put_in_place(finished, directory, Path(workshop) / "replaced")
+    except OSError as error:
+        raise OutputError(f"cannot write {directory}: {error.strerror or error}; choose another folder") from error
+
+
+def _entries(directory: Path) -> list[Path]:
+    if directory.exists() and not directory.is_dir():
+        raise OutputError(f"{directory} is a file; choose a folder")
+    return sorted(directory.iterdir()) if directory.exists() else []
+
+
+def _put_in_place(finished: Path, directory: Path, replaced: Path) -> None:
+    if directory.exists():
+        directory.replace(replaced)
+    try:
+        finished.replace(directory)
+    except BaseException:
+        if replaced.exists():
+            replaced.replace(directory)
+        raise
+
+
+def _text_file(path: Path) -> Path:
+    path = Path(path)
+    return path if path.name == _TEXT else path / _TEXT
+
+
+# Writing ------------------------------------------------------------------------------------------------------
+
+
+def _to_text(sequence: Sequence) -> Text:
+    motion, prior, truth = sequence.motion, sequence.prior, sequence.truth
+    return {
+        "schema": SCHEMA,
+        "name": sequence.name,
+        "provenance": asdict(sequence.provenance),
+        "counts": _counts(sequence),
+        "units": "SI and px; time int64 ns; poses take the IMU frame to the world; bias and prior in [accel, gyro]",
+        "gravity_world": sequence.gravity_world.tolist(),
+        "rig": _plain(sequence.rig),
+        "motion": {"kind": sequence.motion_kind}
+        | ({"pairing": motion.pairing} if isinstance(motion, TwistSamples) else {}),
+        "noise": _plain(sequence.noise),
+        "prior": None if prior is None else {"source": prior.source},
+        "truth": None if truth is None else {"independent": truth.independent},
+    }
+
+
+def _counts(sequence: Sequence) -> dict[str, int]:
+    counts = {
+        "frames": sequence.frame_count,
+        "observations": len(sequence.observations),
+        "motion_samples": sequence.motion.t_ns.size,
+    }
+    return counts if sequence.truth is None else counts | {"truth_poses": sequence.truth.t_ns.size}
+
+
+def _plain(value: StereoRig | MotionNoise) -> Text:
+    """Return the fields of a value with arrays as nested lists; Python writes floats so that they come back whole."""
+    return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in vars(value).items()}
+
+
+def _to_arrays(sequence: Sequence) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "frames_t_ns": sequence.frames_t_ns,
+        "observations_frame": sequence.observations.frame,
+        "observations_track_id": sequence.observations.track_id,
+        "observations_uv_px": sequence.observations.uv_px,
+        "motion_t_ns": sequence.motion.t_ns,
+        "motion_values": sequence.motion.values,
+    }
+    for part, value in (("truth", sequence.truth), ("prior", sequence.prior)):
+        fields = vars(value) if value is not None else {}
+        arrays |= {f"{part}_{name}": x for name, x in fields.items() if isinstance(x, np.ndarray)}
+    return arrays
+
+
+# Reading ------------------------------------------------------------------------------------------------------
+
+
+def _read_text(file: Path) -> Text:
+    try:
+        text = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(f"{file} does not exist; give the folder of a recording") from error
+    except OSError as error:
+        raise DataError(f"{file} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DataError(f"{file} is not JSON ({error}); copy or save the recording again") from error
+    if not isinstance(text, dict) or text.get("schema") != SCHEMA:
+        schema = text.get("schema") if isinstance(text, dict) else None
+        raise DataError(f"{file}: the schema is {schema!r}, this version reads {SCHEMA!r}; save it with this version")
+    return cast(Text, text)
+
+
+def _read_arrays(file: Path) -> Arrays:
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise DataError(f"{file} does not exist; copy it together with {_TEXT}") from error
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        reason = str(error).partition("\n")[0]
+        raise DataError(f"{file} is damaged or not an archive of plain arrays ({reason}); copy it again") from error
+
+
+def _sequence(text: Text, arrays: Arrays) -> Sequence:
+    motion, noise = _motion(text, arrays)
+    return Sequence(
+        name=str(text["name"]),
+        rig=StereoRig(**_arrays_again(text["rig"])),
+        noise=noise,
+        frames_t_ns=arrays["frames_t_ns"],
+        observations=Observations(
+            arrays["observations_frame"], arrays["observations_track_id"], arrays["observations_uv_px"]
+        ),
+        motion=motion,
+        provenance=_provenance(text["provenance"]),
+        prior=_prior(text, arrays),
+        truth=_truth(text, arrays),
+        gravity_world=np.array(text["gravity_world"], dtype=float),
+    )
+
+
+def _arrays_again(fields: Text) -> Text:
+    return {name: np.array(x, dtype=float) if isinstance(x, list) else float(x) for name, x in fields.items()}
+
+
+def _motion(text: Text, arrays: Arrays) -> tuple[MotionSamples, MotionNoise]:
+    t_ns, values = arrays["motion_t_ns"], arrays["motion_values"]
+    if values.shape != (t_ns.size, 6):
+        raise DataError(f"motion_values has shape {values.shape}, expected ({t_ns.size}, 6)")
+    kind, noise = text["motion"]["kind"], _arrays_again(text["noise"])
+    if kind == "imu":
+        return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**noise)
+    if kind == "twist":
+        pairing = text["motion"]["pairing"]
+        if pairing not in get_args(Pairing):
+            raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(get_args(Pairing))}")
+        return TwistSamples(t_ns, values[:, :3], values[:, 3:], pairing), TwistNoise(**noise)
+    raise DataError(f"motion.kind is {kind!r}, expected imu or twist")
+
+
+def _provenance(fields: Text) -> Provenance:
+    return Provenance(fields["format"], fields["source"], tuple(fields["facts"]))
+
+
+def _prior(text: Text, arrays: Arrays) -> Prior | None:
+    if text["prior"] is None:
+        return None
+    parts: dict[str, Array] = {name: arrays[f"prior_{name}"] for name in ("T_world_imu", "v_world", "bias", "cov")}
+    return Prior(**parts, source=text["prior"]["source"])
+
+
+def _truth(text: Text, arrays: Arrays) -> Truth | None:
+    if text["truth"] is None:
+        return None
+    return Truth(
+        arrays["truth_t_ns"],
+        arrays["truth_T_world_imu"],
+        arrays.get("truth_v_world"),
+        arrays.get("truth_bias"),
+        text["truth"]["independent"],
+    )
+
+
+def _check_whole(sequence: Sequence, text: Text, file: Path) -> None:
+    """Raise DataError where the two files are not of one recording or the observations point to no frame."""
+    if text.get("counts") != _counts(sequence):
+        raise DataError(
+            f"{file}: counts say {text.get('counts')}, {_ARRAYS} holds {_counts(sequence)}; copy both files again"
+        )
+    observations = sequence.observations
+    if not len(observations) == observations.track_id.size == len(observations.uv_px):
+        raise DataError(f"{file.parent / _ARRAYS}: the observations' columns differ in length; copy it again")
+    if (np.diff(observations.frame) < 0).any():
+        raise DataError(f"{file.parent / _ARRAYS}: the observations are not sorted by frame; save the recording again")
+    outside = np.flatnonzero((observations.frame < 0) | (observations.frame >= sequence.frame_count))
+    if outside.size:
+        raise DataError(
+            f"{file.parent / _ARRAYS}: observation {outside[0]} is of frame {observations.frame[outside[0]]}, "
+            f"there are {sequence.frame_count}; save the recording again"
+        )

@@ -1,0 +1,1 @@
+"""Parts the metric files share: association, alignment, relative errors, reprojection, triangulation."""

@@ -1,0 +1,45 @@
+"""What the run cost: time per frame, time in all, memory."""
+
+import numpy as np
+
+from toolkit.geometry import Array
+from toolkit.metrics.common.judged import Judged
+from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+
+ORDER = 90
+METRICS = {
+    "frame_ms_mean": "mean wall-clock time of a step, the first included (ms)",
+    "frame_ms_p95": "95th percentile of the same (ms)",
+    "frame_ms_max": "longest step (ms)",
+    "total_s": "wall-clock time of all steps and the finish (s)",
+    "cpu_s": "processor time of all threads (s)",
+    "peak_rss_mb": "peak resident memory of the process (MB)",
+}
+
+
+def score(judged: Judged) -> Scores:
+    """Score the run's timings; the same for both kinds of output, which come from one run."""
+    timings = judged.run.timings
+    return evaluate(
+        {
+            "frame_ms_mean": lambda: float(np.mean(_steps_ms(judged))),
+            "frame_ms_p95": lambda: float(np.percentile(_steps_ms(judged), 95.0)),
+            "frame_ms_max": lambda: float(np.max(_steps_ms(judged))),
+            "total_s": lambda: timings.total_s,
+            "cpu_s": lambda: timings.cpu_s,
+            "peak_rss_mb": lambda: _measured(timings.peak_rss_mb),
+        }
+    )
+
+
+def _steps_ms(judged: Judged) -> Array:
+    steps_s = np.asarray(judged.run.timings.step_s)
+    if not steps_s.size:
+        raise Unavailable("the run made no step")
+    return 1e3 * steps_s
+
+
+def _measured(value: float | None) -> float:
+    if value is None:
+        raise Unavailable("not measured on this platform")
+    return value

@@ -1,0 +1,29 @@
+"""Normalised innovation squared: does the filter believe its own residuals as much as it should?
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
+"""
+
+import numpy as np
+
+from toolkit.metrics.common.judged import Judged
+from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+
+ORDER = 70
+METRICS = {"nis_mean": "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent"}
+
+
+def score(judged: Judged) -> Scores:
+    """Score the innovations a causal output reports."""
+    return evaluate({"nis_mean": lambda: _nis_per_dof(judged)})
+
+
+def _nis_per_dof(judged: Judged) -> float:
+    if judged.output != "causal":
+        raise Unavailable("innovations belong to the causal output")
+    nis, dof = judged.run.info.get("nis"), judged.run.info.get("nis_dof")
+    if nis is None or dof is None:
+        raise Unavailable("the estimator reports no innovations")
+    given = np.isfinite(nis) & np.isfinite(dof) & (dof > 0.0)
+    if not given.any():
+        raise Unavailable("no step reports an innovation")
+    return float(nis[given].sum() / dof[given].sum())

@@ -1,0 +1,77 @@
+"""Relative pose error over one second and over 100 metres: drift, whatever happened before.
+
+Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.geometry import Array, IntArray
+from toolkit.metrics.common.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
+from toolkit.metrics.common.judged import Judged
+from toolkit.metrics.common.relative import angles_deg, lengths, relative_errors, rmse
+from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.sequence import NS_PER_S
+
+ORDER = 20
+METRICS = {
+    "rpe_1s_m": "RMSE of the translation error over 1 s (m)",
+    "rpe_1s_deg": "RMSE of the rotation error over 1 s (deg)",
+    "rpe_100m_percent": "RMSE of the translation error over 100 m of true path (percent)",
+}
+INTERVAL_M = 100.0
+# A pair may be longer than asked for by this much, or it spans a gap and is left out: 1.5 steps of the matched
+# stamps for the second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as evo does).
+_LATEST_IN_STEPS = 1.5
+_LONGEST_OVER_INTERVAL = 1.1
+
+
+class _Intervals(NamedTuple):
+    """Indices (p,), (p,) of the first and last matched pair of each interval."""
+
+    first: IntArray
+    last: IntArray
+
+
+def score(judged: Judged) -> Scores:
+    """Score drift over one second and over 100 m."""
+    return evaluate(
+        {
+            "rpe_1s_m": lambda: rmse(lengths(_errors(judged, _one_second)[:, :3, 3])),
+            "rpe_1s_deg": lambda: rmse(angles_deg(_errors(judged, _one_second)[:, :3, :3])),
+            "rpe_100m_percent": lambda: rmse(lengths(_errors(judged, _hundred_metres)[:, :3, 3])) / INTERVAL_M * 100.0,
+        }
+    )
+
+
+def _errors(judged: Judged, choose: Callable[[Matched], _Intervals]) -> Array:
+    return relative_errors(judged.compared, *choose(judged.compared))
+
+
+def _one_second(matched: Matched) -> _Intervals:
+    """Pair each stamp with the first one a second later; stamps a rounding error short of it count."""
+    latest_ns = NS_PER_S + _LATEST_IN_STEPS * median_period_ns(matched.t_ns)
+    intervals = _first_reaching(matched.t_ns, NS_PER_S - STAMP_TOLERANCE_NS, latest_ns)
+    if not intervals.first.size:
+        raise Unavailable("no two matched poses are 1 s apart")
+    return intervals
+
+
+def _hundred_metres(matched: Matched) -> _Intervals:
+    """Pair each stamp with the first one 100 m further along the truth."""
+    intervals = _first_reaching(matched.path_m, INTERVAL_M, _LONGEST_OVER_INTERVAL * INTERVAL_M)
+    if not intervals.first.size:
+        length_m = matched.path_m[-1] - matched.path_m[0]
+        raise Unavailable(f"no two matched poses are 100 m apart; the matched path is {length_m:.1f} m")
+    return intervals
+
+
+def _first_reaching(along: Array | IntArray, least: float, most: float) -> _Intervals:
+    """Pair each of the ascending values (n,) with the first at least ``least`` beyond; drop pairs beyond ``most``."""
+    last = np.searchsorted(along, along + least)
+    first = np.flatnonzero(last < along.size)
+    last = last[first]
+    near = along[last] - along[first] <= most
+    return _Intervals(first[near], last[near])

@@ -1,0 +1,68 @@
+"""A directory appears complete or not at all: it is written beside its place and then renamed into it."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from toolkit.errors import OutputError
+
+# Says whether an existing directory was made by us, so that it may be replaced.
+IsOurs = Callable[[Path], bool]
+
+
+def check_replaceable(target: Path, is_ours: IsOurs) -> None:
+    """Raise OutputError unless ``target`` can be created, or is a directory that is empty or ours."""
+    if target.resolve() == Path.cwd():
+        raise OutputError(f"{target} is the current directory and cannot be replaced; name a directory inside it")
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise OutputError(f"{target} exists and is not a directory; choose another place for the results")
+    try:
+        if target.is_dir() and any(target.iterdir()) and not is_ours(target):
+            raise OutputError(f"{target} holds other files, which would be lost; choose another directory")
+        probe = _nearest_existing(target.parent) / f".vislam-probe-{os.getpid()}"
+        probe.mkdir()
+        probe.rmdir()
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+@contextmanager
+def replaced_directory(target: Path, is_ours: IsOurs) -> Iterator[Path]:
+    """Give an empty directory to write to; on success it takes ``target``'s place, on any failure it is removed.
+
+    Raises OutputError where the place is taken by something else or cannot be written.
+    """
+    check_replaceable(target, is_ours)
+    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        _swap(partial, target)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _swap(new: Path, target: Path) -> None:
+    """Rename ``new`` to ``target``; what was there comes back if that fails or is interrupted."""
+    old = target.parent / f".{target.name}.replaced-{os.getpid()}"
+    try:
+        if target.exists():
+            target.rename(old)
+        new.rename(target)
+    finally:
+        if old.exists() and not target.exists():
+            old.rename(target)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _nearest_existing(path: Path) -> Path:
+    absolute = path.absolute()
+    return next(p for p in (absolute, *absolute.parents) if p.exists())
+
+
+def _unwritable(target: Path, error: OSError) -> OutputError:
+    return OutputError(f"{target} cannot be written ({error.strerror or error}); choose another directory with --out")

@@ -1,0 +1,25 @@
+"""The figures of a comparison as PNG files, one module a figure; drawn without a display."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from toolkit.report.comparison import Comparison
+from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
+from toolkit.report.figures.style import NamedFigure
+
+_DRAWINGS: tuple[Callable[[Comparison], Iterator[NamedFigure]], ...] = (
+    top_view.draw,
+    errors_over_time.draw,
+    reprojection.draw,
+    frame_times.draw,
+)
+
+
+def write_figures(comparison: Comparison, directory: Path) -> dict[str, str]:
+    """Draw every figure the comparison has data for into PNG files; return file name -> caption, in order."""
+    captions: dict[str, str] = {}
+    for drawing in _DRAWINGS:
+        for name, caption, figure in drawing(comparison):
+            figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
+            captions[f"{name}.png"] = caption
+    return captions

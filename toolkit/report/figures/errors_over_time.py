@@ -1,0 +1,101 @@
+"""Position and heading error over time against the truth; without truth, the differences between estimators."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from toolkit.geometry import Array
+from toolkit.metrics.common.alignment import Alignment
+from toolkit.report.comparison import Comparison, Row
+from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, errors_to, onto_truth, truth_during
+from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet
+from toolkit.sequence import NS_PER_S, Truth
+
+# A run that is not ok is drawn up to this many times the largest error of the runs that are.
+_ROOM_FOR_DIVERGED = 1.5
+
+
+class _Reference(NamedTuple):
+    """What the curves are measured against, how a row is aligned to it first, and how to call the difference."""
+
+    truth: Truth
+    align: Callable[[Row], Alignment]
+    what: str
+    caption: str
+
+
+def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of errors (with truth) or of differences (without, given two trajectories)."""
+    reference = _truth(comparison) or _last_good_answer(comparison)
+    if reference is None:
+        return
+    curves: list[tuple[Row, Errors]] = []
+    for row in comparison.rows:
+        trajectory = row.run.trajectory(row.output)
+        if trajectory is None or trajectory.T_world_imu is reference.truth.T_world_imu:
+            continue
+        errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
+        if errors is not None:
+            curves.append((row, errors))
+    if curves:
+        yield _figure(comparison, curves, reference)
+
+
+def _truth(comparison: Comparison) -> _Reference | None:
+    sequence = comparison.sequence
+    truth = truth_during(sequence)
+    if truth is None:
+        return None
+    caption = (
+        "Position and heading error over time, aligned to the truth by yaw and position. "
+        "Dashed: causal, what was known at the time. Solid: final."
+    )
+    return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
+
+
+def _last_good_answer(comparison: Comparison) -> _Reference | None:
+    """Take the last trajectory of a run that is ok for the reference: with the defaults, the smoother's."""
+    for row in reversed(comparison.rows):
+        trajectory = row.run.trajectory(row.output)
+        if row.status == "ok" and trajectory is not None:
+            name = f"{row.estimator} {row.output}"
+            caption = (
+                f"There is no truth: position and heading difference from {name}, not aligned. "
+                "A difference says that two estimators disagree, not which of them is right."
+            )
+            as_truth = Truth(trajectory.t_ns, trajectory.T_world_imu)
+            return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {name}", caption)
+    return None
+
+
+def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference: _Reference) -> NamedFigure:
+    figure = new_figure(9.6, 5.6)
+    position, heading = figure.subplots(2, 1, sharex=True)
+    start_ns = int(comparison.sequence.frames_t_ns[0])
+    for row, errors in curves:
+        t_s = (errors.t_ns - start_ns) / NS_PER_S
+        colour, line = colour_of(comparison, row.estimator), line_of(row.output)
+        label = f"{row.estimator} {row.output}"
+        position.plot(t_s, errors.position_m, color=colour, linestyle=line, linewidth=1.6, label=label)
+        heading.plot(t_s, _without_wraps(errors.heading_deg), color=colour, linestyle=line, linewidth=1.6)
+    quiet(position, f"{comparison.sequence.name}: position {reference.what}", "", "position [m]")
+    quiet(heading, f"heading {reference.what}", "time [s]", "heading [deg]")
+    _limit(position, curves)
+    figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
+    return NamedFigure("errors_over_time", reference.caption, figure)
+
+
+def _limit(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
+    """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them."""
+    good = [float(errors.position_m.max()) for row, errors in curves if row.status == "ok"]
+    diverged = len(good) < len(curves)
+    axes.set_ylim(0.0, max(good) * _ROOM_FOR_DIVERGED if good and diverged and max(good) > 0.0 else None)
+
+
+def _without_wraps(heading_deg: Array) -> Array:
+    """Break the line where the angle steps over +-180 degrees, so that no vertical stroke is drawn."""
+    broken = heading_deg.copy()
+    broken[1:][np.abs(np.diff(heading_deg)) > 180.0] = np.nan
+    return broken

@@ -1,0 +1,52 @@
+"""Time per frame: what every step cost, and what a finish costs when it is spread over the frames."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.ticker import NullFormatter
+
+from toolkit.geometry import Array
+from toolkit.report.comparison import Comparison
+from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
+
+_MS = 1e3
+_SMOOTHED_FRAMES = 15
+
+
+def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the time of each step by frame, on a logarithmic axis, with the finish in the legend."""
+    timed = [run for run in comparison.runs if run.timings.step_s.size]
+    if not timed:
+        return
+    figure = new_figure(9.6, 4.2)
+    axes = figure.add_subplot()
+    for run in timed:
+        step_ms = np.maximum(run.timings.step_s * _MS, 1e-4)
+        colour = colour_of(comparison, run.estimator)
+        axes.plot(step_ms, ".", color=colour, markersize=2.5, alpha=0.35)
+        label = f"{run.estimator}: mean {float(step_ms.mean()):.2f} ms"
+        if run.timings.finish_s > run.timings.step_s.sum():
+            label += f",\nthen {run.timings.finish_s:.1f} s at the end"
+        axes.plot(_running_median(step_ms), color=colour, linewidth=1.5, label=label)
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least: jitter shall not look like drama
+    axes.set_ylim(low / widened, high * widened)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    quiet(axes, f"{comparison.sequence.name}: time per frame", "frame", "time of a step [ms]")
+    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
+    caption = (
+        "Wall-clock time of each step (dots) and its running median (lines). An estimator that answers only at "
+        "the end does its work there; that time is in the legend."
+    )
+    yield NamedFigure("frame_times", caption, figure)
+
+
+def _running_median(values: Array) -> Array:
+    """Return the median (N,) of the values (N,) around each, over fewer of them at the ends."""
+    half = _SMOOTHED_FRAMES // 2
+    padded = np.pad(values, half, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+    medians: Array = np.median(windows, axis=1)
+    return medians

@@ -1,0 +1,69 @@
+"""Histograms of the reprojection error: the estimator's own landmarks, and the tracks withheld from it."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from toolkit.estimate import Run
+from toolkit.geometry import Array
+from toolkit.metrics import Judged, held_out, in_sample
+from toolkit.metrics.common.scores import Unavailable
+from toolkit.report.comparison import Comparison
+from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
+from toolkit.report.figures.top_view import last_word
+
+# The axis ends here or at this quantile, whichever is nearer; the legend says how much lies beyond.
+_LARGEST_PX = 10.0
+_QUANTILE = 0.97
+_BINS = 50
+
+
+def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the histograms, one panel an estimator; nothing where there is nothing to reproject."""
+    errors = {run.estimator: _errors_px(comparison, run) for run in comparison.runs}
+    drawable = {name: kinds for name, kinds in errors.items() if kinds}
+    if not drawable:
+        return
+    largest = (float(np.quantile(error, _QUANTILE)) for kinds in drawable.values() for error in kinds.values())
+    bins = np.linspace(0.0, max(min(_LARGEST_PX, max(largest)), 0.1), _BINS + 1).tolist()
+    figure = new_figure(9.6, 1.2 + 1.7 * len(drawable))
+    panels = figure.subplots(len(drawable), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, kinds) in zip(panels, drawable.items(), strict=True):
+        for kind, error_px in kinds.items():
+            _histogram(axes, kind, error_px, bins, colour_of(comparison, name))
+        quiet(axes, name, "", "share [%]")
+        axes.set_xlim(0.0, bins[-1])
+        axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.05))
+    panels[-1].set_xlabel("reprojection error: root mean square of the uL, uR, v residuals [px]")
+    caption = (
+        "Reprojection error of every sighting. Filled: against the estimator's own landmarks (in-sample). Outlined: "
+        "of the tracks withheld from every estimator."
+    )
+    yield NamedFigure("reprojection", caption, figure)
+
+
+def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
+    """Return the errors (n,) px by kind, without the kinds the run has none of."""
+    if run.trajectory(last_word(run)) is None:
+        return {}
+    judged = Judged(run, last_word(run), comparison.sequence)
+    kinds: dict[str, Callable[[Judged], Array]] = {"in-sample": in_sample.errors, "held-out": held_out.errors}
+    found = {}
+    for kind, errors_of in kinds.items():
+        try:
+            with np.errstate(all="ignore"):  # a diverged run may overflow; the metrics cap what comes of it
+                found[kind] = errors_of(judged)
+        except Unavailable:
+            continue
+    return {kind: error_px for kind, error_px in found.items() if error_px.size}
+
+
+def _histogram(axes: Axes, kind: str, error_px: Array, bins: list[float], colour: str) -> None:
+    share = np.full(error_px.size, 100.0 / error_px.size)
+    beyond = 100.0 * float(np.mean(error_px > bins[-1]))
+    label = f"{kind}: median {float(np.median(error_px)):.2f} px\n({beyond:.1f} % beyond the axis)"
+    if kind == "in-sample":
+        axes.hist(error_px, bins=bins, weights=share, color=colour, alpha=0.35, label=label)
+    else:
+        axes.hist(error_px, bins=bins, weights=share, color=colour, histtype="step", linewidth=1.5, label=label)

@@ -1,0 +1,90 @@
+"""How a run can be repeated: the command, every version, the data's hash, seeds, threads and the machine."""
+
+import os
+import platform
+import subprocess
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import toolkit
+from toolkit.report.comparison import Comparison
+from toolkit.report.metrics_json import Json
+
+SCHEMA = "vislam.manifest/1"
+_PACKAGES = {
+    "toolkit": "vislam-toolkit",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "gtsam": "gtsam",
+    "opencv": "opencv-python-headless",
+    "matplotlib": "matplotlib",
+}
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
+
+
+def build(comparison: Comparison, command: str, seed: int) -> Json:
+    """Return the manifest of a comparison made by ``command`` with ``seed``."""
+    sequence = comparison.sequence
+    return {
+        "schema": SCHEMA,
+        "command": command,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {"python": platform.python_version(), **{name: _version(p) for name, p in _PACKAGES.items()}},
+        "git_revision": git_revision(Path(toolkit.__file__).parent),
+        "sequence": {
+            "name": sequence.name,
+            "hash": sequence.content_hash(),
+            "format": sequence.provenance.format,
+            "source": sequence.provenance.source,
+        },
+        "start": comparison.prior.source,
+        "estimators": [run.estimator for run in comparison.runs],
+        "seeds": {"sequence": seed},
+        "threads": {"cpus": _usable_cpus(), **{name: os.environ.get(name) for name in _THREAD_VARIABLES}},
+        "cpu": cpu_model(),
+        "os": platform.platform(),
+    }
+
+
+def git_revision(package: Path) -> str | None:
+    """Return the commit a package's folder is checked out at, ``-dirty`` where it was edited, or None.
+
+    A package installed somewhere inside another project's checkout is not at that project's revision.
+    """
+    if not (package.parent / ".git").exists():
+        return None
+    try:
+        described = subprocess.run(
+            ["git", "-C", str(package.parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return described.stdout.strip() or None
+
+
+def cpu_model() -> str:
+    """Return the processor's name as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _usable_cpus() -> int | None:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count()

@@ -1,0 +1,173 @@
+"""The JSON contract ``vislam.metrics/1``: how it is built, and a validator for it (see docs/metrics-json.md)."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from toolkit.report.comparison import Comparison, Row
+from toolkit.sequence import Sequence
+
+SCHEMA = "vislam.metrics/1"
+
+# Every run of a valid document has these keys, in this order; more may follow in later versions of the toolkit.
+METRIC_KEYS = (
+    "ate_none_m",
+    "ate_se3_m",
+    "ate_yaw_m",
+    "ate_sim3_m",
+    "ate_se3_deg",
+    "rpe_1s_m",
+    "rpe_1s_deg",
+    "rpe_100m_percent",
+    "kitti_t_percent",
+    "kitti_r_deg_per_m",
+    "end_drift_percent",
+    "reproj_median_px",
+    "reproj_rmse_px",
+    "heldout_reproj_median_px",
+    "heldout_reproj_rmse_px",
+    "nis_mean",
+    "coverage_percent",
+    "pairs",
+    "frame_ms_mean",
+    "frame_ms_p95",
+    "frame_ms_max",
+    "total_s",
+    "cpu_s",
+    "peak_rss_mb",
+)
+
+_COUNTS = ("pairs",)
+
+Json = dict[str, object]
+_NUMBER = (int, float)
+_SEQUENCE_FIELDS: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "hash": (str,),
+    "frames": (int,),
+    "tracks": (int,),
+    "observations": (int,),
+    "duration_s": _NUMBER,
+    "path_m": (*_NUMBER, type(None)),
+    "motion": (str,),
+}
+_FINDING_FIELDS: dict[str, tuple[type, ...]] = {"fault": (str,), "count": (int,), "repaired": (bool,), "detail": (str,)}
+_RUN_FIELDS: dict[str, tuple[type, ...]] = {
+    "estimator": (str,),
+    "output": (str,),
+    "status": (str,),
+    "metrics": (dict,),
+    "notes": (dict,),
+    "log": (list,),
+}
+_CHOICES = {"motion": ("twist", "imu"), "output": ("causal", "final"), "status": ("ok", "diverged", "failed")}
+
+
+def build(comparison: Comparison) -> Json:
+    """Return the document of a comparison; a value that is not finite becomes null with a note."""
+    return {
+        "schema": SCHEMA,
+        "sequence": _sequence(comparison.sequence),
+        "audit": [
+            {"fault": f.fault, "count": f.count, "repaired": f.repaired, "detail": f.detail}
+            for f in comparison.findings
+        ],
+        "runs": [_run(row) for row in comparison.rows],
+    }
+
+
+def to_text(document: Json) -> str:
+    """Return the document as indented JSON; refuses NaN and infinity, which are not JSON."""
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def path_length_m(sequence: Sequence) -> float | None:
+    """Return the length of the true path while the camera ran, or None without truth."""
+    if sequence.truth is None:
+        return None
+    t_ns = sequence.truth.t_ns
+    during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
+    positions = sequence.truth.T_world_imu[during, :3, 3]
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def _sequence(sequence: Sequence) -> Json:
+    return {
+        "name": sequence.name,
+        "hash": sequence.content_hash(),
+        "frames": sequence.frame_count,
+        "tracks": int(np.unique(sequence.observations.track_id).size),
+        "observations": len(sequence.observations),
+        "duration_s": sequence.duration_s,
+        "path_m": path_length_m(sequence),
+        "motion": sequence.motion_kind,
+    }
+
+
+def _run(row: Row) -> Json:
+    given, notes = row.scores.values, dict(row.scores.notes)
+    metrics: dict[str, float | None] = {}
+    for key in (*METRIC_KEYS, *sorted(given.keys() - set(METRIC_KEYS))):
+        value = given.get(key)
+        if value is None:
+            metrics[key] = None
+            notes.setdefault(key, "not computed")
+        elif not math.isfinite(value):
+            metrics[key] = None
+            notes[key] = f"the value is {value}, which JSON cannot hold"
+        else:
+            metrics[key] = int(value) if key in _COUNTS else float(value)
+    return {
+        "estimator": row.estimator,
+        "output": row.output,
+        "status": row.status,
+        "metrics": metrics,
+        "notes": {key: notes[key] for key in sorted(notes)},
+        "log": list(row.run.log),
+    }
+
+
+def violations(document: object) -> list[str]:
+    """Return everything in which a parsed document breaks the contract; empty for a valid one."""
+    if not isinstance(document, dict):
+        return ["the document is not an object"]
+    found = [] if document.get("schema") == SCHEMA else [f"schema is {document.get('schema')!r}, not {SCHEMA!r}"]
+    found += _field_violations(document.get("sequence"), "sequence", _SEQUENCE_FIELDS)
+    for name, item_fields in (("audit", _FINDING_FIELDS), ("runs", _RUN_FIELDS)):
+        items = document.get(name)
+        if not isinstance(items, list):
+            found.append(f"{name} is not a list")
+            continue
+        for i, item in enumerate(items):
+            found += _field_violations(item, f"{name}[{i}]", item_fields)
+            if name == "runs" and isinstance(item, dict):
+                found += _metric_violations(item, f"runs[{i}]")
+    return found
+
+
+def _field_violations(item: object, where: str, expected: Mapping[str, tuple[type, ...]]) -> Iterator[str]:
+    if not isinstance(item, dict):
+        yield f"{where} is not an object"
+        return
+    for name, types in expected.items():
+        # type(), not isinstance(): True must not pass for the number 1.
+        if name not in item or type(item[name]) not in types:
+            yield f"{where}.{name} is missing or not {' or '.join(t.__name__ for t in types)}"
+        elif name in _CHOICES and item[name] not in _CHOICES[name]:
+            yield f"{where}.{name} is {item[name]!r}, not one of {_CHOICES[name]}"
+
+
+def _metric_violations(run: Json, where: str) -> Iterator[str]:
+    metrics, notes = run.get("metrics"), run.get("notes")
+    if not isinstance(metrics, dict) or not isinstance(notes, dict):
+        return
+    for key in METRIC_KEYS:
+        if key not in metrics:
+            yield f"{where}.metrics.{key} is missing"
+    for key, value in metrics.items():
+        if value is None and not notes.get(key):
+            yield f"{where}.metrics.{key} is null without a note"
+        elif value is not None and (type(value) not in _NUMBER or not math.isfinite(value)):
+            yield f"{where}.metrics.{key} is neither a finite number nor null"

@@ -1,0 +1,127 @@
+"""From sources to run directories: load, audit, start, run, score, write; what ``vislam compare`` does."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from toolkit import runner
+from toolkit.audit import Audit, audit
+from toolkit.datasets import load_sequence
+from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.estimate import Output, Run
+from toolkit.estimator import find
+from toolkit.metrics import Scores, describe, score_run
+from toolkit.report.comparison import Comparison, Row, Start, outputs_of
+from toolkit.report.run_directory import check_run_directory, write_run
+from toolkit.runner import Progress
+from toolkit.sequence import Prior, Sequence, Truth
+from toolkit.start import start_from_measurements, start_from_truth
+
+ProgressFor = Callable[[str], AbstractContextManager[Progress]]
+_STARTS: dict[Start, Callable[[Sequence], Prior]] = {
+    "measurements": start_from_measurements,
+    "truth": start_from_truth,
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to compare and where to write it.
+
+    ``keep`` names the faults that the audit reports but leaves as they are; ``command`` is kept in the
+    manifest.
+    """
+
+    sources: tuple[str, ...]
+    estimators: tuple[str, ...]
+    out: Path
+    truth: Path | None = None
+    max_frames: int | None = None
+    keep: frozenset[str] = frozenset()
+    start: Start = "measurements"
+    seed: int = 0
+    command: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """One audited sequence with its start and the directory its results go to."""
+
+    audited: Audit
+    prior: Prior
+    directory: Path
+
+
+def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[Comparison, Path]]:
+    """Compare the estimators on every source; yield each comparison once its run directory is in place.
+
+    Everything that can be wrong with the request is checked before the first estimator starts. Raises
+    EstimatorError for an unknown or unavailable estimator, OutputError where the results cannot be written,
+    DataError for a recording or truth that cannot be used.
+    """
+    for name in request.estimators:
+        find(name).load()
+    check_run_directory(request.out)
+    for case in _cases(request):
+        comparison = compare(case.audited, case.prior, request.estimators, progress_for)
+        write_run(comparison, case.directory, command=request.command, seed=request.seed)
+        yield comparison, case.directory
+
+
+def compare(audited: Audit, prior: Prior, estimators: Iterable[str], progress_for: ProgressFor) -> Comparison:
+    """Run and score every estimator on the same audited sequence from the same prior."""
+    sequence = audited.sequence
+    runs = []
+    for name in estimators:
+        with progress_for(f"{sequence.name}: {name}") as progress:
+            runs.append(runner.run(name, sequence, prior, progress))
+    rows = tuple(
+        Row(one, output, _score(one, output, sequence))
+        for one in runs
+        for output in outputs_of(one)
+    )  # fmt: skip
+    return Comparison(sequence, audited.findings, prior, tuple(runs), rows)
+
+
+def _score(run: Run, output: Output, sequence: Sequence) -> Scores:
+    if run.trajectory(output) is not None:
+        return score_run(run, output, sequence)
+    keys = describe()
+    return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
+
+
+def load_audited(source: str, truth: Truth | None, keep: frozenset[str], seed: int) -> Audit:
+    """Load a recording, attach a truth given apart from it, and audit it."""
+    sequence = load_sequence(source, seed)
+    if truth is not None:
+        sequence = with_truth(sequence, truth)
+    return audit(sequence, keep)
+
+
+def _cases(request: Request) -> list[_Case]:
+    """Prepare every sequence before any estimator runs; several go into sub-directories by name."""
+    truth = None if request.truth is None else load_truth(request.truth)
+    audits = [load_audited(source, truth, request.keep, request.seed) for source in request.sources]
+    if request.max_frames is not None:
+        # Only now: the audit judges slow faults (a bias, a lag) better on the whole recording.
+        audits = [replace(a, sequence=a.sequence.truncated(request.max_frames)) for a in audits]
+    names = unique_names(a.sequence.name for a in audits)
+    directories = [request.out] if len(audits) == 1 else [request.out / name for name in names]
+    for directory in directories:
+        check_run_directory(directory)
+    start = _STARTS[request.start]
+    return [_Case(a, start(a.sequence), d) for a, d in zip(audits, directories, strict=True)]
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Turn sequence names into directory names, all different; a second ``drive`` becomes ``drive-2``."""
+    taken: list[str] = []
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip(".") or "sequence"
+        candidate, n = plain, 2
+        while candidate in taken:
+            candidate, n = f"{plain}-{n}", n + 1
+        taken.append(candidate)
+    return taken

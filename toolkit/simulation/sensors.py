@@ -1,0 +1,134 @@
+"""What the sensors make of the truth: stereo pixels, body twists and IMU samples with known noise.
+
+Continuous densities have Kalibr's names and units; a sample of white noise over dt has the standard deviation
+density / sqrt(dt), a step of a walk over dt has density * sqrt(dt) (Furgale et al., "Kalibr", IMU noise model).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
+from toolkit.models.stereo import project
+from toolkit.sequence import (
+    NS_PER_S,
+    ImuNoise,
+    ImuSamples,
+    MotionSamples,
+    Observations,
+    StereoRig,
+    TwistNoise,
+    TwistSamples,
+)
+from toolkit.simulation.trajectory import Trajectory
+from toolkit.simulation.world import Camera, Tracks
+
+
+@dataclass(frozen=True, eq=False)
+class Odometer:
+    """Body twists at the frame stamps: noise, and the standard deviation (3,) rad/s of the bias it starts with."""
+
+    noise: TwistNoise
+    gyro_bias_sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """Raw IMU samples: rate, noise, and the standard deviation (6,) of the bias [accel, gyro] it starts with."""
+
+    rate_hz: float
+    noise: ImuNoise
+    bias_sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Motion samples and the bias (S, 6), [accel, gyro], that is in each of them."""
+
+    samples: MotionSamples
+    bias: Array
+
+
+def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
+    """Return the stamps of a periodic sensor from the start to the end of a recording, both included."""
+    count = int(np.floor(duration_s * rate_hz + 1e-9)) + 1
+    return start_ns + np.round(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
+
+
+def sightings(tracks: Tracks, points: Array, T_world_imu: Array, rig: StereoRig) -> Observations:
+    """Return the exact observations of tracks over landmarks (M, 3) from the poses (K, 4, 4) of the frames."""
+    T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
+    uv_px = project(transform(T_cam_world[tracks.frame], points[tracks.landmark]), rig)
+    return Observations(tracks.frame, tracks.track_id, uv_px)
+
+
+def with_pixel_noise(
+    exact: Observations, scale: float, cov_uv_px2: Array, step_px: float, rng: np.random.Generator
+) -> Observations:
+    """Add noise of the covariance (3, 3) px^2, its standard deviations scaled, and round to the step (0: not)."""
+    spread = scale * np.linalg.cholesky(cov_uv_px2)
+    noisy_px = exact.uv_px + rng.standard_normal((len(exact), 3)) @ spread.T
+    if step_px > 0.0:
+        noisy_px = np.round(noisy_px / step_px) * step_px
+    return Observations(exact.frame, exact.track_id, noisy_px)
+
+
+def with_outliers(clean: Observations, camera: Camera, rng: np.random.Generator) -> Observations:
+    """Displace a share of the sightings, both images alike, as a tracker that has slipped to another corner.
+
+    The displacement points towards the middle of the image, so that the sighting stays inside it.
+    """
+    struck = np.flatnonzero(rng.uniform(size=len(clean)) < camera.outlier_rate)
+    length_px = rng.uniform(*camera.outlier_px, size=struck.size)
+    angle = rng.uniform(0.0, 0.5 * np.pi, size=struck.size)
+    uv_px = clean.uv_px.copy()
+    middle_px = 0.5 * np.array(camera.size_px)
+    towards = np.where(uv_px[struck][:, [0, 2]] < middle_px, 1.0, -1.0)
+    shift_px = towards * (length_px * np.stack([np.cos(angle), np.sin(angle)])).T
+    uv_px[struck] += shift_px[:, [0, 0, 1]]
+    return Observations(clean.frame, clean.track_id, uv_px)
+
+
+def measure_twist(
+    odometer: Odometer, scale: float, t_ns: IntArray, T_world_imu: Array, rng: np.random.Generator
+) -> Measured:
+    """Measure the exact mean body twist of each interval between stamps: log(T_k^-1 T_k+1) / dt, plus noise.
+
+    Takes S + 1 stamps and poses and gives S samples; sample k describes the motion from k to k + 1.
+    """
+    dt_s = np.diff(t_ns)[:, None] / NS_PER_S
+    exact = se3_log(se3_inverse(T_world_imu[:-1]) @ T_world_imu[1:]) / dt_s
+    white_rng, walk_rng, start_rng = rng.spawn(3)
+    white, walk = white_rng.standard_normal((dt_s.size, 6)), walk_rng.standard_normal((dt_s.size, 3))
+    noise = odometer.noise
+    start = odometer.gyro_bias_sigma * start_rng.standard_normal(3)
+    gyro_bias = scale * _walk(start, noise.gyro_random_walk * np.sqrt(dt_s) * walk)
+    density = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density])
+    measured = exact + scale * white * density / np.sqrt(dt_s)
+    samples = TwistSamples(t_ns[:-1], measured[:, 3:], measured[:, :3] + gyro_bias, "start")
+    return Measured(samples, np.hstack([np.zeros_like(gyro_bias), gyro_bias]))
+
+
+def measure_imu(
+    imu: Imu, scale: float, t_ns: IntArray, trajectory: Trajectory, gravity_world: Array, rng: np.random.Generator
+) -> Measured:
+    """Measure the instantaneous specific force and angular velocity at stamps (S,), plus noise and bias."""
+    t_s = (t_ns - t_ns[0]) / NS_PER_S
+    dt_s = 1.0 / imu.rate_hz
+    motion = trajectory.at(t_s)
+    R_imu_world = np.swapaxes(motion.T_world_imu[:, :3, :3], 1, 2)
+    exact = np.hstack([(R_imu_world @ (motion.a_world - gravity_world)[:, :, None])[:, :, 0], motion.w_imu])
+    white_rng, walk_rng, start_rng = rng.spawn(3)
+    white, walk = white_rng.standard_normal((t_ns.size, 6)), walk_rng.standard_normal((t_ns.size, 6))
+    noise = imu.noise
+    density = np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
+    walk_density = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3)
+    bias = scale * _walk(imu.bias_sigma * start_rng.standard_normal(6), walk_density * np.sqrt(dt_s) * walk)
+    measured = exact + bias + scale * white * density / np.sqrt(dt_s)
+    return Measured(ImuSamples(t_ns, measured[:, :3], measured[:, 3:]), bias)
+
+
+def _walk(start: Array, steps: Array) -> Array:
+    """Return a random walk (S, d) from its start (d,) and its steps (S, d), the first of which is not taken."""
+    walked: Array = start + np.cumsum(np.vstack([np.zeros_like(start), steps[:-1]]), axis=0)
+    return walked

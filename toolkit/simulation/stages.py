@@ -1,0 +1,100 @@
+"""Where the scenarios play: the road of `drive` and the hall of `flight`; functions of time without any seed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.geometry import Array, about_z, so3_exp
+from toolkit.simulation import world
+from toolkit.simulation.trajectory import SPLINE_ORDER as ORDER
+from toolkit.simulation.trajectory import (
+    FreeTrajectory,
+    RoadTrajectory,
+    RotationSpline,
+    Trajectory,
+    UniformKnots,
+    VectorSpline,
+)
+
+_WORLD_SEED = 20  # draws the landmarks, the same for every seed of a scenario
+
+# The road goes on after the last frame as far as the camera sees.
+_ROAD_LEAD_OUT_S = 6.0
+_ROAD_LANDMARKS_PER_POSE = 14
+_ROAD_POSE_SPACING_M = 2.0
+_CORNER_EVERY_S = 20.0
+_CORNER_TURNS = (1.0, 1.0, -1.0, 1.0, -1.0, -1.0)  # left is positive
+
+_HALL_LOWER_M, _HALL_UPPER_M = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 4.5])
+_HALL_LANDMARKS = 1500
+# The IMU of EuRoC's sensor stands on its side: x up, z ahead.
+_R_LEVEL_IMU = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Where a scenario plays: the trajectory and the landmarks (M, 3) along it."""
+
+    trajectory: Trajectory
+    points: Array
+
+
+def road(duration_s: float) -> Stage:
+    """Return a drive through hilly streets: 3 to 12 m/s, a right-angled corner every 20 s, slow in the corners."""
+    reach_s = duration_s + _ROAD_LEAD_OUT_S
+    knots, control_t_s = _knots(0.8, reach_s)
+    trajectory = RoadTrajectory(VectorSpline(knots, _road_positions(control_t_s)))
+    fine_t_s = np.arange(0.0, reach_s, 0.02)
+    travelled_m = np.cumsum(0.02 * np.linalg.norm(trajectory.position.at(fine_t_s, 1), axis=1))
+    even_m = np.arange(travelled_m[0], travelled_m[-1], _ROAD_POSE_SPACING_M)
+    path = trajectory.at(np.interp(even_m, travelled_m, fine_t_s)).T_world_imu
+    return Stage(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, np.random.default_rng(_WORLD_SEED)))
+
+
+def _road_positions(t_s: Array) -> Array:
+    """Return positions (N, 3) along the road, from a speed, a turn rate and a slope given as functions of time."""
+    dt_s = 0.02
+    fine_s = np.arange(t_s[0], t_s[-1] + dt_s, dt_s)
+    speed_mps = 7.5 + 4.5 * np.cos(2.0 * np.pi * fine_s / _CORNER_EVERY_S)
+    turn_radps = 0.04 * np.sin(2.0 * np.pi * fine_s / 9.0)
+    corners_s = np.arange(0.5 * _CORNER_EVERY_S, t_s[-1], _CORNER_EVERY_S)
+    for i, corner_s in enumerate(corners_s):
+        # The integral of this bell is a right angle.
+        bell = np.exp(-(((fine_s - corner_s) / 2.2) ** 2)) / (2.2 * np.sqrt(np.pi))
+        turn_radps += _CORNER_TURNS[i % len(_CORNER_TURNS)] * 0.5 * np.pi * bell
+    heading = dt_s * np.cumsum(turn_radps)
+    travelled_m = dt_s * np.cumsum(speed_mps)
+    x = dt_s * np.cumsum(speed_mps * np.cos(heading))
+    y = dt_s * np.cumsum(speed_mps * np.sin(heading))
+    z = 2.0 * np.sin(2.0 * np.pi * travelled_m / 180.0) + 0.4 * np.sin(2.0 * np.pi * travelled_m / 47.0)
+    return np.stack([np.interp(t_s, fine_s, axis) for axis in (x, y, z)], axis=-1)
+
+
+def hall(duration_s: float) -> Stage:
+    """Return a flight of about 1 m/s through a hall of 10 x 10 x 4.5 m, turning about and shaken on all axes."""
+    knots, t_s = _knots(0.2, duration_s)
+    position = np.stack(
+        [
+            2.0 * np.sin(0.45 * t_s) + 0.04 * np.sin(2.9 * t_s),
+            1.8 * np.sin(0.60 * t_s + 1.0) + 0.04 * np.sin(3.3 * t_s),
+            2.1 + 0.6 * np.sin(0.80 * t_s + 0.5) + 0.03 * np.sin(3.7 * t_s),
+        ],
+        axis=-1,
+    )
+    yaw = 0.25 * t_s + 0.4 * np.sin(0.7 * t_s)
+    pitch, roll = 0.25 * np.sin(1.1 * t_s), 0.2 * np.sin(1.4 * t_s + 0.7)
+    zero = np.zeros_like(t_s)
+    tilt = so3_exp(np.stack([zero, pitch, zero], axis=-1)) @ so3_exp(np.stack([roll, zero, zero], axis=-1))
+    rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
+    trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
+    points = world.room(_HALL_LOWER_M, _HALL_UPPER_M, _HALL_LANDMARKS, np.random.default_rng(_WORLD_SEED))
+    return Stage(trajectory, points)
+
+
+def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:
+    """Return a time base that reaches from 0 to ``reach_s`` and a little on, and its control points' times."""
+    before = ORDER // 2
+    count = int(np.ceil(reach_s / step_s)) + 2 * before + 3
+    start_s = -before * step_s
+    control_t_s: Array = start_s + step_s * np.arange(count, dtype=np.float64)
+    return UniformKnots(start_s, step_s), control_t_s
