@@ -1,7 +1,7 @@
 """EKF corrections of the pose by many landmarks and of many landmarks by one pose (Kang, eqs. 6-14).
 
 The report leaves one problem open: its gain inverts a matrix of the size of all measurements (eq. 12). The
-matrix is block diagonal but for the pose's own six dimensions, so the same update in information form,
+measurement noise is block diagonal, so the same update in information form,
 ``P+ = (P^-1 + sum_k H_k^T S_k^-1 H_k)^-1``, needs only 3x3 blocks and is identical; no landmark is left out.
 """
 
@@ -27,46 +27,59 @@ class PoseCorrection(NamedTuple):
 
 
 def correct_pose(belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig) -> PoseCorrection:
-    """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation."""
-    predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
-    residual_px, d_uv_d_pose, d_uv_d_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
-    own_cov = d_uv_d_point @ landmarks.covs @ np.swapaxes(d_uv_d_point, 1, 2) + rig.cov_uv_px2
-    d_pose_uv = np.swapaxes(d_uv_d_pose, 1, 2)
-    whole_cov = own_cov + d_uv_d_pose @ belief.cov[POSE, POSE] @ d_pose_uv
-    nis = mahalanobis_squared(residual_px, whole_cov)
-    accepted = (nis < STEREO_GATE) & (predicted.depth_m > 0.0)
-    information = np.linalg.inv(own_cov)
-    own_nis = np.einsum("ni,nij,nj->n", residual_px, information, residual_px)
-    weights = np.where(accepted, huber_weights(own_nis), 0.0)
-    weighted = weights[:, None, None] * (d_pose_uv @ information)
-    delta, cov = information_update(
-        belief.cov, (weighted @ d_uv_d_pose).sum(axis=0), np.einsum("nij,nj->i", weighted, residual_px)
-    )
-    return PoseCorrection(belief.moved(delta, cov), accepted, float(nis[accepted].sum()), 3 * int(accepted.sum()))
+    """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation.
 
-
-def information_update(cov: Array, pose_information: Array, pose_gradient: Array) -> tuple[Array, Array]:
-    """Return the error (d,) and covariance (d, d) after adding information about the pose.
-
-    ``pose_information`` (6, 6) is sum H^T S^-1 H and ``pose_gradient`` (6,) is sum H^T S^-1 r.
+    A sighting outside the 95 % gate is left out, one that strains it is given Huber's weight.
     """
-    information = np.linalg.inv(cov)
-    information[POSE, POSE] += pose_information
-    updated = np.linalg.inv(information)
-    return updated[:, POSE] @ pose_gradient, updated
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
+    residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
+    own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2
+    nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
+    accepted = (nis < STEREO_GATE) & (predicted.depth_m > 0.0)
+    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov)), 0.0)
+    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
+    return PoseCorrection(corrected, accepted, float(nis[accepted].sum()), 3 * int(accepted.sum()))
 
 
-def correct_landmarks(landmarks: LandmarkMap, uvs_px: Array, belief: Belief, rig: StereoRig) -> LandmarkMap:
+def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:
+    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6) and information matrices (N, 3, 3)."""
+    weighted = np.swapaxes(H_pose, 1, 2) @ information
+    posterior = np.linalg.inv(belief.cov)
+    posterior[POSE, POSE] += (weighted @ H_pose).sum(axis=0)
+    cov = np.linalg.inv(posterior)
+    return belief.moved(cov[:, POSE] @ np.einsum("nij,nj->i", weighted, residual_px), cov)
+
+
+class LandmarkCorrection(NamedTuple):
+    """The corrected landmarks, the NIS (N,) of their sightings and the depths (N,) m they were predicted at."""
+
+    landmarks: LandmarkMap
+    nis: Array
+    depth_m: Array
+
+
+def correct_landmarks(
+    landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig
+) -> LandmarkCorrection:
     """Correct N landmarks by their sightings (N, 3) px from one pose, each by its own 3x3 EKF (Kang, eqs. 6-10).
 
-    The pose's uncertainty counts as measurement noise, so that a doubtful pose does not harden the map.
+    ``pose_cov`` (6, 6), zero in the report, counts as measurement noise: a doubtful pose does not harden the map.
     """
-    predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
-    residual_px, H_point, H_pose = uvs_px - predicted.uv_px, predicted.d_uv_d_point, predicted.d_uv_d_pose
-    pose_noise = H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2)
-    innovation_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2 + pose_noise
+    predicted = stereo.predict(landmarks.points, T_world_imu, rig)
+    residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
+    noise_px2 = rig.cov_uv_px2 + H_pose @ pose_cov @ np.swapaxes(H_pose, 1, 2)
+    innovation_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + noise_px2
     gain = np.swapaxes(np.linalg.solve(innovation_cov, H_point @ landmarks.covs), 1, 2)
     points = landmarks.points + (gain @ residual_px[..., None])[..., 0]
     covs = landmarks.covs - gain @ H_point @ landmarks.covs
-    accepted = (mahalanobis_squared(residual_px, innovation_cov) < STEREO_GATE) & (predicted.depth_m > 0.0)
-    return landmarks.corrected(accepted, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
+    corrected = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
+    return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), predicted.depth_m)
+
+
+def correct_landmarks_gated(
+    landmarks: LandmarkMap, uvs_px: Array, belief: Belief, rig: StereoRig, trusted: BoolArray
+) -> LandmarkMap:
+    """Correct the trusted (N,) landmarks whose sightings also pass the gate; leave the others as they are."""
+    corrected, nis, depth_m = correct_landmarks(landmarks, uvs_px, belief.T_world_imu, belief.cov[POSE, POSE], rig)
+    accepted = trusted & (nis < STEREO_GATE) & (depth_m > 0.0)
+    return landmarks.corrected(accepted, corrected.points, corrected.covs)

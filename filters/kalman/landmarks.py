@@ -1,6 +1,6 @@
 """The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that left."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -74,20 +74,30 @@ def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: 
     return LandmarkMap(ids, points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2))
 
 
-@dataclass
-class Archive:
-    """Collects landmarks as they leave the state; the last value of an id wins."""
+class TrackedMap:
+    """The landmarks in view, kept frame by frame: lost ones leave the state for an archive, new ones start."""
 
-    _left: list[LandmarkMap] = field(default_factory=list)
+    def __init__(self, rig: StereoRig) -> None:
+        self._rig = rig
+        self._in_view = LandmarkMap.empty()
+        self._left: list[LandmarkMap] = []
 
-    def add(self, landmarks: LandmarkMap) -> None:
-        """Keep what the filter knew of these landmarks when they left."""
-        if len(landmarks):
-            self._left.append(landmarks)
+    def seen_again(self, frame: StereoFrame) -> tuple[LandmarkMap, Array]:
+        """Return the landmarks the frame shows again and their measurements (N, 3) px; forget the others."""
+        slots, rows = self._in_view.match(frame.track_ids)
+        lost = np.ones(len(self._in_view), dtype=bool)
+        lost[slots] = False
+        self._left.append(self._in_view.select(lost))
+        return self._in_view.select(slots), frame.uvs_px[rows]
 
-    def with_current(self, landmarks: LandmarkMap) -> Landmarks:
-        """Return every landmark there ever was, the current ones included."""
-        parts = [*self._left, landmarks]
+    def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Keep the landmarks seen again, with their new values, and start the frame's other tracks."""
+        new = ~np.isin(frame.track_ids, seen.track_ids, assume_unique=True)
+        self._in_view = seen.merged(first_sighting(frame, np.flatnonzero(new), T_world_imu, self._rig))
+
+    def landmarks(self) -> Landmarks:
+        """Return every landmark there ever was, as last known."""
+        parts = [*self._left, self._in_view]
         ids = np.concatenate([p.track_ids for p in parts])
         points, covs = np.concatenate([p.points for p in parts]), np.concatenate([p.covs for p in parts])
         last = ids.size - 1 - np.unique(ids[::-1], return_index=True)[1]

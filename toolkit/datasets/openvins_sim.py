@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.parts.csv_table import find_table, read_columns
+from toolkit.datasets.parts.csv_table import find_table, first_line, read_columns
 from toolkit.datasets.parts.fields import Fields, check_frame_count
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
@@ -41,10 +41,13 @@ _RECTIFIED_TOLERANCE = 1e-6
 
 def recognises(path: Path) -> bool:
     """Say whether the path is a folder whose calibration or feature table is of this kind."""
-    calibration, features = path / _CALIBRATION, find_table(path, _FEATURES)
-    if calibration.is_file():
-        return '"cam0"' in calibration.read_text(encoding="utf-8", errors="replace")
-    return features is not None and find_table(path, _IMU) is not None
+    features = find_table(path, _FEATURES)
+    if features is not None and b"feature_id" in first_line(features):
+        return True
+    try:
+        return b'"cam0"' in (path / _CALIBRATION).read_bytes()
+    except OSError:
+        return False
 
 
 def load(path: Path) -> Sequence:
@@ -84,6 +87,8 @@ def _tables(folder: Path) -> tuple[Path, Path]:
 def _calibration(path: Path) -> Fields:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     except (JSONDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
     if not isinstance(content, dict):
@@ -134,7 +139,7 @@ def _frames(path: Path, imu_t_ns: IntArray) -> tuple[IntArray, Observations]:
         raise DataError(f"{path}: row {unnamed[0] + 1} has no frame or feature_id; remove the row")
     if imu_t_ns.size == 0:
         raise DataError(f"{path.parent}: the IMU table has no samples; export it again")
-    inside = (row_t_ns >= imu_t_ns[0]) & (row_t_ns <= imu_t_ns[-1])
+    inside = (row_t_ns >= imu_t_ns.min()) & (row_t_ns <= imu_t_ns.max())
     stereo = (table[:, 7:9] == 1.0).all(axis=1)
     number, first_row = np.unique(table[inside, 1], return_index=True)
     kept = inside & stereo

@@ -1,9 +1,10 @@
 """What the numbers mean, in plain words: statuses, findings, metrics that are missing and why."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 from toolkit.audit import Finding
-from toolkit.report.comparison import Comparison
+from toolkit.report.comparison import Comparison, Row
 from toolkit.report.metrics_json import path_length_m
 from toolkit.report.table import COLUMNS
 from toolkit.sequence import Sequence
@@ -58,19 +59,28 @@ def missing_lines(comparison: Comparison) -> Iterator[str]:
     A run without any answer is explained by its status already and left out here.
     """
     rows = [row for row in comparison.rows if row.run.trajectory(row.output) is not None]
-    empty: dict[str, dict[tuple[str, ...], list[str]]] = {}
+    empty: dict[tuple[str, str], list[str]] = {}
     for column in COLUMNS:
-        by_reason: dict[str, list[str]] = {}
+        by_reason: dict[str, list[Row]] = {}
         for row in rows:
             if row.scores.values.get(column.key) is None:
-                reason = row.scores.notes.get(column.key, "not computed")
-                by_reason.setdefault(reason, []).append(f"{row.estimator} {row.output}")
-        for reason, whose in by_reason.items():
-            empty.setdefault(reason, {}).setdefault(tuple(whose), []).append(column.name)
-    for reason, groups in empty.items():
-        for affected, names in groups.items():
-            of_whom = "" if len(affected) == len(rows) else f" for {', '.join(affected)}"
-            yield f"no {', '.join(names)}{of_whom}: {reason}"
+                by_reason.setdefault(row.scores.notes.get(column.key, "not computed"), []).append(row)
+        for reason, affected in by_reason.items():
+            empty.setdefault((_whose(affected, rows), reason), []).append(column.name)
+    for (whose, reason), names in empty.items():
+        yield f"no {', '.join(names)}{whose}: {reason}"
+
+
+def _whose(affected: list[Row], rows: list[Row]) -> str:
+    """Name the rows affected: nobody where it is all, the estimator alone where it is all of its outputs."""
+    if len(affected) == len(rows):
+        return ""
+    of_all, of_affected = Counter(row.estimator for row in rows), Counter(row.estimator for row in affected)
+    names = (
+        row.estimator if of_affected[row.estimator] == of_all[row.estimator] else f"{row.estimator} {row.output}"
+        for row in affected
+    )
+    return f" for {', '.join(dict.fromkeys(names))}"
 
 
 def remark_lines(comparison: Comparison) -> Iterator[str]:

@@ -19,6 +19,17 @@ def find_table(folder: Path, name: str) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
+def first_line(path: Path) -> bytes:
+    """Return the first line of a table, or nothing where it cannot be read."""
+    try:
+        with path.open("rb") as raw:
+            zipped = raw.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+        with gzip.open(path) if zipped else path.open("rb") as stream:
+            return stream.readline()
+    except (OSError, EOFError, zlib.error):
+        return b""
+
+
 def read_columns(path: Path, names: tuple[str, ...]) -> Array:
     """Return the named columns (N, C) of a table, in that order; N may be 0.
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
+from toolkit.estimate import Run
 from toolkit.geometry import Array
 from toolkit.metrics.common.alignment import Alignment
 from toolkit.report.comparison import Comparison, Row
@@ -35,6 +36,8 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is None or trajectory.T_world_imu is reference.truth.T_world_imu:
+            continue
+        if row.output == "causal" and _says_the_same(row.run):
             continue
         errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
         if errors is not None:
@@ -77,7 +80,7 @@ def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference:
     for row, errors in curves:
         t_s = (errors.t_ns - start_ns) / NS_PER_S
         colour, line = colour_of(comparison, row.estimator), line_of(row.output)
-        label = f"{row.estimator} {row.output}"
+        label = f"{row.estimator} {'causal = final' if _says_the_same(row.run) else row.output}"
         position.plot(t_s, errors.position_m, color=colour, linestyle=line, linewidth=1.6, label=label)
         heading.plot(t_s, _without_wraps(errors.heading_deg), color=colour, linestyle=line, linewidth=1.6)
     quiet(position, f"{comparison.sequence.name}: position {reference.what}", "", "position [m]")
@@ -85,6 +88,13 @@ def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference:
     _limit(position, curves)
     figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
     return NamedFigure("errors_over_time", reference.caption, figure)
+
+
+def _says_the_same(run: Run) -> bool:
+    """Say whether both outputs of a run agree, as a filter's do; one line then stands for both."""
+    if run.causal is None or run.final is None:
+        return False
+    return np.array_equal(run.causal.T_world_imu, run.final.T_world_imu)
 
 
 def _limit(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:

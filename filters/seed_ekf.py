@@ -1,0 +1,57 @@
+"""The report's visual-inertial EKF to the letter, so that anyone can see what it does (Kang, III-C, eqs. 1-14).
+
+It corrects the map from the predicted pose and then the pose from that map, taken for exact, with the same
+measurements: no gate, no landmark uncertainty in the innovation. Its pose covariance collapses, after which
+one bad match moves the car. The report's measurement has four rows; ours has vL and vR as their mean with
+half the variance, which gives the same update.
+"""
+
+import numpy as np
+
+from filters.kalman.belief import initial_belief
+from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
+from filters.kalman.landmarks import LandmarkMap, TrackedMap
+from filters.kalman.prediction import predictor
+from toolkit.estimate import Estimate, Finished, Trajectory
+from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array
+from toolkit.models import stereo
+from toolkit.sequence import Packet
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    return SeedEkf(setup)
+
+
+class SeedEkf:
+    """Equations 1 to 14 in the order the report gives them."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._rig = setup.rig
+        self._predict = predictor(setup)
+        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._map = TrackedMap(setup.rig)
+        self._said: list[Estimate] = []
+
+    def step(self, packet: Packet) -> Estimate:
+        """Predict (1-2), map (3-10), correct the pose (11-14)."""
+        if packet.motion is not None:
+            self._belief = self._predict(self._belief, packet.motion)
+        seen, uvs_px = self._map.seen_again(packet.frame)
+        if len(seen):
+            seen = correct_landmarks(seen, uvs_px, self._belief.T_world_imu, np.zeros((6, 6)), self._rig).landmarks
+            self._correct_pose(seen, uvs_px)
+        self._map.keep(seen, packet.frame, self._belief.T_world_imu)
+        self._said.append(self._belief.estimate(packet.frame.t_ns))
+        return self._said[-1]
+
+    def _correct_pose(self, seen: LandmarkMap, uvs_px: Array) -> None:
+        predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
+        information = np.broadcast_to(np.linalg.inv(self._rig.cov_uv_px2), (len(seen), 3, 3))
+        residual_px = uvs_px - predicted.uv_px
+        self._belief = updated_by_pose_sightings(self._belief, residual_px, predicted.d_uv_d_pose, information)
+
+    def finish(self) -> Finished:
+        """Return what was said at every frame and every landmark as last known."""
+        return Finished(Trajectory.of(self._said), self._map.landmarks())

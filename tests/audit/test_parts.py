@@ -1,0 +1,69 @@
+"""The camera's own motion, and the statistics the verdicts rest on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit.parts.intervals import interval_means
+from toolkit.audit.parts.robust import slope
+from toolkit.audit.parts.tracks import split
+from toolkit.audit.parts.vision import camera_motion
+from toolkit.geometry import se3_inverse, se3_log
+from toolkit.sequence import NS_PER_S, Observations, Sequence
+from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
+
+
+def true_camera_twist(sequence: Sequence) -> np.ndarray:
+    assert sequence.truth is not None
+    T_world_cam = sequence.truth.T_world_imu @ sequence.rig.T_imu_cam
+    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+    return se3_log(se3_inverse(T_world_cam[:-1]) @ T_world_cam[1:]) / dt_s
+
+
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
+def test_camera_motion_is_exact_on_exact_tracks(scenario: Scenario) -> None:
+    sequence = simulate(replace(noise_free(scenario), duration_s=10.0), seed=0)
+    camera, truth = camera_motion(sequence), true_camera_twist(sequence)
+    assert camera.known.all()
+    # Six iterations from rest: 1e-5 rad/s and 1e-4 m/s of what they started from.
+    np.testing.assert_allclose(camera.w_radps, truth[:, :3], atol=1e-4)
+    np.testing.assert_allclose(camera.v_mps, truth[:, 3:], atol=1e-3)
+
+
+def test_camera_motion_is_unknown_without_tracks() -> None:
+    sequence = simulate(replace(DRIVE, duration_s=3.0), seed=0)
+    few = sequence.observations.select(sequence.observations.frame < 10)
+    camera = camera_motion(replace(sequence, observations=few))
+    assert camera.known[:9].all()
+    assert not camera.known[9:].any()
+    assert np.isfinite(camera.v_mps).all()
+
+
+def test_slope_through_an_instrument_ignores_the_noise_of_the_regressor() -> None:
+    rng = np.random.default_rng(5)
+    signal = rng.standard_normal((4000, 3))
+    regressor = signal + rng.standard_normal(signal.shape)
+    response = 0.7 * signal + 0.1 * rng.standard_normal(signal.shape)
+    through = slope(signal, regressor, response)
+    direct = slope(regressor, regressor, response)
+    assert abs(through.value - 0.7) < 5.0 * through.error
+    assert direct.value < 0.5  # half of it lost to the noise: why the instrument is there
+
+
+def test_interval_means_integrate_straight_lines_exactly() -> None:
+    t_ns = np.array([0, 3, 4, 9, 12]) * NS_PER_S
+    values = np.stack([2.0 * t_ns / NS_PER_S, np.ones(5)], axis=1)
+    frames_t_ns = np.array([1, 2, 8, 11]) * NS_PER_S
+    np.testing.assert_allclose(interval_means(t_ns, values, frames_t_ns), [[3, 1], [10, 1], [19, 1]], rtol=1e-12)
+
+
+def test_split_renames_from_the_start_on_and_keeps_every_other_track() -> None:
+    observations = Observations.sorted(
+        np.array([0, 1, 2, 3, 0, 1, 2]), np.array([7, 7, 7, 7, 9, 9, 9]), np.zeros((7, 3))
+    )
+    starts = (observations.track_id == 7) & (observations.frame == 2)
+    renamed = split(observations, starts)
+    assert renamed[(observations.track_id == 7) & (observations.frame < 2)].tolist() == [7, 7]
+    assert renamed[(observations.track_id == 7) & (observations.frame >= 2)].tolist() == [10, 10]
+    assert (renamed[observations.track_id == 9] == 9).all()

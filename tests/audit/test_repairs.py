@@ -1,0 +1,201 @@
+"""What each repair leaves: the clean recording again, or exactly what the fault's page promises."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Finding, audit
+from toolkit.geometry import Array, so3_exp
+from toolkit.sequence import Sequence
+
+Make = Callable[..., Sequence]
+PlantIn = Callable[[str, Sequence], Sequence]
+
+
+def only_finding(sequence: Sequence) -> Finding:
+    (finding,) = audit(sequence).findings
+    return finding
+
+
+def test_reordered_time_gives_the_clean_recording_again(clean_recording: Make, planted: PlantIn) -> None:
+    clean = clean_recording()
+    repaired = audit(planted("time-order", clean)).sequence
+    assert repaired.content_hash() == clean.content_hash()
+
+
+def test_a_frame_with_the_stamp_of_another_goes_with_its_sightings(clean_recording: Make) -> None:
+    clean = clean_recording()
+    stamps = clean.frames_t_ns.copy()
+    stamps[50] = stamps[49]
+    repaired = audit(replace(clean, frames_t_ns=stamps)).sequence
+    assert np.array_equal(repaired.frames_t_ns, np.delete(clean.frames_t_ns, 50))
+    assert len(repaired.observations) == len(clean.observations) - np.sum(clean.observations.frame == 50)
+
+
+def test_a_stamp_that_is_no_time_is_dropped(clean_recording: Make) -> None:
+    clean = clean_recording()
+    stamps = clean.frames_t_ns.copy()
+    stamps[50] = np.iinfo(np.int64).min
+    repaired = audit(replace(clean, frames_t_ns=stamps)).sequence
+    assert np.array_equal(repaired.frames_t_ns, np.delete(clean.frames_t_ns, 50))
+
+
+@pytest.mark.parametrize("fault", ["not-finite", "no-disparity"])
+def test_only_the_bad_sightings_are_dropped(clean_recording: Make, planted: PlantIn, fault: str) -> None:
+    clean = clean_recording()
+    faulty = planted(fault, clean)
+    disparity_px = faulty.observations.uv_px[:, 0] - faulty.observations.uv_px[:, 1]
+    expected = clean.observations.select(disparity_px > 0.0)  # False for NaN
+    repaired = audit(faulty).sequence.observations
+    assert np.array_equal(repaired.uv_px, expected.uv_px)
+    assert np.array_equal(repaired.track_id, expected.track_id)
+
+
+def test_the_longest_stretch_between_motion_gaps_is_kept(clean_recording: Make, planted: PlantIn) -> None:
+    clean = clean_recording()
+    repaired = audit(planted("time-gap", clean)).sequence
+    t_s = (clean.frames_t_ns - clean.frames_t_ns[0]) / 1e9
+    assert np.array_equal(repaired.frames_t_ns, clean.frames_t_ns[t_s >= 12.0])
+    assert repaired.prior is None  # it was the state at another frame
+
+
+def test_a_gap_in_the_frames_alone_is_information(clean_recording: Make) -> None:
+    clean = clean_recording()
+    kept = np.delete(np.arange(clean.frame_count), range(100, 104))
+    new_index = np.cumsum(np.isin(np.arange(clean.frame_count), kept)) - 1
+    # Its tracks end at the gap, or they would be called back from an absence no frame shows.
+    observations = clean.observations.select(clean.observations.frame < 100)
+    sequence = replace(
+        clean,
+        frames_t_ns=clean.frames_t_ns[kept],
+        observations=replace(observations, frame=new_index[observations.frame]),
+    )
+    outcome = audit(sequence)
+    assert [(f.fault, f.repaired, f.blocking) for f in outcome.findings] == [("time-gap", False, False)]
+    assert outcome.sequence is sequence
+
+
+def test_repeated_tracks_end_at_a_stale_frame_and_start_anew_after_it(clean_recording: Make, planted: PlantIn) -> None:
+    faulty = planted("stale-frames", clean_recording())
+    repaired = audit(faulty).sequence.observations
+    last_before = set(repaired.track_id[repaired.frame == 39].tolist())
+    in_stale = set(repaired.track_id[repaired.frame == 40].tolist())
+    first_after = set(repaired.track_id[repaired.frame == 41].tolist())
+    assert not last_before & in_stale
+    assert not last_before & first_after
+    survivors = faulty.observations.track_id
+    carried = np.intersect1d(survivors[faulty.observations.frame == 39], survivors[faulty.observations.frame == 40])
+    dropped = len(faulty.observations) - len(repaired)
+    assert dropped > carried.size > 4
+    assert len(set(zip(repaired.frame.tolist(), repaired.track_id.tolist(), strict=True))) == len(repaired)
+
+
+def test_a_parked_vehicle_that_repeats_its_pixels_is_not_stale(clean_recording: Make) -> None:
+    clean = clean_recording()
+    o = clean.observations
+    moving = o.frame >= 20
+    parked = np.flatnonzero(o.frame == 20)
+    frame = np.concatenate([np.repeat(np.arange(20), parked.size), o.frame[moving]])
+    track_id = np.concatenate([np.tile(o.track_id[parked], 20), o.track_id[moving]])
+    uv_px = np.concatenate([np.tile(o.uv_px[parked], (20, 1)), o.uv_px[moving]])
+    standing = replace(clean, observations=type(o).sorted(frame, track_id, uv_px))
+    assert "stale-frames" not in {f.fault for f in audit(standing).findings}
+
+
+def test_no_track_is_absent_between_its_first_and_last_sighting(clean_recording: Make, planted: PlantIn) -> None:
+    repaired = audit(planted("returning-tracks", clean_recording("flight"))).sequence.observations
+    _, sightings = np.unique(repaired.track_id, return_counts=True)
+    order = np.lexsort((repaired.frame, repaired.track_id))
+    first = np.concatenate([[0], np.cumsum(sightings)[:-1]])
+    span = repaired.frame[order][first + sightings - 1] - repaired.frame[order][first] + 1
+    assert np.array_equal(span, sightings)
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [
+        np.diag([1.0, -1.0, -1.0]),
+        np.diag([-1.0, -1.0, 1.0]),
+        np.eye(3)[[1, 2, 0]],
+        so3_exp(np.array([0, 0, np.pi / 2])),
+    ],
+)
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_any_right_handed_turn_of_the_axes_is_undone(clean_recording: Make, scenario: str, turn: Array) -> None:
+    rig = clean_recording(scenario).rig
+    T = np.eye(4)
+    T[:3, :3] = turn
+    faulty = replace(clean_recording(scenario), rig=replace(rig, T_imu_cam=T @ rig.T_imu_cam))
+    outcome = audit(faulty)
+    assert [f.fault for f in outcome.findings] == ["mixed-axes"]
+    # Turns are exact; what is left is rounding.
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_camera_is_put_where_it_is(clean_recording: Make, planted: PlantIn, seed: int) -> None:
+    clean = clean_recording("drive", seed)
+    repaired = audit(planted("extrinsic-translation", clean)).sequence
+    np.testing.assert_allclose(repaired.rig.T_imu_cam, clean.rig.T_imu_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_late_twists_give_every_interval_its_clean_motion(clean_recording: Make, planted: PlantIn, seed: int) -> None:
+    clean = clean_recording("drive", seed)
+    repaired = audit(planted("twist-lag", clean)).sequence
+    for now, before in zip(repaired.packets(), clean.packets(), strict=True):
+        if now.motion is not None and before.motion is not None:
+            assert np.array_equal(now.motion.v_mps, before.motion.v_mps)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_does_not_make_the_mean_of_two_samples_look_right(clean_recording: Make, seed: int) -> None:
+    """A mean has half the noise, so a least-squares lag would answer one half; this one says nothing instead."""
+    clean, rng = clean_recording("drive", seed), np.random.default_rng(seed)
+    w_radps = clean.motion.w_radps + 0.05 * rng.standard_normal(clean.motion.w_radps.shape)
+    assert audit(replace(clean, motion=replace(clean.motion, w_radps=w_radps))).findings == ()
+
+
+def test_a_gyro_bias_is_reported_and_left_to_the_filters(clean_recording: Make) -> None:
+    clean = clean_recording("drive")
+    motion = replace(clean.motion, w_radps=clean.motion.w_radps - 0.01)
+    outcome = audit(replace(clean, motion=motion))
+    (finding,) = outcome.findings
+    assert (finding.fault, finding.count, finding.repaired, finding.blocking) == ("gyro-bias", 3, False, False)
+    assert outcome.sequence.motion is motion
+
+
+def test_the_gyro_bias_of_an_imu_is_found_on_its_axis(clean_recording: Make) -> None:
+    clean = clean_recording("flight")
+    motion = replace(clean.motion, gyro_radps=clean.motion.gyro_radps + np.array([0.0, 0.02, 0.0]))
+    finding = only_finding(replace(clean, motion=motion))
+    assert (finding.fault, finding.count) == ("gyro-bias", 1)
+
+
+def test_a_standstill_shows_the_gyro_bias_without_a_camera(clean_recording: Make) -> None:
+    clean, rng = clean_recording("drive"), np.random.default_rng(0)
+    v_mps = clean.motion.v_mps.copy()
+    w_radps = clean.motion.w_radps.copy()
+    v_mps[:80] = 0.001 * rng.standard_normal((80, 3))
+    w_radps[:80] = -0.01 + 0.005 * rng.standard_normal((80, 3))
+    blind = replace(clean, observations=clean.observations.select(np.zeros(len(clean.observations), dtype=bool)))
+    finding = only_finding(replace(blind, motion=replace(clean.motion, v_mps=v_mps, w_radps=w_radps)))
+    assert (finding.fault, finding.count) == ("gyro-bias", 3)
+    assert "80 samples at standstill" in finding.detail
+
+
+def test_faults_that_come_together_are_all_repaired(clean_recording: Make, planted: PlantIn) -> None:
+    faulty = clean = clean_recording("drive", 2)
+    for fault in ("extrinsic-translation", "mixed-axes", "twist-lag", "stale-frames", "no-disparity"):
+        faulty = planted(fault, faulty)
+    outcome = audit(faulty)
+    assert {f.fault for f in outcome.findings if f.repaired} == {
+        "extrinsic-translation",
+        "mixed-axes",
+        "twist-lag",
+        "stale-frames",
+        "no-disparity",
+    }
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, clean.rig.T_imu_cam, atol=1e-12)

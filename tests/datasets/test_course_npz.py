@@ -1,0 +1,236 @@
+"""The course's npz files: what is read, how much memory it takes, and what is said of malformed ones."""
+
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import course_npz, load_sequence
+from toolkit.errors import DataError
+from toolkit.geometry import se3_inverse
+
+Course = dict[str, Any]
+STATUS = Path("/proc/self/status")
+# Not getrusage: its peak starts at that of the process which started this one.
+MEASURE = f"""
+import sys
+from pathlib import Path
+from toolkit.datasets import course_npz
+def peak_mb():
+    return next(int(line.split()[1]) for line in open("{STATUS}") if line.startswith("VmHWM")) / 1024
+before = peak_mb()
+sequence = course_npz.load(Path(sys.argv[1]))
+print(len(sequence.observations), peak_mb() - before)
+"""
+
+
+def written(folder: Path, arrays: Course) -> Path:
+    path = folder / "small.npz"
+    np.savez(path, **arrays)
+    return path
+
+
+def streamed(path: Path, tracks: int, frames: int, length: int = 13) -> int:
+    """Write a recording of full size without its dense array; each track is seen for ``length`` frames."""
+    small = {
+        "time_stamps": 0.1 * np.arange(frames)[None],
+        "linear_velocity": np.zeros((3, frames)),
+        "angular_velocity": np.zeros((3, frames)),
+        "K": np.diag([500.0, 500.0, 1.0]),
+        "b": np.array(0.5),
+        "imu_T_cam": np.eye(4),
+    }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for key, array in small.items():
+            with archive.open(f"{key}.npy", "w") as stream:
+                np.lib.format.write_array(stream, array)
+        with archive.open("features.npy", "w", force_zip64=True) as stream:
+            header = {"descr": "<f8", "fortran_order": False, "shape": (4, tracks, frames)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            first_seen = np.linspace(0, frames - length, tracks).astype(int)
+            for _ in range(4):
+                for some in np.array_split(first_seen, tracks // 200):
+                    rows = np.full((some.size, frames), -1.0)
+                    for row, start in zip(rows, some, strict=True):
+                        row[start : start + length] = 100.0
+                    stream.write(rows.tobytes())
+    return tracks * length
+
+
+def measured(path: Path) -> tuple[int, float]:
+    """Return the observations, and the growth of peak memory (MB), of loading in a fresh process."""
+    if not STATUS.exists():
+        pytest.skip("peak memory is read from /proc, which this system lacks")
+    result = subprocess.run([sys.executable, "-c", MEASURE, str(path)], capture_output=True, text=True, check=True)
+    observations, grown_mb = result.stdout.split()
+    return int(observations), float(grown_mb)
+
+
+def test_sightings_are_those_not_missing_in_all_four_coordinates(course: Course, tmp_path: Path) -> None:
+    observations = course_npz.load(written(tmp_path, course)).observations
+    np.testing.assert_array_equal(observations.frame, [0, 1, 1, 2, 2, 3, 4])
+    np.testing.assert_array_equal(observations.track_id, [0, 0, 2, 0, 2, 2, 2])
+    np.testing.assert_array_equal(observations.uv_px[:2], [[400.0, 380.0, 201.0]] * 2)
+
+
+def test_a_sighting_that_lacks_a_coordinate_keeps_nan_there(course: Course, tmp_path: Path) -> None:
+    np.testing.assert_array_equal(
+        np.isnan(course_npz.load(written(tmp_path, course)).observations.uv_px[-1]), [False, True, False]
+    )
+
+
+def test_nan_of_the_file_is_kept_for_the_audit(course: Course, tmp_path: Path) -> None:
+    course["features"][0, 0, 0] = course["linear_velocity"][1, 2] = np.nan
+    sequence = course_npz.load(written(tmp_path, course))
+    assert np.isnan(sequence.observations.uv_px[0, 0])
+    assert np.isnan(sequence.motion.values[2, 1])
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4", "<i4"])
+def test_memory_order_and_number_type_do_not_matter(course: Course, tmp_path: Path, order: Any, dtype: str) -> None:
+    expected = course_npz.load(written(tmp_path, course)).observations
+    course["features"] = np.asarray(course["features"], dtype=dtype, order=order)
+    read = course_npz.load(written(tmp_path, course)).observations
+    np.testing.assert_array_equal(read.uv_px, expected.uv_px)
+    np.testing.assert_array_equal(read.track_id, expected.track_id)
+
+
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
+def test_every_version_of_the_header_is_read(course: Course, tmp_path: Path, version: tuple[int, int]) -> None:
+    path = tmp_path / "version.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for key, array in course.items():
+            with archive.open(f"{key}.npy", "w") as stream:
+                np.lib.format.write_array(stream, array, version=version)
+    assert len(course_npz.load(path).observations) == 7
+
+
+def test_both_generations_of_keys_mean_the_same(course: Course, tmp_path: Path) -> None:
+    older = course_npz.load(written(tmp_path, course))
+    course["cam_T_imu"] = se3_inverse(course.pop("imu_T_cam"))
+    course["rotational_velocity"] = course.pop("angular_velocity")
+    newer = course_npz.load(written(tmp_path, course))
+    np.testing.assert_allclose(newer.rig.T_imu_cam, older.rig.T_imu_cam, atol=1e-15)
+    np.testing.assert_array_equal(newer.motion.values, older.motion.values)
+
+
+def test_stamps_are_nanoseconds_and_the_name_is_the_stem(course: Course, tmp_path: Path) -> None:
+    sequence = course_npz.load(written(tmp_path, course))
+    assert sequence.name == "small"
+    # a double holds seconds since 1970 to 0.24 microseconds
+    np.testing.assert_allclose(sequence.frames_t_ns, 1.3e18 + 1e8 * np.arange(5), atol=256.0, rtol=0.0)
+
+
+def test_a_recording_without_features_says_so(course: Course, tmp_path: Path) -> None:
+    del course["features"]
+    sequence = course_npz.load(written(tmp_path, course))
+    assert len(sequence.observations) == 0
+    assert sequence.provenance.facts == ("no image features in this file",)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "tracks", "observations"),
+    [("03", 1010, 5105, 66353), ("0022", 800, 3220, 58418), ("0027", 1106, 3950, 75647), ("10_imu_only", 3026, 0, 0)],
+)
+def test_real_recordings_have_their_known_size(
+    real: Callable[[str], Path], name: str, frames: int, tracks: int, observations: int
+) -> None:
+    sequence = load_sequence(str(real(f"ucsd/{name}.npz")))
+    assert sequence.frame_count == sequence.motion.t_ns.size == frames
+    assert np.unique(sequence.observations.track_id).size == tracks
+    assert len(sequence.observations) == observations
+
+
+def test_loading_a_drive_stays_within_60_mb(tmp_path: Path) -> None:
+    path = tmp_path / "size_of_03.npz"
+    written_observations = streamed(path, tracks=5105, frames=1010)
+    observations, grown_mb = measured(path)
+    assert observations == written_observations
+    assert grown_mb <= 60.0
+
+
+def test_loading_the_real_drive_stays_within_60_mb(real: Callable[[str], Path]) -> None:
+    assert measured(real("ucsd/03.npz"))[1] <= 60.0
+
+
+def test_loading_1_3_gb_of_features_stays_within_300_mb(tmp_path: Path) -> None:
+    path = tmp_path / "size_of_10.npz"
+    written_observations = streamed(path, tracks=13289, frames=3026)
+    observations, grown_mb = measured(path)
+    assert observations == written_observations
+    assert grown_mb <= 300.0
+
+
+def spoil(key: str, value: Any) -> Callable[[Course], None]:
+    return lambda arrays: arrays.update({key: value})
+
+
+MALFORMED: list[tuple[str, Callable[[Course], Any], str]] = [
+    ("missing key", lambda a: (a.pop("K"), a.pop("angular_velocity")), "missing angular_velocity or rotational_.*, K"),
+    ("pickled features", spoil("features", np.array([{}, []], dtype=object)), "features holds objects"),
+    ("pickled stamps", spoil("time_stamps", np.array([{}, []], dtype=object)), "time_stamps .* unpickled"),
+    ("wrong features", spoil("features", np.zeros((4, 3, 6))), r"features has shape \(4, 3, 6\), .*\(4, any, 5\)"),
+    ("wrong velocity", spoil("linear_velocity", np.zeros((5, 3))), "linear_velocity has shape"),
+    ("wrong stamps", spoil("time_stamps", np.zeros((2, 5))), "time_stamps has shape"),
+    ("text", spoil("K", np.full((3, 3), "x")), "K holds <U1"),
+    ("one frame", spoil("time_stamps", np.zeros((1, 1))), "1 frame"),
+    ("no frame", spoil("time_stamps", np.zeros((1, 0))), "0 frame"),
+    ("NaN stamp", spoil("time_stamps", np.array([[0, 1, np.nan, 3, 4]])), r"time_stamps\[2\] is nan"),
+    ("nanoseconds", spoil("time_stamps", 1.3e18 + 1e8 * np.arange(5)), "look like nanoseconds: divide by 1e9"),
+    ("no baseline", spoil("b", np.array(0.0)), "b is 0, expected a positive"),
+    ("NaN calibration", spoil("K", np.full((3, 3), np.nan)), "K is not finite"),
+    ("no rotation", spoil("imu_T_cam", 2.0 * np.eye(4)), "imu_T_cam is not a rotation"),
+]
+
+
+@pytest.mark.parametrize(("spoiled", "message"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
+def test_a_malformed_recording_gets_one_line_naming_file_and_field(
+    course: Course, tmp_path: Path, spoiled: Callable[[Course], Any], message: str
+) -> None:
+    spoiled(course)
+    path = written(tmp_path, course)
+    with pytest.raises(DataError, match=message) as raised:
+        load_sequence(str(path))
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_archive_is_named_as_such(course: Course, tmp_path: Path, share: float) -> None:
+    path = written(tmp_path, course)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError, match="damaged or truncated"):
+        load_sequence(str(path))
+
+
+def test_damaged_bytes_inside_the_archive_are_noticed(course: Course, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.npz"
+    np.savez_compressed(path, **course)
+    with zipfile.ZipFile(path) as archive:
+        start = archive.getinfo("features.npy").header_offset
+    content = bytearray(path.read_bytes())
+    content[start + 60 : start + 70] = bytes(10)
+    path.write_bytes(bytes(content))
+    with pytest.raises(DataError, match="damaged"):
+        load_sequence(str(path))
+    with pytest.raises(DataError, match="cannot be read"):
+        course_npz.load(tmp_path)
+
+
+def test_an_array_shorter_than_its_header_says_is_noticed(course: Course, tmp_path: Path) -> None:
+    path = tmp_path / "short.npz"
+    features = course.pop("features")
+    np.savez(path, **course)
+    with zipfile.ZipFile(path, "a") as archive, archive.open("features.npy", "w") as stream:
+        header = {"descr": "<f8", "fortran_order": False, "shape": features.shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        stream.write(features.tobytes()[:-20])
+    with pytest.raises(DataError, match="features ends after 57 of 60 values"):
+        course_npz.load(path)

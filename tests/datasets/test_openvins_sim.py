@@ -1,0 +1,141 @@
+"""Exports of the OpenVINS simulator: conventions, cuts, and malformed ones."""
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.errors import DataError
+from toolkit.geometry import se3_inverse, transform
+from toolkit.models.stereo import project, triangulate
+from toolkit.sequence import NS_PER_S, ImuNoise, ImuSamples
+
+
+@pytest.mark.parametrize(
+    ("name", "observations", "tracks"),
+    [("euroc_V1_01_easy_rect_s0", 119993, 893), ("udel_gore_rect_s0", 120000, 4109)],
+)
+def test_real_exports_have_their_known_size_and_fit_their_truth(
+    real: Callable[[str], Path], name: str, observations: int, tracks: int
+) -> None:
+    sequence = load_sequence(str(real(f"openvins_sim/{name}")))
+    truth, seen, rig = sequence.truth, sequence.observations, sequence.rig
+    assert truth is not None
+    assert sequence.frame_count == 1200
+    assert len(seen) == observations
+    assert np.unique(seen.track_id).size == tracks
+    np.testing.assert_array_equal(truth.t_ns, sequence.frames_t_ns)
+    here, there = seen.frame == 600, seen.frame == 601
+    _, before, after = np.intersect1d(seen.track_id[here], seen.track_id[there], return_indices=True)
+    T_world_cam = truth.T_world_imu[600:602] @ rig.T_imu_cam
+    points = transform(se3_inverse(T_world_cam[1]) @ T_world_cam[0], triangulate(seen.uv_px[here][before], rig))
+    residual_px = seen.uv_px[there][after] - project(points, rig)
+    # 1 px noise in both frames gives 1.2 px; a wrong frame or convention 8 px or more
+    assert np.median(np.sqrt((residual_px**2).mean(axis=1))) < 2.0
+
+
+def test_gravity_and_specific_force_agree_with_the_velocities_of_the_truth(real: Callable[[str], Path]) -> None:
+    sequence = load_sequence(str(real("openvins_sim/euroc_V1_01_easy_rect_s0")))
+    truth, motion = sequence.truth, sequence.motion
+    assert truth is not None
+    assert truth.v_world is not None
+    assert isinstance(motion, ImuSamples)
+    dt_s = (truth.t_ns[2:] - truth.t_ns[:-2]) / NS_PER_S
+    accel_world = (truth.v_world[2:] - truth.v_world[:-2]) / dt_s[:, None] - sequence.gravity_world
+    accel_imu = np.einsum("nji,nj->ni", truth.T_world_imu[1:-1, :3, :3], accel_world)
+    nearest = np.searchsorted(motion.t_ns, truth.t_ns[1:-1])
+    # differences over 0.2 s: gravity with the wrong sign would be off by 20 m/s^2
+    assert np.abs(np.median(accel_imu - motion.accel_mps2[nearest], axis=0)).max() < 0.1
+
+
+def test_frames_outside_the_imu_are_dropped_and_frames_without_stereo_kept(openvins: Path) -> None:
+    sequence = load_sequence(str(openvins))
+    np.testing.assert_array_equal(sequence.frames_t_ns, [200_000_000, 300_000_000])
+    np.testing.assert_array_equal(sequence.observations.frame, [0, 1])
+    np.testing.assert_array_equal(sequence.observations.track_id, [6, 6])
+    assert sum(1 for _ in sequence.packets()) == 2
+
+
+def test_calibration_noise_and_truth_land_in_their_fields(openvins: Path) -> None:
+    sequence = load_sequence(str(openvins))
+    assert sequence.name == "export"
+    assert sequence.rig.baseline_m == pytest.approx(0.11)
+    np.testing.assert_array_equal(sequence.rig.cov_uv_px2, np.diag([4.0, 4.0, 2.0]))
+    np.testing.assert_array_equal(sequence.observations.uv_px[0], [300.0, 290.0, 202.0])
+    np.testing.assert_array_equal(sequence.motion.values[0], [1.0, 2.0, 9.8, 0.1, 0.2, 0.3])
+    assert sequence.noise == ImuNoise(0.001, 0.001, 0.001, 0.001)
+    assert sequence.gravity_world[2] == -9.8
+    assert sequence.prior is None
+    assert sequence.truth is not None
+    assert sequence.truth.bias is not None
+    np.testing.assert_array_equal(sequence.truth.bias[0], [0.4, 0.5, 0.6, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(sequence.truth.T_world_imu[0, :3], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]])
+
+
+def test_gzipped_tables_are_the_same_recording(openvins: Path) -> None:
+    plain = load_sequence(str(openvins)).content_hash()
+    for table in list(openvins.glob("*.csv")):
+        table.with_suffix(".csv.gz").write_bytes(gzip.compress(table.read_bytes()))
+        table.unlink()
+    assert load_sequence(str(openvins)).content_hash() == plain
+
+
+def test_an_export_without_truth_has_none(openvins: Path) -> None:
+    (openvins / "truth_cam.csv").unlink()
+    assert load_sequence(str(openvins)).truth is None
+
+
+def edit_calibration(folder: Path, edit: Callable[[dict[str, object]], object]) -> None:
+    calibration = json.loads((folder / "calib.json").read_text())
+    edit(calibration)
+    (folder / "calib.json").write_text(json.dumps(calibration))
+
+
+def replace_in(folder: Path, name: str, old: str, new: str) -> None:
+    path = folder / name
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+
+
+def keep_lines(folder: Path, name: str, count: int) -> None:
+    lines = (folder / name).read_text().splitlines(keepends=True)
+    (folder / name).write_text("".join(lines[:count]))
+
+
+def truncated_gzip(folder: Path) -> None:
+    content = gzip.compress((folder / "imu.csv").read_bytes())
+    (folder / "imu.csv").write_bytes(content[: len(content) // 2])
+
+
+MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
+    ("no tables", lambda d: [(d / f).unlink() for f in ("imu.csv", "features.csv")], "missing imu.csv, features.csv"),
+    ("no calibration", lambda d: (d / "calib.json").unlink(), "missing calib.json"),
+    ("no noise", lambda d: edit_calibration(d, lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
+    ("broken json", lambda d: (d / "calib.json").write_text('{"cam0": '), "not valid JSON"),
+    ("json list", lambda d: (d / "calib.json").write_text('["cam0"]'), "holds a JSON list"),
+    ("null", lambda d: edit_calibration(d, lambda c: c.update(pixel_noise_sigma=None)), "pixel_noise_sigma holds"),
+    ("ragged", lambda d: edit_calibration(d, lambda c: c.update(gravity_world=[[0], 0, 1])), "gravity_world holds"),
+    ("not rectified", lambda d: replace_in(d, "calib.json", '"k1": 0', '"k1": 0.1'), "not a rectified pair"),
+    ("no column", lambda d: replace_in(d, "features.csv", "uL,vL", "u,v"), "missing column uL, vL"),
+    ("not numeric", lambda d: replace_in(d, "features.csv", "300", "many"), "features.csv: .*'many'"),
+    ("no track id", lambda d: replace_in(d, "features.csv", ",7,", ",nan,"), "row 1 has no frame or feature_id"),
+    ("truncated row", lambda d: replace_in(d, "imu.csv", "0.1,0.2,0.3,1,2,9.8\n", "0.1\n"), "imu.csv: .*truncated"),
+    ("truncated gzip", truncated_gzip, "damaged or truncated gzip"),
+    ("no samples", lambda d: (d / "imu.csv").write_text("timestamp,gx,gy,gz,ax,ay,az\n"), "no samples"),
+    ("one frame", lambda d: keep_lines(d, "features.csv", 5), r"1 frame\(s\)"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
+def test_a_malformed_export_gets_one_line_naming_the_file(
+    openvins: Path, spoil: Callable[[Path], object], message: str
+) -> None:
+    spoil(openvins)
+    with pytest.raises(DataError, match=message) as raised:
+        load_sequence(str(openvins))
+    assert str(openvins) in str(raised.value)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,155 @@
+"""The UTIAS Matlab files: conventions proved by reprojection under their truth, and malformed ones."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+from toolkit.datasets import load_sequence, utias_mat
+from toolkit.errors import DataError
+from toolkit.geometry import se3_inverse, transform
+from toolkit.models.stereo import project, triangulate
+from toolkit.sequence import NS_PER_S, Sequence, TwistNoise, TwistSamples
+
+DRIVES = [
+    ("2011_09_26_drive_0001_sync_KLT", 108, 707, 10501),
+    ("2011_09_26_drive_0005_sync_KLT", 154, 911, 13908),
+    ("2011_09_26_drive_0009_sync_KLT", 446, 1461, 26708),
+    ("2011_09_26_drive_0027_sync_KLT", 188, 1281, 12660),
+    ("2011_09_26_drive_0035_sync_KLT", 131, 536, 11588),
+    ("2011_09_26_drive_0051_sync_KLT", 125, 741, 7984),
+    ("2011_09_30_drive_0027_sync_KLT", 500, 2811, 44556),
+    ("dataset3", 1900, 20, 9410),
+]
+
+
+def one_step_median_px(sequence: Sequence) -> float:
+    """Return the median root mean square of (uL, uR, v) when a sighting is carried to the next frame by the truth."""
+    assert sequence.truth is not None
+    seen, T_world_cam = sequence.observations, sequence.truth.T_world_imu @ sequence.rig.T_imu_cam
+    name = seen.frame * 10**6 + seen.track_id
+    _, before, after = np.intersect1d(name + 10**6, name, return_indices=True)
+    usable = seen.uv_px[before, 0] - seen.uv_px[before, 1] > 2.0
+    before, after = before[usable], after[usable]
+    T_after_before = se3_inverse(T_world_cam[seen.frame[after]]) @ T_world_cam[seen.frame[before]]
+    points = transform(T_after_before, triangulate(seen.uv_px[before], sequence.rig))
+    residual_px = seen.uv_px[after] - project(points, sequence.rig)
+    return float(np.median(np.sqrt((residual_px**2).mean(axis=1))))
+
+
+def written(folder: Path, variables: dict[str, Any]) -> Path:
+    path = folder / "small.mat"
+    scipy.io.savemat(path, variables)
+    return path
+
+
+@pytest.mark.parametrize(("name", "frames", "tracks", "observations"), DRIVES)
+def test_real_recordings_have_their_known_size_and_fit_their_truth(
+    real: Callable[[str], Path], name: str, frames: int, tracks: int, observations: int
+) -> None:
+    sequence = load_sequence(str(real(f"utias/{name}.mat")))
+    assert sequence.frame_count == sequence.motion.t_ns.size == frames
+    assert np.unique(sequence.observations.track_id).size == tracks
+    assert len(sequence.observations) == observations
+    # 0.33-0.77 px on the drives and 1.87 px indoors; a transposed rotation gives 1.2-17 px and 7.6 px
+    assert one_step_median_px(sequence) < (2.0 if name == "dataset3" else 0.8)
+
+
+def test_indoor_twist_errors_have_the_stated_variances_under_the_stated_pairing(real: Callable[[str], Path]) -> None:
+    path = real("utias/dataset3.mat")
+    sequence = utias_mat.load(path)
+    assert sequence.truth is not None
+    assert isinstance(sequence.motion, TwistSamples)
+    assert sequence.motion.pairing == "start"
+    R = sequence.truth.T_world_imu[:, :3, :3]
+    dt_s = np.diff(sequence.truth.t_ns) / NS_PER_S
+    moved = np.diff(sequence.truth.T_world_imu[:, :3, 3], axis=0) / dt_s[:, None]
+    error_mps = np.einsum("nji,nj->ni", R[:-1], moved) - sequence.motion.v_mps[:-1]
+    # chords against arcs account for the rest
+    np.testing.assert_allclose((error_mps**2).mean(axis=0), scipy.io.loadmat(path)["v_var"][:, 0], rtol=0.05)
+
+
+def test_truth_is_independent_only_where_variances_were_measured(utias: dict[str, Any], tmp_path: Path) -> None:
+    drive = utias_mat.load(written(tmp_path, utias))
+    variances = {key: np.full((3, 1), 0.04) for key in ("v_var", "w_var")} | {"y_var": np.arange(1.0, 5.0)[:, None]}
+    indoors = utias_mat.load(written(tmp_path, utias | variances))
+    assert drive.truth is not None
+    assert indoors.truth is not None
+    assert not drive.truth.independent
+    assert indoors.truth.independent
+
+
+def test_measured_variances_become_densities_over_the_median_step(utias: dict[str, Any], tmp_path: Path) -> None:
+    variances = {key: np.full((3, 1), 0.04) for key in ("v_var", "w_var")} | {"y_var": np.arange(1.0, 5.0)[:, None]}
+    sequence = utias_mat.load(written(tmp_path, utias | variances))
+    assert isinstance(sequence.noise, TwistNoise)
+    # stamps near 1.3e9 s are doubles good to 0.24 microseconds, 2.4e-6 of a step
+    np.testing.assert_allclose(sequence.noise.velocity_noise_density, 0.2 * np.sqrt(0.1), rtol=3e-6)
+    np.testing.assert_array_equal(sequence.rig.cov_uv_px2, np.diag([1.0, 3.0, 3.0]))
+
+
+def test_the_camera_sits_at_rho_and_looks_along_the_third_row_of_C(utias: dict[str, Any], tmp_path: Path) -> None:
+    T_imu_cam = utias_mat.load(written(tmp_path, utias)).rig.T_imu_cam
+    np.testing.assert_array_equal(T_imu_cam[:3, 3], [1.0, 0.2, 0.3])
+    np.testing.assert_array_equal(T_imu_cam[:3, 2], [1.0, 0.0, 0.0])
+
+
+def test_twists_and_truth_are_cut_at_the_last_frame(utias: dict[str, Any], tmp_path: Path) -> None:
+    sequence = utias_mat.load(written(tmp_path, utias))
+    assert sequence.truth is not None
+    assert sequence.frame_count == sequence.motion.t_ns.size == sequence.truth.t_ns.size == 4
+
+
+MALFORMED: list[tuple[str, dict[str, Any], str]] = [
+    ("short twist", {"v_vk_vk_i": np.ones((3, 3))}, "v_vk_vk_i has 3 columns for 4 stamps"),
+    ("wrong features", {"y_k_j": np.ones((4, 9, 3))}, "y_k_j has shape"),
+    ("one frame", {"t": np.zeros((1, 1)), "y_k_j": np.ones((4, 1, 3))}, r"1 frame\(s\)"),
+    ("cells", {"t": np.array([{}, []], dtype=object)}, "t holds objects"),
+    ("text", {"fu": "wide"}, "fu holds"),
+    ("no rotation", {"C_c_v": np.ones((3, 3))}, "C_c_v is not a rotation"),
+]
+
+
+@pytest.mark.parametrize(("spoiled", "message"), [m[1:] for m in MALFORMED], ids=[m[0] for m in MALFORMED])
+def test_a_malformed_recording_gets_one_line_naming_file_and_field(
+    utias: dict[str, Any], tmp_path: Path, spoiled: dict[str, Any], message: str
+) -> None:
+    path = written(tmp_path, utias | spoiled)
+    with pytest.raises(DataError, match=message) as raised:
+        load_sequence(str(path))
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_missing_variables_are_all_listed(utias: dict[str, Any], tmp_path: Path) -> None:
+    del utias["theta_vk_i"], utias["b"]
+    with pytest.raises(DataError, match="missing theta_vk_i, b; it has C_c_v"):
+        load_sequence(str(written(tmp_path, utias)))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
+def test_a_truncated_file_is_refused(utias: dict[str, Any], tmp_path: Path, share: float) -> None:
+    path = written(tmp_path, utias)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError):
+        load_sequence(str(path))
+
+
+def test_a_file_that_only_has_the_name_of_a_matlab_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "text.mat"
+    path.write_text("not a matrix")
+    with pytest.raises(DataError, match="of no known format"):
+        load_sequence(str(path))
+    with pytest.raises(DataError, match="not a whole Matlab file"):
+        utias_mat.load(path)
+
+
+def test_matlab_7_3_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "new.mat"
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(64))
+    with pytest.raises(DataError, match="save it with -v7"):
+        load_sequence(str(path))

@@ -1,0 +1,111 @@
+"""Run one estimator over one sequence: feed it the packets, time it, keep both kinds of output.
+
+Nothing here knows an estimator by name. A run is ``ok`` only when its estimates are finite, its solves
+converged and its trajectory does not contradict the measured motion; otherwise it says ``diverged`` or
+``failed`` and why.
+"""
+
+import resource
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from toolkit.errors import DataError, EstimatorError
+from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
+from toolkit.estimator import Build, Estimator, Setup
+from toolkit.geometry import Array
+from toolkit.plausibility import contradiction
+from toolkit.sequence import Packet, Prior, Sequence
+
+
+class Progress(Protocol):
+    """Hears how many of all frames are done."""
+
+    def advance(self, done: int, total: int) -> None:
+        """Take note."""
+
+
+@dataclass
+class _Clock:
+    """Measures wall clock and CPU of one run; the wall clock of each step apart."""
+
+    def __post_init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        self.steps: list[float] = []
+        self.finish_s = 0.0
+
+    def timings(self) -> Timings:
+        total_s, cpu_s = time.perf_counter() - self._wall, time.process_time() - self._cpu
+        return Timings(np.array(self.steps), self.finish_s, total_s, cpu_s, _peak_rss_mb())
+
+
+def _peak_rss_mb() -> float:
+    """Return the peak resident memory of this process: all that ran in it before counts too."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
+    """Run an estimator over a sequence from a prior.
+
+    An error inside the estimator ends its run, not the comparison: the run's status is ``failed`` and its log
+    says why. Raises DataError where the sequence itself cannot be run.
+    """
+    packets = list(sequence.packets())
+    setup = Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind)
+    clock, said = _Clock(), list[Estimate]()
+    try:
+        estimator = build(setup)
+        for packet in packets:
+            estimate = _timed_step(estimator, packet, clock)
+            if estimate is not None:
+                said.append(estimate)
+            progress.advance(packet.index + 1, len(packets))
+        began = time.perf_counter()
+        finished = estimator.finish()
+        clock.finish_s = time.perf_counter() - began
+    except (DataError, KeyboardInterrupt, MemoryError):
+        raise
+    except Exception as error:
+        return _failed(name, said, clock.timings(), error)
+    return _judged(name, said, finished, clock.timings(), sequence)
+
+
+def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate | None:
+    began = time.perf_counter()
+    estimate = estimator.step(packet)
+    clock.steps.append(time.perf_counter() - began)
+    return estimate
+
+
+def _failed(name: str, said: list[Estimate], timings: Timings, error: Exception) -> Run:
+    why = str(error) if isinstance(error, EstimatorError) else f"{type(error).__name__}: {error}"
+    log = (f"failed after {len(said)} estimates: {why}",)
+    if not isinstance(error, EstimatorError):
+        log += tuple(line.rstrip() for line in traceback.format_exception(error))
+    causal = Trajectory.of(said) if said else None
+    return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(said), log)
+
+
+def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
+    causal = Trajectory.of(said) if said else None
+    status: Status = "ok"
+    log = list(finished.log)
+    if not finished.converged:
+        status = "failed"
+        log.append("the solve did not converge; its result is shown but is no estimate to rely on")
+    for output, trajectory in (("causal", causal), ("final", finished.trajectory)):
+        reason = None if trajectory is None else contradiction(trajectory, sequence)
+        if reason is not None:
+            status = "diverged"
+            log.append(f"the {output} trajectory diverged: {reason}")
+    return Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
+
+
+def _info(said: list[Estimate]) -> dict[str, Array]:
+    names = sorted({name for estimate in said for name in estimate.info})
+    return {name: np.array([e.info.get(name, np.nan) for e in said], dtype=float) for name in names}
