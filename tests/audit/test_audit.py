@@ -50,3 +50,10 @@ def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[.
 def test_every_fault_has_a_summary_of_one_line() -> None:
     assert len(faults()) == 11
     assert all(summary and "\n" not in summary for summary in faults().values())
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2])
+def test_a_recording_of_hardly_any_frame_is_audited_without_complaint(
+    clean_recording: Callable[..., Sequence], frames: int
+) -> None:
+    assert audit(clean_recording().truncated(frames)).findings == ()

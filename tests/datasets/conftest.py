@@ -1,5 +1,6 @@
 """Recordings small enough to write, spoil and read again in a test, and the way to the real ones."""
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 
 PROJECT = Path(__file__).parents[2]
-NAN = float("nan")
 
 
 @pytest.fixture(scope="session")
@@ -63,8 +63,6 @@ def utias() -> dict[str, Any]:
 @pytest.fixture
 def openvins(tmp_path: Path) -> Path:
     """Return the folder of an export of 4 frames, of which the first lies before the IMU and the last after it."""
-    import json
-
     folder = tmp_path / "export"
     folder.mkdir()
     pinhole = {"fx": 458.0, "fy": 457.0, "cx": 367.0, "cy": 248.0, "k1": 0, "k2": 0, "p1": 0, "p2": 0}

@@ -60,8 +60,8 @@ def test_tracks_fit_the_drive_s_truth(sequence: Sequence, real: Callable[[str], 
     T_after_before = se3_inverse(T_world_cam[seen.frame[after]]) @ T_world_cam[seen.frame[before]]
     points = transform(T_after_before, triangulate(seen.uv_px[before], sequence.rig))
     residual_px = seen.uv_px[after] - project(points, sequence.rig)
-    # 0.5 px; without the extrinsic or half a frame late it is 5 px
-    assert np.median(np.sqrt((residual_px**2).mean(axis=1))) < 0.7
+    # 0.49 px; with the frames half a period early or late 0.63 and 0.83 px
+    assert np.median(np.sqrt((residual_px**2).mean(axis=1))) < 0.55
 
 
 def test_a_wheel_without_the_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ def test_gravity_and_specific_force_agree_with_the_velocities_of_the_truth(real:
     assert np.abs(np.median(accel_imu - motion.accel_mps2[nearest], axis=0)).max() < 0.1
 
 
-def test_frames_outside_the_imu_are_dropped_and_frames_without_stereo_kept(openvins: Path) -> None:
+def test_frames_outside_the_imu_and_sightings_in_one_camera_are_dropped(openvins: Path) -> None:
     sequence = load_sequence(str(openvins))
     np.testing.assert_array_equal(sequence.frames_t_ns, [200_000_000, 300_000_000])
     np.testing.assert_array_equal(sequence.observations.frame, [0, 1])
@@ -106,13 +106,18 @@ def keep_lines(folder: Path, name: str, count: int) -> None:
     (folder / name).write_text("".join(lines[:count]))
 
 
+def remove(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).unlink()
+
+
 def truncated_gzip(folder: Path) -> None:
     content = gzip.compress((folder / "imu.csv").read_bytes())
     (folder / "imu.csv").write_bytes(content[: len(content) // 2])
 
 
 MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no tables", lambda d: [(d / f).unlink() for f in ("imu.csv", "features.csv")], "missing imu.csv, features.csv"),
+    ("no tables", lambda d: remove(d, "imu.csv", "features.csv"), "missing imu.csv, features.csv"),
     ("no calibration", lambda d: (d / "calib.json").unlink(), "missing calib.json"),
     ("no noise", lambda d: edit_calibration(d, lambda c: c.pop("imu")), "missing imu.accel_noise_density, imu.gyro"),
     ("broken json", lambda d: (d / "calib.json").write_text('{"cam0": '), "not valid JSON"),
@@ -126,6 +131,8 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ("truncated row", lambda d: replace_in(d, "imu.csv", "0.1,0.2,0.3,1,2,9.8\n", "0.1\n"), "imu.csv: .*truncated"),
     ("truncated gzip", truncated_gzip, "damaged or truncated gzip"),
     ("no samples", lambda d: (d / "imu.csv").write_text("timestamp,gx,gy,gz,ax,ay,az\n"), "no samples"),
+    ("no truth rows", lambda d: keep_lines(d, "truth_cam.csv", 1), "truth_cam.csv: holds no poses"),
+    ("zero quaternion", lambda d: replace_in(d, "truth_cam.csv", ",1,1,0", ",1,0,0"), "line 3 has a quaternion"),
     ("one frame", lambda d: keep_lines(d, "features.csv", 5), r"1 frame\(s\)"),
 ]
 

@@ -64,10 +64,10 @@ def test_indoor_twist_errors_have_the_stated_variances_under_the_stated_pairing(
     assert sequence.truth is not None
     assert isinstance(sequence.motion, TwistSamples)
     assert sequence.motion.pairing == "start"
-    R = sequence.truth.T_world_imu[:, :3, :3]
+    R_world_imu = sequence.truth.T_world_imu[:, :3, :3]
     dt_s = np.diff(sequence.truth.t_ns) / NS_PER_S
     moved = np.diff(sequence.truth.T_world_imu[:, :3, 3], axis=0) / dt_s[:, None]
-    error_mps = np.einsum("nji,nj->ni", R[:-1], moved) - sequence.motion.v_mps[:-1]
+    error_mps = np.einsum("nji,nj->ni", R_world_imu[:-1], moved) - sequence.motion.v_mps[:-1]
     # chords against arcs account for the rest
     np.testing.assert_allclose((error_mps**2).mean(axis=0), scipy.io.loadmat(path)["v_var"][:, 0], rtol=0.05)
 
@@ -91,7 +91,7 @@ def test_measured_variances_become_densities_over_the_median_step(utias: dict[st
     np.testing.assert_array_equal(sequence.rig.cov_uv_px2, np.diag([1.0, 3.0, 3.0]))
 
 
-def test_the_camera_sits_at_rho_and_looks_along_the_third_row_of_C(utias: dict[str, Any], tmp_path: Path) -> None:
+def test_the_camera_sits_at_rho_and_looks_along_the_third_row_of_c(utias: dict[str, Any], tmp_path: Path) -> None:
     T_imu_cam = utias_mat.load(written(tmp_path, utias)).rig.T_imu_cam
     np.testing.assert_array_equal(T_imu_cam[:3, 3], [1.0, 0.2, 0.3])
     np.testing.assert_array_equal(T_imu_cam[:3, 2], [1.0, 0.0, 0.0])
@@ -109,6 +109,7 @@ MALFORMED: list[tuple[str, dict[str, Any], str]] = [
     ("one frame", {"t": np.zeros((1, 1)), "y_k_j": np.ones((4, 1, 3))}, r"1 frame\(s\)"),
     ("cells", {"t": np.array([{}, []], dtype=object)}, "t holds objects"),
     ("text", {"fu": "wide"}, "fu holds"),
+    ("NaN truth", {"r_i_vk_i": np.full((3, 6), np.nan)}, "r_i_vk_i is not finite"),
     ("no rotation", {"C_c_v": np.ones((3, 3))}, "C_c_v is not a rotation"),
 ]
 

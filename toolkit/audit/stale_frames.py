@@ -30,7 +30,7 @@ def check(evidence: Evidence) -> Symptom | None:
     sequence = evidence.sequence
     pairs = neighbours(sequence.observations)
     step_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before]).max(axis=1)
-    stale = _stale_intervals(sequence.frame_count - 1, pairs, step_px)
+    stale = _stale_intervals(max(sequence.frame_count - 1, 0), pairs, step_px)
     count = int(stale.sum())
     if count == 0:
         return None

@@ -17,16 +17,17 @@ from toolkit.datasets.parts.csv_table import find_table, first_line, read_column
 from toolkit.datasets.parts.fields import Fields, check_frame_count
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
+from toolkit.datasets.parts.truth_file import checked_poses
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray, rotation_from_quaternion, se3, se3_inverse
+from toolkit.geometry import IntArray, se3, se3_inverse
 from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
 
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
 _IMU_COLUMNS = ("timestamp", "ax", "ay", "az", "gx", "gy", "gz")
 _FEATURE_COLUMNS = ("timestamp", "frame", "feature_id", "uL", "vL", "uR", "vR", "in_left", "in_right")
 _TRUTH_COLUMNS = (
-    *("timestamp", "qx", "qy", "qz", "qw", "px", "py", "pz", "vx", "vy", "vz"),
-    *("bax", "bay", "baz", "bgx", "bgy", "bgz"),
+    *("timestamp", "px", "py", "pz", "qx", "qy", "qz", "qw"),
+    *("vx", "vy", "vz", "bax", "bay", "baz", "bgx", "bgy", "bgz"),
 )
 _NOISE_KEYS = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -151,6 +152,8 @@ def _truth(folder: Path) -> Truth | None:
     path = find_table(folder, _TRUTH)
     if path is None:
         return None
-    table: Array = read_columns(path, _TRUTH_COLUMNS)
-    T_world_imu = se3(rotation_from_quaternion(table[:, 1:5]), table[:, 5:8])
-    return Truth(stamps_ns(path, "timestamp", table[:, 0]), T_world_imu, table[:, 8:11], table[:, 11:17])
+    table = read_columns(path, _TRUTH_COLUMNS)
+    if not len(table):
+        raise DataError(f"{path}: holds no poses; export it again, or remove it to run without truth")
+    t_ns, T_world_imu = checked_poses(path, list(range(2, len(table) + 2)), table[:, :8])
+    return Truth(t_ns, T_world_imu, table[:, 8:11], table[:, 11:17])

@@ -105,8 +105,10 @@ def _rig(fields: Fields, cov_uv_px2: Array) -> StereoRig:
 
 
 def _truth(fields: Fields, t_ns: IntArray, independent: bool) -> Truth:
-    R_world_imu = so3_exp(_rows(fields, "theta_vk_i", t_ns.size))
-    return Truth(t_ns, se3(R_world_imu, _rows(fields, "r_i_vk_i", t_ns.size)), independent=independent)
+    theta, position = (_rows(fields, key, t_ns.size) for key in ("theta_vk_i", "r_i_vk_i"))
+    if not np.isfinite([theta, position]).all():
+        raise DataError(f"{fields.path}: theta_vk_i or r_i_vk_i is not finite; cut the recording to its truth")
+    return Truth(t_ns, se3(so3_exp(theta), position), independent=independent)
 
 
 def _sightings(fields: Fields, frame_count: int) -> Observations:

@@ -33,7 +33,7 @@ class TerminalBar:
         self._drawn_s = float("-inf")
 
     def __enter__(self) -> Self:
-        self._draw("starting")
+        self._draw("...")
         return self
 
     def __exit__(

@@ -1,7 +1,7 @@
 """From sources to run directories: load, audit, start, run, score, write; what ``vislam compare`` does."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from toolkit.audit import Audit, audit
 from toolkit.datasets import load_sequence
 from toolkit.datasets.parts.truth_file import load_truth, with_truth
 from toolkit.estimate import Output, Run
-from toolkit.estimator import find
+from toolkit.estimator import Build, find
 from toolkit.metrics import Scores, describe, score_run
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of
 from toolkit.report.run_directory import check_run_directory, write_run
@@ -61,22 +61,22 @@ def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[C
     EstimatorError for an unknown or unavailable estimator, OutputError where the results cannot be written,
     DataError for a recording or truth that cannot be used.
     """
-    for name in request.estimators:
-        find(name).load()
+    builds = {name: find(name).load() for name in request.estimators}
     check_run_directory(request.out)
-    for case in _cases(request):
-        comparison = compare(case.audited, case.prior, request.estimators, progress_for)
-        write_run(comparison, case.directory, command=request.command, seed=request.seed)
+    for case in _cases(request, progress_for):
+        comparison = compare(case.audited, case.prior, builds, progress_for)
+        with progress_for(f"{comparison.sequence.name}: figures and report"):
+            write_run(comparison, case.directory, command=request.command, seed=request.seed)
         yield comparison, case.directory
 
 
-def compare(audited: Audit, prior: Prior, estimators: Iterable[str], progress_for: ProgressFor) -> Comparison:
+def compare(audited: Audit, prior: Prior, builds: Mapping[str, Build], progress_for: ProgressFor) -> Comparison:
     """Run and score every estimator on the same audited sequence from the same prior."""
     sequence = audited.sequence
     runs = []
-    for name in estimators:
+    for name, build in builds.items():
         with progress_for(f"{sequence.name}: {name}") as progress:
-            runs.append(runner.run(name, sequence, prior, progress))
+            runs.append(runner.run(name, build, sequence, prior, progress))
     rows = tuple(
         Row(one, output, _score(one, output, sequence))
         for one in runs
@@ -100,10 +100,13 @@ def load_audited(source: str, truth: Truth | None, keep: frozenset[str], seed: i
     return audit(sequence, keep)
 
 
-def _cases(request: Request) -> list[_Case]:
+def _cases(request: Request, progress_for: ProgressFor) -> list[_Case]:
     """Prepare every sequence before any estimator runs; several go into sub-directories by name."""
     truth = None if request.truth is None else load_truth(request.truth)
-    audits = [load_audited(source, truth, request.keep, request.seed) for source in request.sources]
+    audits = []
+    for source in request.sources:
+        with progress_for(f"{source}: loading and checking"):
+            audits.append(load_audited(source, truth, request.keep, request.seed))
     if request.max_frames is not None:
         # Only now: the audit judges slow faults (a bias, a lag) better on the whole recording.
         audits = [replace(a, sequence=a.sequence.truncated(request.max_frames)) for a in audits]

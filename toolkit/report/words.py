@@ -9,6 +9,9 @@ from toolkit.report.metrics_json import path_length_m
 from toolkit.report.table import COLUMNS
 from toolkit.sequence import Sequence
 
+# An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
+_LOG_ENTRIES = 4
+
 _STATUS = {
     "diverged": (
         "diverged: it ran to the end, but its answers left what is physically plausible. That is a result, not a "
@@ -49,8 +52,10 @@ def status_lines(comparison: Comparison) -> Iterator[str]:
     for run in comparison.runs:
         if run.status in _STATUS:
             yield f"{run.estimator} {_STATUS[run.status]}"
-        for entry in run.log:
-            yield f"{run.estimator}: {entry}"
+        for entry in run.log[:_LOG_ENTRIES]:
+            yield f"{run.estimator}: {' '.join(entry.split())}"
+        if len(run.log) > _LOG_ENTRIES:
+            yield f"{run.estimator}: {len(run.log) - _LOG_ENTRIES} more entries are in the log in metrics.json"
 
 
 def missing_lines(comparison: Comparison) -> Iterator[str]:

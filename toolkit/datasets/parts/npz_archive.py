@@ -110,7 +110,7 @@ def glance(path: Path) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return set(_keys(archive))
-    except zipfile.BadZipFile:
+    except _DAMAGE:
         return _first_key(path)
 
 

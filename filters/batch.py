@@ -1,0 +1,71 @@
+"""Full smoother: Levenberg-Marquardt over all poses and landmarks at once, answering at the end (GTSAM).
+
+What it approximates: nothing but the noise; every measurement is relinearised at every iteration (Dellaert &
+Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from the causal pass of the decoupled
+filter, for a dead-reckoned start ends in poor minima.
+"""
+
+import gtsam
+import numpy as np
+
+from filters.graph.landmarks import restricted, worth_smoothing
+from filters.graph.motion import motion_graph
+from filters.graph.robust import solve_in_stages
+from filters.kalman.decoupled import DecoupledEkf
+from toolkit.estimate import Estimate, Finished, Landmarks
+from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import IntArray
+from toolkit.models.factors import L
+from toolkit.sequence import Packet
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    return Batch(setup)
+
+
+class Batch:
+    """Remembers every packet and solves for all of them in the end."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._rig = setup.rig
+        self._motion = motion_graph(setup)
+        self._causal_pass = DecoupledEkf(setup)
+        self._packets: list[Packet] = []
+        self._estimates: list[Estimate] = []
+
+    def step(self, packet: Packet) -> None:
+        """Remember the packet and carry the causal pass on; there is no answer before the end."""
+        self._packets.append(packet)
+        self._estimates.append(self._causal_pass.step(packet))
+
+    def finish(self) -> Finished:
+        """Solve for every state and landmark."""
+        known = self._causal_pass.landmarks()
+        track_ids = worth_smoothing([p.frame for p in self._packets], known)
+        frames = [restricted(p.frame, np.isin(p.frame.track_ids, track_ids)) for p in self._packets]
+        solution = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
+        stamps_ns = [p.frame.t_ns for p in self._packets]
+        points = np.array([solution.values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
+        return Finished(self._motion.read(solution.values, stamps_ns), Landmarks(track_ids, points), solution.converged)
+
+    def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
+        """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in self._motion.prior():
+            graph.add(factor)
+        best_bias = self._estimates[-1].bias
+        for packet in self._packets:
+            if packet.motion is not None:
+                for factor in self._motion.step(packet.motion, best_bias, packet.index):
+                    graph.add(factor)
+        return graph
+
+    def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
+        values = gtsam.Values()
+        for packet, estimate in zip(self._packets, self._estimates, strict=True):
+            self._motion.insert(values, estimate, packet.index)
+        rows = np.searchsorted(known.track_ids, track_ids)
+        for track_id, point in zip(track_ids.tolist(), known.points_world[rows], strict=True):
+            values.insert(L(track_id), point)
+        return values

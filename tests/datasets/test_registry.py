@@ -1,0 +1,78 @@
+"""Finding the reader of a recording by its content, and saying what there is where none is found."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit import datasets
+from toolkit.datasets import built_in_names, formats, load_sequence
+from toolkit.errors import DataError
+
+
+def test_every_module_of_the_package_is_a_format_or_has_built_ins() -> None:
+    for module in datasets._modules().values():
+        assert isinstance(module, datasets.RecordingFormat | datasets.BuiltIns)
+
+
+def test_every_format_has_a_summary() -> None:
+    assert {"course-npz", "utias-mat", "openvins-sim"} <= formats().keys()
+    assert all(summary.endswith(".") or len(summary) > 20 for summary in formats().values())
+
+
+def test_built_in_names_are_told_without_making_any() -> None:
+    assert "kitti00" in built_in_names()
+
+
+def test_listing_imports_neither_gtsam_nor_scipy_io() -> None:
+    code = (
+        "import sys; from toolkit.datasets import formats, built_in_names; formats(); built_in_names(); "
+        "print([name for name in ('gtsam', 'scipy.io', 'cv2') if name in sys.modules])"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == "[]"
+
+
+def test_the_name_of_a_file_does_not_matter(course: dict[str, Any], openvins: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "course.npz", **course)
+    shutil.move(tmp_path / "course.npz", tmp_path / "recording.mat")
+    assert load_sequence(str(tmp_path / "recording.mat")).provenance.format == "course-npz"
+    shutil.move(openvins, tmp_path / "features.npz")
+    assert load_sequence(str(tmp_path / "features.npz")).provenance.format == "openvins-sim"
+
+
+def test_exactly_one_format_recognises_a_recording(course: dict[str, Any], openvins: Path, tmp_path: Path) -> None:
+    np.savez(tmp_path / "course.npz", **course)
+    for path, name in ((tmp_path / "course.npz", "course-npz"), (openvins, "openvins-sim")):
+        assert [n for n, reader in datasets._readers().items() if reader.recognises(path)] == [name]
+
+
+def test_an_unknown_source_names_the_built_ins() -> None:
+    with pytest.raises(DataError, match=r"no-such-drive: no such file or directory, and the built-in .* kitti00"):
+        load_sequence("no-such-drive")
+
+
+@pytest.mark.parametrize("content", [b"", b"P", b"PK\x03\x04", b"hello world", bytes(1000)])
+def test_unknown_content_names_the_formats(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "03.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"of no known format; there are .*course-npz"):
+        load_sequence(str(path))
+
+
+def test_an_empty_folder_and_a_foreign_archive_are_of_no_known_format(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
+    (tmp_path / "empty").mkdir()
+    for name in ("other.npz", "empty"):
+        with pytest.raises(DataError, match="of no known format"):
+            load_sequence(str(tmp_path / name))
+
+
+def test_a_path_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(DataError, match=r"cannot be read \(Not a directory\)"):
+        load_sequence(str(tmp_path / "file" / "03.npz"))

@@ -1,0 +1,217 @@
+"""Truth files: what is read, and that every way of writing one wrongly is named and never silently repaired."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import course_npz
+from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.errors import DataError
+from toolkit.geometry import (
+    Array,
+    about_z,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    se3,
+    se3_exp,
+    so3_exp,
+)
+from toolkit.noise import pixel_covariance
+from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
+
+COUNT, STEP_S, START_S = 200, 0.1, 1.4e9
+FORWARD_MPS, LEFT_TURN_RADPS = 10.0, 0.3
+NOBODY = np.empty(0, dtype=np.int64)
+
+
+def drive(turn_radps: float = LEFT_TURN_RADPS) -> Array:
+    """Return poses (COUNT, 4, 4) of a vehicle that drives forward and turns left, from the identity."""
+    step = se3_exp(STEP_S * np.array([0.0, 0.0, turn_radps, FORWARD_MPS, 0.0, 0.0]))
+    return np.stack([np.linalg.matrix_power(step, k) for k in range(COUNT)])
+
+
+def table(poses: Array) -> Array:
+    """Return the rows (N, 8) of a TUM file."""
+    stamps_s = START_S + STEP_S * np.arange(len(poses))
+    return np.column_stack([stamps_s, poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3])])
+
+
+def w_first(rows: Array) -> Array:
+    return rows[:, [0, 1, 2, 3, 7, 4, 5, 6]]
+
+
+def written(folder: Path, rows: Array, fmt: str = "%.9f") -> Path:
+    path = folder / "truth.tum"
+    np.savetxt(path, rows, fmt=fmt, header="time x y z qx qy qz qw")
+    return path
+
+
+def recording(gyro_radps: Array, start_s: float = START_S) -> Sequence:
+    """Return a recording without sightings whose gyro reads (COUNT, 3) at the truth's stamps."""
+    t_ns = np.rint(1e9 * (start_s + STEP_S * np.arange(COUNT))).astype(np.int64)
+    rig = StereoRig(500.0, 500.0, 320.0, 240.0, 0.5, np.eye(4), pixel_covariance(2))
+    return Sequence(
+        name="made",
+        rig=rig,
+        noise=ImuNoise(1e-2, 1e-3, 1e-4, 1e-5),
+        frames_t_ns=t_ns,
+        observations=Observations(NOBODY, NOBODY, np.empty((0, 3))),
+        motion=ImuSamples(t_ns, np.zeros((COUNT, 3)), gyro_radps),
+        provenance=Provenance("test", "made"),
+    )
+
+
+def test_poses_survive_a_file(tmp_path: Path) -> None:
+    truth = load_truth(written(tmp_path, table(drive())))
+    # nine decimals
+    np.testing.assert_allclose(truth.T_world_imu, drive(), atol=2e-8)
+    np.testing.assert_allclose(truth.t_ns, 1.4e18 + 1e8 * np.arange(COUNT), atol=256.0, rtol=0.0)
+
+
+def test_blank_lines_and_comments_are_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum"
+    path.write_text("# a comment\n\n1.0 0 0 0 0 0 0 1  # the first\n2.0 1 0 0 0 0 0 1\n")
+    np.testing.assert_array_equal(load_truth(path).t_ns, [1_000_000_000, 2_000_000_000])
+
+
+@pytest.mark.parametrize("name", ["ucsd/gt/0027.tum", "kitti00/gt_imu.tum"])
+def test_real_truth_is_accepted_and_refused_w_first(real: Callable[[str], Path], tmp_path: Path, name: str) -> None:
+    path = real(name)
+    assert load_truth(path).t_ns.size > 1000
+    for first in (0, 500):
+        with pytest.raises(DataError, match="look w first"):
+            load_truth(written(tmp_path, w_first(np.loadtxt(path))[first:]))
+
+
+@pytest.mark.parametrize("turn_radps", [0.0, LEFT_TURN_RADPS, -LEFT_TURN_RADPS])
+def test_a_vehicle_w_first_is_refused_with_or_without_turns(tmp_path: Path, turn_radps: float) -> None:
+    with pytest.raises(DataError, match=r"look w first; .* move the fifth column to the end"):
+        load_truth(written(tmp_path, w_first(table(drive(turn_radps)))))
+
+
+def test_a_vehicle_that_truly_is_upside_down_at_the_start_is_accepted(tmp_path: Path) -> None:
+    rolled = drive() @ se3(so3_exp(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
+    assert abs(table(rolled)[0, 4]) == pytest.approx(1.0)
+    load_truth(written(tmp_path, table(rolled)))
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.0, 2.5, -1.0])
+def test_a_vehicle_is_accepted_whatever_its_first_heading(tmp_path: Path, yaw_rad: float) -> None:
+    load_truth(written(tmp_path, table(se3(about_z(yaw_rad), np.zeros(3)) @ drive())))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_gyro_gives_w_first_away_where_the_path_cannot(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rates = np.cumsum(rng.normal(0.0, 0.2, (COUNT, 3)), axis=0)
+    turns = so3_exp(STEP_S * 0.5 * (rates[1:] + rates[:-1]))
+    rotations = list(itertools.accumulate(turns, np.matmul, initial=so3_exp(np.array([0.4, -0.2, 1.0]))))
+    R_world_imu = np.stack(rotations)
+    positions = np.cumsum(rng.normal(0.0, 0.1, (COUNT, 3)), axis=0)
+    noisy = rates + np.array([0.01, -0.02, 0.03]) + rng.normal(0.0, 0.05, (COUNT, 3))
+    sequence = recording(noisy)
+    truth = Truth(sequence.frames_t_ns, se3(R_world_imu, positions))
+    assert with_truth(sequence, truth).truth is truth
+    misread = rotation_from_quaternion(np.roll(quaternion_from_rotation(R_world_imu), 1, axis=1))
+    with pytest.raises(DataError, match="w first"):
+        with_truth(sequence, replace(truth, T_world_imu=se3(misread, positions)))
+
+
+def test_a_gyro_of_noise_alone_refuses_no_truth() -> None:
+    sequence = recording(np.random.default_rng(2).normal(0.0, 0.05, (COUNT, 3)))
+    with_truth(sequence, Truth(sequence.frames_t_ns, drive()))
+
+
+def test_a_gyro_with_gaps_and_reversed_stamps_still_takes_a_truth() -> None:
+    sequence = recording(np.tile([0.0, 0.0, LEFT_TURN_RADPS], (COUNT, 1)))
+    motion = sequence.motion
+    assert isinstance(motion, ImuSamples)
+    gyro, t_ns = motion.gyro_radps.copy(), motion.t_ns.copy()
+    gyro[5], t_ns[10] = np.nan, t_ns[8]
+    faulty = replace(sequence, motion=ImuSamples(t_ns, motion.accel_mps2, gyro))
+    with_truth(faulty, Truth(sequence.frames_t_ns, drive()))
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"),
+    [(1e9, "nanoseconds: divide by 1e9"), (1e6, "microseconds: divide by 1e6"), (1e3, "milliseconds: divide by 1e3")],
+)
+@pytest.mark.parametrize("start_s", [START_S, 0.0])
+def test_stamps_in_another_unit_are_named(tmp_path: Path, scale: float, unit: str, start_s: float) -> None:
+    rows = table(drive())
+    rows[:, 0] = scale * (rows[:, 0] - START_S + start_s)
+    with pytest.raises(DataError, match=f"look like {unit}"):
+        load_truth(written(tmp_path, rows))
+
+
+def edited(line: int, column: int, value: float) -> Array:
+    rows = table(drive())
+    rows[line, column] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (edited(3, 2, np.nan), "line 5 holds a value that is not finite"),
+        (edited(3, 0, np.nan), r"time\[3\] is nan"),
+        (edited(3, 0, START_S), "line 5 is not later than the line before it"),
+        (edited(3, 0, START_S + 0.2), "line 5 is not later than the line before it"),
+        (edited(3, 7, 3.0), "line 5 has a quaternion that is not of unit length"),
+        (table(drive())[:, :7], "line 2 has 7 columns, expected 8"),
+    ],
+)
+def test_a_malformed_line_is_named(tmp_path: Path, rows: Array, message: str) -> None:
+    path = written(tmp_path, rows)
+    with pytest.raises(DataError, match=message) as raised:
+        load_truth(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "holds no poses"),
+        (b"# only a comment\n", "holds no poses"),
+        (b"1.0,0,0,0,0,0,0,1\n", "separated by blanks, not commas"),
+        (b"1.0 0 0 0 0 0 0 one\n", "line 1 is not numeric"),
+        (b"\xff\xfe\x00\x80", "not a text file"),
+    ],
+)
+def test_a_file_that_is_no_tum_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "truth.tum"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        load_truth(path)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent.tum", tmp_path):
+        with pytest.raises(DataError, match="cannot be read"):
+            load_truth(path)
+
+
+@pytest.mark.parametrize(
+    ("shift_s", "cause"),
+    [
+        (-START_S, r"counts from its own start: add 1400000000.000 s"),
+        (7200.0, "-2 h apart, as time zones are"),
+        (-5000.0, "of another drive or clock"),
+    ],
+)
+def test_truth_without_overlap_names_both_ranges_and_the_cause(shift_s: float, cause: str) -> None:
+    sequence = recording(np.zeros((COUNT, 3)))
+    t_ns = sequence.frames_t_ns + np.int64(shift_s * 1e9)
+    with pytest.raises(DataError, match=cause) as raised:
+        with_truth(sequence, Truth(t_ns, drive()))
+    assert "1400000000.000 .. 1400000019.900 s" in str(raised.value)
+
+
+def test_truth_of_another_real_drive_does_not_overlap(real: Callable[[str], Path]) -> None:
+    with pytest.raises(DataError, match="do not overlap"):
+        with_truth(course_npz.load(real("ucsd/03.npz")), load_truth(real("kitti00/gt_imu.tum")))

@@ -1,0 +1,79 @@
+"""Says when a trajectory contradicts the motion that was measured: the sign of a diverged estimator, without truth.
+
+In the steady state of a consistent filter the correction at each frame has the covariance of the motion noise
+(what a frame adds to the covariance is what a correction takes away), so the step between two estimates,
+compared with the measured motion, is chi-square distributed. Steps far outside that are rare in a filter that
+works and common in one that has lost its way.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import chdtri
+
+from toolkit.estimate import Trajectory
+from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.models import imu, twist
+from toolkit.sequence import ImuNoise, Packet, Sequence, TwistMotion, TwistNoise
+
+# A step beyond this squared distance happens once in a million consistent steps.
+FAR_STEP = float(chdtri(6, 1e-6))
+# Mismatches and poor noise figures make some steps far in healthy runs too; a tenth of all is no accident.
+MOST_FAR_STEPS = 0.10
+# What a correction may do beyond the noise of an IMU, whose velocity and biases it corrects as well:
+# rad/s of turn rate and m/s of velocity.
+_IMU_SLACK = np.repeat([0.02, 0.2], 3)
+
+
+def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
+    """Return why the trajectory cannot be right, or None. Its stamps must be the sequence's frames."""
+    if not np.isfinite(trajectory.T_world_imu).all():
+        first = int(np.flatnonzero(~np.isfinite(trajectory.T_world_imu).all(axis=(1, 2)))[0])
+        return f"its poses are not numbers from estimate {first} on"
+    far = np.fromiter((d > FAR_STEP for d in _step_distances(trajectory, sequence)), dtype=bool)
+    if far.size == 0 or far.mean() <= MOST_FAR_STEPS:
+        return None
+    return (
+        f"{100.0 * far.mean():.0f} % of its steps contradict the measured motion by more than chance allows "
+        f"(at most {100.0 * MOST_FAR_STEPS:.0f} % do in a run that works)"
+    )
+
+
+def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Iterator[float]:
+    """Yield the squared Mahalanobis distance of each step between neighbouring frames from the measured motion."""
+    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
+    for before, packet in pairwise(sequence.packets()):
+        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
+        if start is None or end is None:
+            continue
+        deviation, cov = _deviation(trajectory, start, end, packet, sequence)
+        yield float(deviation @ np.linalg.solve(cov, deviation))
+
+
+def _deviation(trajectory: Trajectory, start: int, end: int, packet: Packet, sequence: Sequence) -> tuple[Array, Array]:
+    """Return the step's deviation (6,) from the measured motion, in the tangent of its end, and its covariance."""
+    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[start]
+    T_world_start = trajectory.T_world_imu[start]
+    if isinstance(packet.motion, TwistMotion) and isinstance(sequence.noise, TwistNoise):
+        step = twist.integrate(packet.motion, bias[3:], sequence.noise)
+        predicted, cov = T_world_start @ step.T_start_end, step.cov
+    else:
+        predicted, cov = _imu_prediction(trajectory, start, packet, sequence)
+    return se3_log(se3_inverse(predicted) @ trajectory.T_world_imu[end]), cov
+
+
+def _imu_prediction(trajectory: Trajectory, start: int, packet: Packet, sequence: Sequence) -> tuple[Array, Array]:
+    assert packet.motion is not None and not isinstance(packet.motion, TwistMotion)
+    assert isinstance(sequence.noise, ImuNoise)
+    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[start]
+    params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
+    preintegration = imu.preintegrate(packet.motion, bias, params)
+    cov = np.asarray(preintegration.residualCovariance())[:6, :6]
+    dt_s = float(packet.motion.dt_s.sum())
+    slack = np.diag((_IMU_SLACK * dt_s) ** 2)
+    if trajectory.v_world is None:  # without a velocity only the rotation can be compared
+        slack[3:, 3:] = np.eye(3) * 1e12
+    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[start]
+    step = imu.predict(preintegration, trajectory.T_world_imu[start], v_world, bias)
+    return step.T_world_imu, cov + slack
