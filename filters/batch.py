@@ -16,7 +16,7 @@ from toolkit.estimate import Estimate, Finished, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
-from toolkit.sequence import Packet
+from toolkit.sequence import Packet, StereoFrame
 
 
 def build(setup: Setup) -> Estimator:
@@ -32,18 +32,21 @@ class Batch:
         self._motion = motion_graph(setup)
         self._causal_pass = DecoupledEkf(setup)
         self._packets: list[Packet] = []
+        self._frames: list[StereoFrame] = []
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> None:
         """Remember the packet and carry the causal pass on; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
+        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.rejected)
+        self._frames.append(restricted(packet.frame, passed))
 
     def finish(self) -> Finished:
         """Solve for every state and landmark."""
         known = self._causal_pass.landmarks()
-        track_ids = worth_smoothing([p.frame for p in self._packets], known)
-        frames = [restricted(p.frame, np.isin(p.frame.track_ids, track_ids)) for p in self._packets]
+        track_ids = worth_smoothing(self._frames, known)
+        frames = [restricted(f, np.isin(f.track_ids, track_ids)) for f in self._frames]
         solution = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
         stamps_ns = [p.frame.t_ns for p in self._packets]
         points = np.array([solution.values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)

@@ -6,7 +6,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.sequence import NS_PER_S, TwistNoise
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
-TRACKED_PIXEL_SIGMA_PX = 1.0
+TRACKED_PIXEL_SIGMA_PX = 0.5
 # What a noise-free-looking odometer still gets wrong between frames: pairing, wheel slip, lever arm.
 LEAST_VELOCITY_SIGMA_MPS = 0.05
 LEAST_GYRO_SIGMA_RADPS = 0.005

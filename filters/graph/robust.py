@@ -20,7 +20,7 @@ class Stage:
 # Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go.
 SCHEDULE = (
     Stage(gtsam.noiseModel.mEstimator.Huber.Create(1.5), Stopping(1e-2, 20)),
-    Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-5, 60)),
+    Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-4, 60)),
 )
 
 

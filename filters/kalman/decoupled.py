@@ -12,6 +12,7 @@ from filters.kalman.landmarks import TrackedMap
 from filters.kalman.prediction import predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
+from toolkit.geometry import IntArray
 from toolkit.sequence import Packet
 
 
@@ -23,16 +24,23 @@ class DecoupledEkf:
         self._predict = predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
+        self._rejected: IntArray = np.empty(0, dtype=np.int64)
+
+    @property
+    def rejected(self) -> IntArray:
+        """Return the ids of the tracks whose sighting in the last frame did not pass the gate."""
+        return self._rejected
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
             self._belief = self._predict(self._belief, packet.motion)
         seen, uvs_px = self._map.seen_again(packet.frame)
-        nis, nis_dof = np.nan, 0
+        nis, nis_dof, accepted = np.nan, 0, np.ones(len(seen), dtype=bool)
         if len(seen):
             self._belief, accepted, nis, nis_dof = correct_pose(self._belief, seen, uvs_px, self._rig)
             seen = correct_landmarks_gated(seen, uvs_px, self._belief, self._rig, accepted)
+        self._rejected = seen.track_ids[~accepted]
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, nis=nis, nis_dof=nis_dof)
 

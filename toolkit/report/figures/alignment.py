@@ -1,4 +1,8 @@
-"""How the figures lay estimates over the truth: the metrics' own pairs and their fit of yaw and position."""
+"""How the figures lay estimates over the truth: with the metrics' own pairs and fits.
+
+With an IMU the vertical is measured and only heading and position are fitted (the fit of ate_yaw_m); from twists
+alone an estimator does not know the vertical, and a whole rigid motion is fitted (that of ate_se3_m).
+"""
 
 from typing import NamedTuple
 
@@ -7,7 +11,7 @@ import numpy as np
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, IntArray, yaw_of
 from toolkit.metrics import Judged
-from toolkit.metrics.common.alignment import Alignment, fit_yaw
+from toolkit.metrics.common.alignment import Alignment, fit_se3, fit_yaw
 from toolkit.metrics.common.association import associate, median_period_ns
 from toolkit.metrics.common.scores import Unavailable
 from toolkit.sequence import Sequence, Truth
@@ -33,12 +37,21 @@ def truth_during(sequence: Sequence) -> Truth | None:
 
 
 def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
-    """Return the fit of yaw and position behind ate_yaw_m, or no alignment where it cannot be computed."""
+    """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
+    fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
     try:
         pairs = Judged(run, output, sequence).compared
-        return fit_yaw(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+        return fit(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
     except Unavailable:
         return NOT_ALIGNED
+
+
+def alignment_words(sequence: Sequence) -> str:
+    """Say how a figure's estimates are aligned."""
+    if sequence.truth is None:
+        return "There is no truth; every estimator starts from the same pose and nothing is aligned."
+    how = "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
+    return f"Estimates are aligned to the truth by {how}."
 
 
 def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, sequence: Sequence) -> Errors | None:

@@ -10,7 +10,7 @@ from toolkit.estimate import Run
 from toolkit.geometry import Array
 from toolkit.metrics.common.alignment import Alignment
 from toolkit.report.comparison import Comparison, Row
-from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, errors_to, onto_truth, truth_during
+from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, alignment_words, errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet
 from toolkit.sequence import NS_PER_S, Truth
 
@@ -52,7 +52,7 @@ def _truth(comparison: Comparison) -> _Reference | None:
     if truth is None:
         return None
     caption = (
-        "Position and heading error over time, aligned to the truth by yaw and position. "
+        f"Position and heading error over time. {alignment_words(sequence)} "
         "Dashed: causal, what was known at the time. Solid: final."
     )
     return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)

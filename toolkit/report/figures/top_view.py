@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from toolkit.estimate import Output, Run
 from toolkit.geometry import Array
 from toolkit.report.comparison import Comparison
-from toolkit.report.figures.alignment import onto_truth, truth_during
+from toolkit.report.figures.alignment import alignment_words, onto_truth, truth_during
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
     TRUTH_COLOUR,
@@ -51,7 +51,7 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
     _finish(figure, axes, tracks, landmarks)
     quiet(axes, f"{run.estimator}{_trouble(run)} on {comparison.sequence.name}, from above", "x [m]", "y [m]")
     mapped = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
-    caption = f"Trajectory of {run.estimator} from above; {mapped}. {_alignment_words(comparison)}"
+    caption = f"Trajectory of {run.estimator} from above; {mapped}. {alignment_words(comparison.sequence)}"
     return NamedFigure(f"top_{run.estimator}", caption, figure)
 
 
@@ -69,18 +69,12 @@ def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
     _finish(figure, axes, tracks, landmarks)
     quiet(axes, f"{comparison.sequence.name}: all estimators, from above", "x [m]", "y [m]")
     of_whom = f" over the landmarks of {mapping[-1].estimator}" if mapping else ""
-    caption = f"All trajectories{of_whom}. {_alignment_words(comparison)}"
+    caption = f"All trajectories{of_whom}. {alignment_words(comparison.sequence)}"
     return NamedFigure("top_all", caption, figure)
 
 
 def _trouble(run: Run) -> str:
     return "" if run.status == "ok" else f" ({run.status})"
-
-
-def _alignment_words(comparison: Comparison) -> str:
-    if comparison.sequence.truth is None:
-        return "There is no truth; every estimator starts from the same pose and nothing is aligned."
-    return "Estimates are aligned to the truth by yaw and position."
 
 
 def _draw_truth(axes: Axes, comparison: Comparison) -> Array:
