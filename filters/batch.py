@@ -57,7 +57,7 @@ class Batch:
         graph = gtsam.NonlinearFactorGraph()
         for factor in self._motion.prior():
             graph.add(factor)
-        best_bias = self._estimates[-1].bias
+        best_bias = self._causal_pass.bias
         for packet in self._packets:
             if packet.motion is not None:
                 for factor in self._motion.step(packet.motion, best_bias, packet.index):

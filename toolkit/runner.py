@@ -84,11 +84,11 @@ def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate
 
 def _failed(name: str, said: list[Estimate], timings: Timings, error: Exception) -> Run:
     why = str(error) if isinstance(error, EstimatorError) else f"{type(error).__name__}: {error}"
-    log = (f"failed after {len(said)} estimates: {why}",)
+    log = [f"failed after {len(said)} estimates: {why}"]
     if not isinstance(error, EstimatorError):
-        log += tuple(line.rstrip() for line in traceback.format_exception(error))
+        log += [line.rstrip() for line in traceback.format_exception(error)]
     causal = Trajectory.of(said) if said else None
-    return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(said), log)
+    return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(said), tuple(log))
 
 
 def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:

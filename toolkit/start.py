@@ -28,7 +28,12 @@ _HUBER = 1.5
 
 
 def start_from_measurements(sequence: Sequence) -> Prior:
-    """Return the state at the first frame from about the first second and a half of the recording."""
+    """Return the state at the first frame from about the first second and a half of the recording.
+
+    A recording that brings its own prior, as a simulated one does, is started from that.
+    """
+    if sequence.prior is not None:
+        return sequence.prior
     if not isinstance(sequence.noise, ImuNoise):
         return _own_frame()
     packets = _first_packets(sequence)

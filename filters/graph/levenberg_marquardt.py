@@ -70,9 +70,7 @@ def solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, stopping: Stop
     return Solution(values, error, stopping.max_iterations, converged=False)
 
 
-def _damped(
-    linear: gtsam.GaussianFactorGraph, keys: dict[int, list[int]], damping: float
-) -> gtsam.GaussianFactorGraph:
+def _damped(linear: gtsam.GaussianFactorGraph, keys: dict[int, list[int]], damping: float) -> gtsam.GaussianFactorGraph:
     damped = gtsam.GaussianFactorGraph()
     damped.push_back(linear)
     for dimension, keys_of_dimension in keys.items():
@@ -92,8 +90,8 @@ def _tried(
     """Return where one damped step leads, or None where even the damped system is indeterminate."""
     try:
         delta = damped.optimize(ordering)
-    except RuntimeError as error:
-        if "Indeterminate" in str(error):
+    except RuntimeError as refusal:
+        if "Indeterminate" in str(refusal):
             return None
         raise
     moved = values.retract(delta)

@@ -12,7 +12,7 @@ from filters.kalman.landmarks import TrackedMap
 from filters.kalman.prediction import predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.sequence import Packet
 
 
@@ -25,6 +25,11 @@ class DecoupledEkf:
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
         self._rejected: IntArray = np.empty(0, dtype=np.int64)
+
+    @property
+    def bias(self) -> Array:
+        """Return the latest bias (6,) [accel, gyro]."""
+        return self._belief.bias
 
     @property
     def rejected(self) -> IntArray:

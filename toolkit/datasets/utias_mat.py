@@ -17,7 +17,7 @@ from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
-from toolkit.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise
+from toolkit.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
 from toolkit.sequence import (
     NS_PER_S,
     Observations,
@@ -62,11 +62,10 @@ def load(path: Path) -> Sequence:
     check_frame_count(path, t_ns.size)
     measured = all(key in fields for key in _MEASURED_VARIANCES)
     v_mps, w_radps = _rows(fields, "v_vk_vk_i", t_ns.size), _rows(fields, "w_vk_vk_i", t_ns.size)
-    estimated = twist_noise(t_ns, v_mps, w_radps)
     return Sequence(
         name=path.stem,
         rig=_rig(fields, _measured_pixels(fields) if measured else pixel_covariance(2)),
-        noise=_measured_noise(fields, t_ns) if measured else estimated,
+        noise=_measured_noise(fields, t_ns, v_mps, w_radps) if measured else twist_noise(t_ns, v_mps, w_radps),
         frames_t_ns=t_ns,
         observations=_sightings(fields, t_ns.size),
         motion=TwistSamples(t_ns, v_mps, w_radps, pairing="start"),
@@ -118,10 +117,14 @@ def _sightings(fields: Fields, frame_count: int) -> Observations:
     return observations(frame, track_id, np.where(corners_px == _NOT_SEEN, np.nan, corners_px))
 
 
-def _measured_noise(fields: Fields, t_ns: IntArray) -> TwistNoise:
-    """Return densities of twists of measured variance, each held over one median step: sigma sqrt(dt)."""
+def _measured_noise(fields: Fields, t_ns: IntArray, v_mps: Array, w_radps: Array) -> TwistNoise:
+    """Return densities of twists of measured variance, each held over one median step: sigma sqrt(dt).
+
+    Samples that scatter more than the file says, because somebody added noise to them, are believed.
+    """
     root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
-    v_sigma, w_sigma = (np.sqrt(fields.constant(key, 3, 1)[:, 0]) for key in ("v_var", "w_var"))
+    v_sigma = np.maximum(np.sqrt(fields.constant("v_var", 3, 1)[:, 0]), white_sigma(v_mps))
+    w_sigma = np.maximum(np.sqrt(fields.constant("w_var", 3, 1)[:, 0]), white_sigma(w_radps))
     return TwistNoise(v_sigma * root_dt, w_sigma * root_dt, np.full(3, GYRO_RANDOM_WALK))
 
 
