@@ -18,6 +18,8 @@ from toolkit.geometry import IntArray
 from toolkit.models.factors import L
 from toolkit.sequence import Packet, StereoFrame
 
+RUNG, CHANGE = 120, "+ the future"
+
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""

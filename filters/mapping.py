@@ -5,15 +5,16 @@ import numpy as np
 from filters.kalman.belief import initial_belief
 from filters.kalman.correction import correct_landmarks
 from filters.kalman.landmarks import TrackedMap
-from filters.kalman.prediction import predictor
-from toolkit.estimate import Estimate, Finished, Trajectory
+from filters.kalman.prediction import predicted, predictor
+from filters.kalman.speaker import Speaker
+from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.sequence import Packet
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Mapping(setup)
+    return Speaker(Mapping(setup))
 
 
 class Mapping:
@@ -21,23 +22,21 @@ class Mapping:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._predict = predictor(setup)
+        self._predictor = predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
-        self._said: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
         """Integrate the motion, then map from where it leads."""
         if packet.motion is not None:
-            self._belief = self._predict(self._belief, packet.motion)
+            self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
             seen = correct_landmarks(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig).landmarks
         self._map.keep(seen, packet.frame, T_world_imu)
-        self._said.append(self._belief.estimate(packet.frame.t_ns))
-        return self._said[-1]
+        return self._belief.estimate(packet.frame.t_ns)
 
-    def finish(self) -> Finished:
-        """Return the dead-reckoned trajectory and the map made on it."""
-        return Finished(Trajectory.of(self._said), self._map.landmarks())
+    def landmarks(self) -> Landmarks:
+        """Return every landmark there ever was, as last known."""
+        return self._map.landmarks()

@@ -9,7 +9,7 @@ import numpy as np
 from filters.kalman.belief import initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
 from filters.kalman.landmarks import TrackedMap
-from filters.kalman.prediction import predictor
+from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray
@@ -21,7 +21,7 @@ class DecoupledEkf:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._predict = predictor(setup)
+        self._predictor = predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
         self._rejected: IntArray = np.empty(0, dtype=np.int64)
@@ -39,7 +39,7 @@ class DecoupledEkf:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
-            self._belief = self._predict(self._belief, packet.motion)
+            self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
         seen, uvs_px = self._map.seen_again(packet.frame)
         nis, nis_dof, accepted = np.nan, 0, np.ones(len(seen), dtype=bool)
         if len(seen):

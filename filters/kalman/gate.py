@@ -3,10 +3,16 @@
 import numpy as np
 from scipy.special import chdtri
 
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 
 GATE_QUANTILE = 0.95
 STEREO_GATE = float(chdtri(3, 1.0 - GATE_QUANTILE))
+
+
+def gate_at(dof: IntArray) -> Array:
+    """Return the chi-square quantile of the gate at each number of degrees of freedom (N,)."""
+    return np.asarray(chdtri(dof, 1.0 - GATE_QUANTILE), dtype=float)
+
 
 # Huber's threshold on the norm of a whitened (uL, uR, v): the median of its chi distribution is 1.54.
 HUBER_THRESHOLD = 1.5

@@ -21,11 +21,24 @@ def check_replaceable(target: Path, is_ours: IsOurs) -> None:
     try:
         if target.is_dir() and any(target.iterdir()) and not is_ours(target):
             raise OutputError(f"{target} holds other files, which would be lost; choose another directory")
-        probe = _nearest_existing(target.parent) / f".vislam-probe-{os.getpid()}"
-        probe.mkdir()
-        probe.rmdir()
+        _probe(target.parent)
     except OSError as error:
         raise _unwritable(target, error) from error
+
+
+def check_parent(directory: Path) -> None:
+    """Raise OutputError unless directories can be made in ``directory``, or it can itself be made first."""
+    try:
+        _probe(directory)
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
+def _probe(directory: Path) -> None:
+    """Make a directory in the nearest one that exists, and take it away again."""
+    probe = _nearest_existing(directory) / f".vislam-probe-{os.getpid()}"
+    probe.mkdir()
+    probe.rmdir()
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.report.comparison import Comparison
 from toolkit.report.table import as_markdown, comparison_table
-from toolkit.report.words import finding_lines, missing_lines, remark_lines, sequence_line, status_lines
+from toolkit.report.words import finding_lines, missing_lines, remark_lines, sequence_line, status_lines, truth_lines
 
 _HOW_TO_READ = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
@@ -40,7 +40,7 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         f"# {' / '.join(run.estimator for run in comparison.runs)} on {comparison.sequence.name}",
         sequence_line(comparison.sequence) + ".",
         as_markdown(comparison_table(comparison)),
-        *_section("notes", [*status_lines(comparison), *missing_lines(comparison)]),
+        *_section("notes", [*status_lines(comparison), *truth_lines(comparison), *missing_lines(comparison)]),
         *_section("remarks", remark_lines(comparison)),
         *_section("start", [comparison.prior.source]),
         *_section("audit", finding_lines(comparison)),

@@ -13,6 +13,7 @@ from toolkit.datasets.parts.truth_file import load_truth, with_truth
 from toolkit.estimate import Output, Run
 from toolkit.estimator import Build, find
 from toolkit.metrics import Scores, describe, score_run
+from toolkit.report.atomic import check_parent
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of
 from toolkit.report.run_directory import check_run_directory, write_run
 from toolkit.runner import Progress
@@ -62,7 +63,10 @@ def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[C
     DataError for a recording or truth that cannot be used.
     """
     builds = {name: find(name).load() for name in request.estimators}
-    check_run_directory(request.out)
+    if len(request.sources) == 1:
+        check_run_directory(request.out)
+    else:
+        check_parent(request.out)  # its sub-directories are checked once the sequences' names are known
     for case in _cases(request, progress_for):
         comparison = compare(case.audited, case.prior, builds, progress_for)
         with progress_for(f"{comparison.sequence.name}: figures and report"):

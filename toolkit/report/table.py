@@ -7,7 +7,7 @@ from toolkit.report.comparison import Comparison, Row
 
 _SEPARATOR = "  "
 _MISSING = "-"
-_WIDEST_NUMBER = 6
+_WIDEST_NUMBER = 5
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,8 @@ def _cell(row: Row, column: Column) -> str:
     value = row.scores.values.get(column.key)
     if value is None:
         return _MISSING
+    if column.decimals == 0:
+        return f"{value:.0f}"
     texts = (f"{value:.{decimals}f}" for decimals in range(column.decimals, -1, -1))
     # A diverged estimator may be light years away; its number must not tear the columns apart.
     return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from toolkit.audit import Audit
 from toolkit.report.comparison import Comparison
 from toolkit.report.table import as_text, comparison_table
-from toolkit.report.words import finding_lines, missing_lines, outcome, sequence_line, status_lines
+from toolkit.report.words import finding_lines, missing_lines, outcome, sequence_line, status_lines, truth_lines
 
 _WIDTH = 118
 
@@ -17,7 +17,7 @@ def comparison_text(comparison: Comparison) -> str:
     lines += _section("start", [comparison.prior.source])
     lines += _section("audit", finding_lines(comparison))
     lines += _section("facts", comparison.sequence.provenance.facts)
-    lines += _section("notes", [*status_lines(comparison), *missing_lines(comparison)])
+    lines += _section("notes", [*status_lines(comparison), *truth_lines(comparison), *missing_lines(comparison)])
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
 """What the numbers mean, in plain words: statuses, findings, metrics that are missing and why."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from toolkit.audit import Finding
 from toolkit.report.comparison import Comparison, Row
@@ -12,6 +12,9 @@ from toolkit.sequence import Sequence
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
+# Remarks on these are told beside the table, the others at the end of the report only.
+_AGAINST_TRUTH = "ate_"
+_BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
 _STATUS = {
     "diverged": (
         "diverged: it ran to the end, but its answers left what is physically plausible. That is a result, not a "
@@ -24,12 +27,12 @@ _STATUS = {
 def sequence_line(sequence: Sequence) -> str:
     """Return the recording in one line: size, duration, true path, motion."""
     path_m = path_length_m(sequence)
+    sightings = (
+        f"{len(sequence.observations)} stereo observations" if len(sequence.observations) else "no image features"
+    )
     path = "no ground truth" if path_m is None else f"true path {path_m:.0f} m"
     motion = {"twist": "body twists", "imu": "raw IMU"}[sequence.motion_kind]
-    return (
-        f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, "
-        f"{len(sequence.observations)} stereo observations, {motion}, {path}"
-    )
+    return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
@@ -49,6 +52,8 @@ def outcome(finding: Finding) -> str:
 
 def status_lines(comparison: Comparison) -> Iterator[str]:
     """Yield a calm explanation of every run that did not end well, and what each run had to say on the way."""
+    if not len(comparison.sequence.observations):
+        yield _BLIND
     for run in comparison.runs:
         if run.status in _STATUS:
             yield f"{run.estimator} {_STATUS[run.status]}"
@@ -56,6 +61,11 @@ def status_lines(comparison: Comparison) -> Iterator[str]:
             yield f"{run.estimator}: {' '.join(entry.split())}"
         if len(run.log) > _LOG_ENTRIES:
             yield f"{run.estimator}: {len(run.log) - _LOG_ENTRIES} more entries are in the log in metrics.json"
+
+
+def truth_lines(comparison: Comparison) -> Iterator[str]:
+    """Yield what must be known before an error against the truth is believed."""
+    return _remarks(comparison, lambda key: key.startswith(_AGAINST_TRUTH))
 
 
 def missing_lines(comparison: Comparison) -> Iterator[str]:
@@ -89,11 +99,21 @@ def _whose(affected: list[Row], rows: list[Row]) -> str:
 
 
 def remark_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield what the metrics remark on values they did compute, each remark once for all it is about."""
-    about: dict[str, list[str]] = {}
-    for row in comparison.rows:
+    """Yield what the metrics remark on the values they did compute, without what :func:`truth_lines` says."""
+    return _remarks(comparison, lambda key: not key.startswith(_AGAINST_TRUTH))
+
+
+def _remarks(comparison: Comparison, wanted: Callable[[str], bool]) -> Iterator[str]:
+    """Yield each remark once, behind the metrics and the rows it is about."""
+    rows = [row for row in comparison.rows if row.run.trajectory(row.output) is not None]
+    noted: dict[str, dict[str, list[Row]]] = {}
+    for row in rows:
         for key, note in row.scores.notes.items():
-            if row.scores.values.get(key) is not None:
-                about.setdefault(note, []).append(f"{key} of {row.estimator} {row.output}")
-    for note, keys in about.items():
-        yield f"{', '.join(keys)}: {note}"
+            if wanted(key) and row.scores.values.get(key) is not None:
+                noted.setdefault(note, {}).setdefault(key, []).append(row)
+    for note, rows_of in noted.items():
+        keys_of: dict[str, list[str]] = {}
+        for key, affected in rows_of.items():
+            keys_of.setdefault(_whose(affected, rows), []).append(key)
+        about = "; ".join(f"{', '.join(keys)}{whose}" for whose, keys in keys_of.items())
+        yield f"{about}: {note}"

@@ -11,11 +11,13 @@ from toolkit.geometry import Array
 from toolkit.metrics.common.alignment import Alignment
 from toolkit.report.comparison import Comparison, Row
 from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, alignment_words, errors_to, onto_truth, truth_during
-from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet
+from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet, width_of
 from toolkit.sequence import NS_PER_S, Truth
 
 # A run that is not ok is drawn up to this many times the largest error of the runs that are.
 _ROOM_FOR_DIVERGED = 1.5
+# Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
+_LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 
 
 class _Reference(NamedTuple):
@@ -79,13 +81,16 @@ def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference:
     start_ns = int(comparison.sequence.frames_t_ns[0])
     for row, errors in curves:
         t_s = (errors.t_ns - start_ns) / NS_PER_S
-        colour, line = colour_of(comparison, row.estimator), line_of(row.output)
+        look = {"color": colour_of(comparison, row.estimator), "linestyle": line_of(row.output)}
+        width = width_of(comparison, row.estimator)
         label = f"{row.estimator} {'causal = final' if _says_the_same(row.run) else row.output}"
-        position.plot(t_s, errors.position_m, color=colour, linestyle=line, linewidth=1.6, label=label)
-        heading.plot(t_s, _without_wraps(errors.heading_deg), color=colour, linestyle=line, linewidth=1.6)
+        position.plot(t_s, errors.position_m, linewidth=width, label=label, **look)
+        heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
     quiet(position, f"{comparison.sequence.name}: position {reference.what}", "", "position [m]")
     quiet(heading, f"heading {reference.what}", "time [s]", "heading [deg]")
-    _limit(position, curves)
+    _limit_position(position, curves)
+    low, high = heading.get_ylim()
+    heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
     figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
     return NamedFigure("errors_over_time", reference.caption, figure)
 
@@ -97,11 +102,14 @@ def _says_the_same(run: Run) -> bool:
     return np.array_equal(run.causal.T_world_imu, run.final.T_world_imu)
 
 
-def _limit(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
+def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:
     """Keep the position axis to what the runs that are ok need, so that a diverged one does not flatten them."""
     good = [float(errors.position_m.max()) for row, errors in curves if row.status == "ok"]
     diverged = len(good) < len(curves)
-    axes.set_ylim(0.0, max(good) * _ROOM_FOR_DIVERGED if good and diverged and max(good) > 0.0 else None)
+    _, high = axes.get_ylim()
+    if good and diverged and max(good) > 0.0:
+        high = min(high, max(good) * _ROOM_FOR_DIVERGED)
+    axes.set_ylim(0.0, max(high, _LEAST_POSITION_M))
 
 
 def _without_wraps(heading_deg: Array) -> Array:

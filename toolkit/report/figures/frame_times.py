@@ -7,7 +7,7 @@ from matplotlib.ticker import NullFormatter
 
 from toolkit.geometry import Array
 from toolkit.report.comparison import Comparison
-from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
+from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet, width_of
 
 _MS = 1e3
 _SMOOTHED_FRAMES = 15
@@ -27,7 +27,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         label = f"{run.estimator}: mean {float(step_ms.mean()):.2f} ms"
         if run.timings.finish_s > run.timings.step_s.sum():
             label += f",\nthen {run.timings.finish_s:.1f} s at the end"
-        axes.plot(_running_median(step_ms), color=colour, linewidth=1.5, label=label)
+        axes.plot(_running_median(step_ms), color=colour, linewidth=width_of(comparison, run.estimator), label=label)
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least: jitter shall not look like drama
@@ -44,9 +44,9 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
 
 
 def _running_median(values: Array) -> Array:
-    """Return the median (N,) of the values (N,) around each, over fewer of them at the ends."""
+    """Return the median (N,) of the values (N,) around each, mirrored at the ends so that none counts for many."""
     half = _SMOOTHED_FRAMES // 2
-    padded = np.pad(values, half, mode="edge")
+    padded = np.pad(values, half, mode="reflect")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
     medians: Array = np.median(windows, axis=1)
     return medians

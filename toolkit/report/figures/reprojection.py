@@ -8,15 +8,16 @@ from matplotlib.axes import Axes
 from toolkit.estimate import Run
 from toolkit.geometry import Array
 from toolkit.metrics import Judged, held_out, in_sample
+from toolkit.metrics.common.reprojection import CAP_PX
 from toolkit.metrics.common.scores import Unavailable
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
 from toolkit.report.figures.top_view import last_word
 
-# The axis ends here or at this quantile, whichever is nearer; the legend says how much lies beyond.
-_LARGEST_PX = 10.0
-_QUANTILE = 0.97
-_BINS = 50
+# A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
+_SMALLEST_PX = 0.01
+_FAR_PX = 3.0
+_BINS = np.geomspace(_SMALLEST_PX, CAP_PX, 61)
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -25,20 +26,21 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     drawable = {name: kinds for name, kinds in errors.items() if kinds}
     if not drawable:
         return
-    largest = (float(np.quantile(error, _QUANTILE)) for kinds in drawable.values() for error in kinds.values())
-    bins = np.linspace(0.0, max(min(_LARGEST_PX, max(largest)), 0.1), _BINS + 1).tolist()
     figure = new_figure(9.6, 1.2 + 1.7 * len(drawable))
     panels = figure.subplots(len(drawable), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, kinds) in zip(panels, drawable.items(), strict=True):
         for kind, error_px in kinds.items():
-            _histogram(axes, kind, error_px, bins, colour_of(comparison, name))
-        quiet(axes, name, "", "share [%]")
-        axes.set_xlim(0.0, bins[-1])
+            _histogram(axes, kind, error_px, colour_of(comparison, name))
+        quiet(axes, f"{comparison.sequence.name}: {name}", "", "share [%]")
+        axes.set_xscale("log")
+        axes.set_xlim(_SMALLEST_PX, CAP_PX)
+        axes.xaxis.set_major_formatter("{x:g}")
         axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.05))
     panels[-1].set_xlabel("reprojection error: root mean square of the uL, uR, v residuals [px]")
     caption = (
         "Reprojection error of every sighting. Filled: against the estimator's own landmarks (in-sample). Outlined: "
-        "of the tracks withheld from every estimator."
+        "of the tracks withheld from every estimator. Thin lines: the medians. The axis is logarithmic; its ends "
+        f"stand for all below {_SMALLEST_PX:g} px, and for all that is {CAP_PX:g} px off or more or behind the camera."
     )
     yield NamedFigure("reprojection", caption, figure)
 
@@ -59,11 +61,16 @@ def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
     return {kind: error_px for kind, error_px in found.items() if error_px.size}
 
 
-def _histogram(axes: Axes, kind: str, error_px: Array, bins: list[float], colour: str) -> None:
+def _histogram(axes: Axes, kind: str, error_px: Array, colour: str) -> None:
     share = np.full(error_px.size, 100.0 / error_px.size)
-    beyond = 100.0 * float(np.mean(error_px > bins[-1]))
-    label = f"{kind}: median {float(np.median(error_px)):.2f} px\n({beyond:.1f} % beyond the axis)"
+    median_px = float(np.median(error_px))
+    label = (
+        f"{kind}: median {median_px:.2f} px\n({100.0 * float(np.mean(error_px > _FAR_PX)):.1f} % above {_FAR_PX:g} px)"
+    )
+    shown_px, bins = np.maximum(error_px, _SMALLEST_PX), _BINS.tolist()
     if kind == "in-sample":
-        axes.hist(error_px, bins=bins, weights=share, color=colour, alpha=0.35, label=label)
+        axes.hist(shown_px, bins=bins, weights=share, color=colour, alpha=0.35, label=label)
+        axes.axvline(median_px, color=colour, linewidth=1.0, alpha=0.5)
     else:
-        axes.hist(error_px, bins=bins, weights=share, color=colour, histtype="step", linewidth=1.5, label=label)
+        axes.hist(shown_px, bins=bins, weights=share, color=colour, histtype="step", linewidth=1.5, label=label)
+        axes.axvline(median_px, color=colour, linewidth=1.0)

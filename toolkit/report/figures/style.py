@@ -15,6 +15,7 @@ LANDMARK_COLOUR = "#8a949f"
 # Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
 _LINE_OF: dict[Output, str] = {"causal": "--", "final": "-"}
+_WIDEST, _THINNEST = 3.6, 1.2
 
 
 class NamedFigure(NamedTuple):
@@ -34,6 +35,14 @@ def colour_of(comparison: Comparison, estimator: str) -> str:
 def line_of(output: Output) -> str:
     """Return the line style of a kind of output: dashed while it knew the past only, solid at the end."""
     return _LINE_OF[output]
+
+
+def width_of(comparison: Comparison, estimator: str) -> float:
+    """Return the width of an estimator's line: each wider than the next, so that equal lines show as a border."""
+    order = [run.estimator for run in comparison.runs]
+    if len(order) == 1:
+        return _THINNEST
+    return _WIDEST + (_THINNEST - _WIDEST) * order.index(estimator) / (len(order) - 1)
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -18,8 +18,11 @@ from toolkit.report.figures.style import (
     line_of,
     new_figure,
     quiet,
+    width_of,
 )
 
+_LINE_WIDTH = 1.5
+_TRUTH_WIDTH = 5.0
 _LANDMARK_QUANTILES = (0.02, 0.98)
 _MARGIN = 0.06
 _LARGEST_IN = (10.0, 7.5)
@@ -47,11 +50,13 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
     figure = new_figure(*_LARGEST_IN)
     axes = figure.add_subplot()
     landmarks = _draw_landmarks(axes, comparison, run)
-    tracks = [_draw_truth(axes, comparison), _draw_run(axes, comparison, run)]
+    tracks = [_draw_truth(axes, comparison), _draw_run(axes, comparison, run, _LINE_WIDTH)]
     _finish(figure, axes, tracks, landmarks)
     quiet(axes, f"{run.estimator}{_trouble(run)} on {comparison.sequence.name}, from above", "x [m]", "y [m]")
     mapped = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
-    caption = f"Trajectory of {run.estimator} from above; {mapped}. {alignment_words(comparison.sequence)}"
+    caption = (
+        f"Trajectory of {run.estimator} from above, from the dot on; {mapped}. {alignment_words(comparison.sequence)}"
+    )
     return NamedFigure(f"top_{run.estimator}", caption, figure)
 
 
@@ -62,14 +67,16 @@ def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
     landmarks = _draw_landmarks(axes, comparison, mapping[-1]) if mapping else np.empty((0, 2))
     tracks = [_draw_truth(axes, comparison)]
     for run in runs:
-        track = _draw_run(axes, comparison, run)
+        track = _draw_run(axes, comparison, run, width_of(comparison, run.estimator))
         # A run that flew off would squash all the others; its own figure shows where it went.
         if run.status == "ok" or len(runs) == 1:
             tracks.append(track)
     _finish(figure, axes, tracks, landmarks)
     quiet(axes, f"{comparison.sequence.name}: all estimators, from above", "x [m]", "y [m]")
     of_whom = f" over the landmarks of {mapping[-1].estimator}" if mapping else ""
-    caption = f"All trajectories{of_whom}. {alignment_words(comparison.sequence)}"
+    caption = f"All trajectories{of_whom}, each from its dot on. {alignment_words(comparison.sequence)}"
+    if any(run.status != "ok" for run in runs):
+        caption += " One that is not ok may leave the picture."
     return NamedFigure("top_all", caption, figure)
 
 
@@ -82,18 +89,18 @@ def _draw_truth(axes: Axes, comparison: Comparison) -> Array:
     if truth is None:
         return np.empty((0, 2))
     positions = truth.T_world_imu[:, :2, 3]
-    axes.plot(*positions.T, color=TRUTH_COLOUR, linewidth=2.8, label="truth", zorder=2)
+    axes.plot(*positions.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, label="truth", zorder=2)
     return positions
 
 
-def _draw_run(axes: Axes, comparison: Comparison, run: Run) -> Array:
+def _draw_run(axes: Axes, comparison: Comparison, run: Run, width: float) -> Array:
     """Draw the run's last word, and where it starts; return its positions (N, 2)."""
     output = last_word(run)
     trajectory = run.trajectory(output)
     assert trajectory is not None, "only runs with a trajectory are drawn"
     positions = _from_above(comparison, run, trajectory.positions)
     colour, label = colour_of(comparison, run.estimator), f"{run.estimator} {output}{_trouble(run)}"
-    axes.plot(*positions.T, color=colour, linewidth=1.5, linestyle=line_of(output), label=label, zorder=3)
+    axes.plot(*positions.T, color=colour, linewidth=width, linestyle=line_of(output), label=label, zorder=3)
     axes.plot(*positions[:1].T, "o", color=colour, markersize=5, markeredgecolor="white", zorder=4)
     return positions
 

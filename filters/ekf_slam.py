@@ -1,0 +1,18 @@
+"""Joint EKF of the pose and the landmarks in view, all cross-covariances kept (Smith, Self & Cheeseman 1990).
+
+The gauge: in world coordinates a joint EKF evaluates the Jacobians of one landmark at ever new estimates and so
+believes it measures its heading, which nothing does. Here every Jacobian is taken at first estimates, with which
+global position and heading stay exactly unobservable (Huang, Mourikis & Roumeliotis 2010).
+"""
+
+from filters.kalman.joint_ekf import JointEkf
+from filters.kalman.linearisation import AtFirstEstimates
+from filters.kalman.speaker import Speaker
+from toolkit.estimator import Estimator, Setup
+
+RUNG, CHANGE = 30, "+ cross-covariances"
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    return Speaker(JointEkf(setup, AtFirstEstimates()))

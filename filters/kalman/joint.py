@@ -1,0 +1,119 @@
+"""The joint belief of the windowed filters: the IMU now, clones of past poses, landmarks, and all their covariance.
+
+Only this class touches the covariance. Every quantity that measurements linearise about is kept twice: as it
+is estimated now, and as it was first estimated; which of the two a Jacobian uses is the filter's choice.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from filters.kalman.belief import Belief
+from filters.kalman.prediction import Step
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
+
+
+class JointBelief:
+    """Error state in the order: the IMU's d, six a clone (oldest first), three a landmark (in world axes)."""
+
+    def __init__(self, core: Belief) -> None:
+        self._core = core
+        self.first_core = core
+        self.clone_frames: IntArray = np.empty(0, dtype=np.int64)
+        self.clones: Array = np.empty((0, 4, 4))
+        self.first_clones: Array = np.empty((0, 4, 4))
+        self.landmark_ids: IntArray = np.empty(0, dtype=np.int64)
+        self.points: Array = np.empty((0, 3))
+        self.first_points: Array = np.empty((0, 3))
+        self._cov = core.cov
+
+    @property
+    def core(self) -> Belief:
+        """Return the belief of the IMU now, everything else marginalised."""
+        d = self._core.layout.size
+        return replace(self._core, cov=self._cov[:d, :d])
+
+    @property
+    def cov(self) -> Array:
+        """Return the whole covariance; do not write to it."""
+        return self._cov
+
+    @property
+    def clone_columns(self) -> slice:
+        """Return where the clones stand in the error state."""
+        d = self._core.layout.size
+        return slice(d, d + 6 * len(self.clones))
+
+    @property
+    def landmark_columns(self) -> slice:
+        """Return where the landmarks stand in the error state."""
+        return slice(self.clone_columns.stop, self._cov.shape[0])
+
+    def propagate(self, step: Step, transition: Array) -> None:
+        """Carry the IMU over a step; its end is the first estimate of the new instant."""
+        d = self._core.layout.size
+        self._core = replace(self._core, T_world_imu=step.T_world_imu, v_world=step.v_world)
+        self.first_core = self._core
+        cov = self._cov.copy()
+        cov[:d] = transition @ cov[:d]
+        cov[:, :d] = cov[:, :d] @ transition.T
+        cov[:d, :d] += step.noise
+        self._cov = _symmetric(cov)
+
+    def clone(self, frame: int) -> None:
+        """Add a clone of the pose now, with all its correlations (stochastic cloning)."""
+        end = self.clone_columns.stop
+        rows = np.r_[0:end, 0:6, end : self._cov.shape[0]]
+        self._cov = self._cov[np.ix_(rows, rows)]
+        self.clone_frames = np.append(self.clone_frames, frame)
+        self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
+        self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
+
+    def forget_clones(self, which: BoolArray) -> None:
+        """Marginalise clones (C,): their rows and columns are dropped."""
+        kept = np.ones(self._cov.shape[0], dtype=bool)
+        kept[self.clone_columns] = np.repeat(~which, 6)
+        self._cov = self._cov[np.ix_(kept, kept)]
+        self.clone_frames = self.clone_frames[~which]
+        self.clones, self.first_clones = self.clones[~which], self.first_clones[~which]
+
+    def forget_landmarks(self, which: BoolArray) -> None:
+        """Marginalise landmarks (L,)."""
+        kept = np.ones(self._cov.shape[0], dtype=bool)
+        kept[self.landmark_columns] = np.repeat(~which, 3)
+        self._cov = self._cov[np.ix_(kept, kept)]
+        self.landmark_ids = self.landmark_ids[~which]
+        self.points, self.first_points = self.points[~which], self.first_points[~which]
+
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, cov: Array) -> None:
+        """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's, plus noise.
+
+        ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
+        """
+        cross = jacobian @ self._cov
+        own = cross @ jacobian.T + cov
+        self._cov = _symmetric(np.block([[self._cov, cross.T], [cross, own]]))
+        self.landmark_ids = np.concatenate([self.landmark_ids, track_ids])
+        self.points = np.concatenate([self.points, points])
+        self.first_points = np.concatenate([self.first_points, points])
+
+    def update(self, H: Array, residual: Array, columns: slice) -> None:
+        """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
+        carried = H @ self._cov[columns]
+        root = np.linalg.cholesky(carried[:, columns] @ H.T + np.eye(len(residual)))
+        half_gain = solve_triangular(root, carried, lower=True, check_finite=False)
+        self.move(half_gain.T @ solve_triangular(root, residual, lower=True, check_finite=False))
+        self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
+
+    def move(self, delta: Array) -> None:
+        """Move every estimate by an error (n,); first estimates stay."""
+        d, clones = self._core.layout.size, self.clone_columns
+        self._core = self._core.moved(delta[:d], self._core.cov)
+        self.clones = self.clones @ se3_exp(delta[clones].reshape(-1, 6))
+        self.points = self.points + delta[clones.stop :].reshape(-1, 3)
+
+
+def _symmetric(cov: Array) -> Array:
+    result: Array = 0.5 * (cov + cov.T)
+    return result

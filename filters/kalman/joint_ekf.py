@@ -1,0 +1,82 @@
+"""EKF-SLAM: the pose and every landmark in view in one Gaussian, all cross-covariances kept.
+
+What it approximates: past poses and landmarks out of view are marginalised at once, so the cost is bounded by
+what is in view, and nothing is ever relinearised (Smith, Self & Cheeseman 1990; Bailey et al. 2006).
+"""
+
+import numpy as np
+
+from filters.kalman import joint_landmarks, multiview
+from filters.kalman.belief import initial_belief
+from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import Linearisation
+from filters.kalman.multiview import Sightings
+from filters.kalman.prediction import predictor
+from toolkit.estimate import Estimate, Landmarks
+from toolkit.estimator import Setup
+from toolkit.sequence import Motion, Packet, StereoFrame
+
+
+class JointEkf:
+    """Propagate, correct pose and landmarks together, forget the landmarks lost, start those new."""
+
+    def __init__(self, setup: Setup, linearisation: Linearisation) -> None:
+        self._rig, self._at = setup.rig, linearisation
+        self._predictor = predictor(setup)
+        self._joint = JointBelief(initial_belief(setup.prior, setup.motion_kind))
+        self._memory = LandmarkMemory()
+
+    @property
+    def joint(self) -> JointBelief:
+        """Return the joint belief now."""
+        return self._joint
+
+    def step(self, packet: Packet) -> Estimate:
+        """Take in one packet and say where the IMU is."""
+        if packet.motion is not None:
+            self._propagate(packet.motion)
+        self._joint.clone(packet.index)
+        innovation = Innovation()
+        self._forget_lost(packet.frame)
+        if len(self._joint.landmark_ids):
+            self._correct(packet.frame, innovation)
+        self._start_new(packet.frame)
+        self._joint.forget_clones(np.ones(1, dtype=bool))
+        return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())
+
+    def landmarks(self) -> Landmarks:
+        """Return every landmark there ever was, as last known."""
+        self._memory.remember(self._joint.landmark_ids, self._joint.points)
+        return self._memory.landmarks()
+
+    def _propagate(self, motion: Motion) -> None:
+        step = self._predictor.step(self._joint.core, motion)
+        self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
+
+    def _forget_lost(self, frame: StereoFrame) -> None:
+        lost = ~joint_landmarks.seen_again(self._joint, frame)
+        self._memory.remember(self._joint.landmark_ids[lost], self._joint.points[lost])
+        self._joint.forget_landmarks(lost)
+
+    def _correct(self, frame: StereoFrame, innovation: Innovation) -> None:
+        joint = self._joint
+        said = joint_landmarks.innovations(joint, frame, self._at, self._rig)
+        nis, accepted = joint_landmarks.gated(joint, said)
+        innovation.add(nis, np.full(len(nis), 3), accepted)
+        if accepted.any():
+            H, residuals = said.H[accepted], said.residuals[accepted]
+            joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), joint_landmarks.columns(joint))
+
+    def _start_new(self, frame: StereoFrame) -> None:
+        """Start the tracks the state does not have from this one view of them."""
+        joint = self._joint
+        new = ~np.isin(frame.track_ids, joint.landmark_ids)
+        sightings = Sightings(
+            frame.track_ids[new], frame.uvs_px[new][:, None], np.ones((int(new.sum()), 1), dtype=bool)
+        )
+        points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
+        sightings, points = sightings.select(reliable), points[reliable]
+        if len(points):
+            linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
+            joint_landmarks.keep(joint, sightings.track_ids, points, linearised)

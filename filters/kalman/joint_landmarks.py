@@ -1,0 +1,80 @@
+"""Landmarks in a joint belief: how tracks become part of the state and how they correct it afterwards.
+
+Both go through the newest clone of the pose, whose estimate and covariance are those of the pose now.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.kalman import multiview
+from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import Linearisation
+from filters.kalman.multiview import Linearised, Sightings
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.sequence import StereoFrame, StereoRig
+
+
+class Innovations(NamedTuple):
+    """Whitened residuals (L, 3) of the state's landmarks with Jacobians (L, 3, k) to clones and landmarks."""
+
+    residuals: Array
+    H: Array
+
+
+def seen_again(joint: JointBelief, frame: StereoFrame) -> BoolArray:
+    """Say which landmarks (L,) of the state the frame shows."""
+    return np.isin(joint.landmark_ids, frame.track_ids)
+
+
+def innovations(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> Innovations:
+    """Return what the frame says of all landmarks of the state, every one of which it must show."""
+    order = np.argsort(frame.track_ids)
+    rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
+    seen = Sightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
+    newest = joint.clones[-1:]
+    now = multiview.linearise(seen, joint.points, newest, newest, rig)
+    there = multiview.linearise(seen, at.points(joint), newest, at.clones(joint)[-1:], rig)
+    return Innovations(now.residuals[:, 0], _over_columns(joint, there.H_pose[:, 0], there.H_point[:, 0]))
+
+
+def _over_columns(joint: JointBelief, H_pose: Array, H_point: Array) -> Array:
+    """Spread Jacobians to the newest clone and to each landmark over the columns of all clones and landmarks."""
+    clones, count = 6 * len(joint.clones), len(H_pose)
+    H = np.zeros((count, 3, clones + 3 * count))
+    H[:, :, clones - 6 : clones] = H_pose
+    own = H[:, :, clones:].reshape(count, 3, count, 3)
+    own[np.arange(count), :, np.arange(count), :] = H_point
+    return H
+
+
+def columns(joint: JointBelief) -> slice:
+    """Return the columns of the error state that :class:`Innovations` speaks of."""
+    return slice(joint.clone_columns.start, joint.cov.shape[0])
+
+
+def gated(joint: JointBelief, said: Innovations) -> tuple[Array, BoolArray]:
+    """Return the NIS (L,) of each landmark's residual and whether it passes the gate."""
+    part = columns(joint)
+    spread = said.H @ joint.cov[part, part] @ np.swapaxes(said.H, 1, 2)
+    nis = mahalanobis_squared(said.residuals, spread + np.eye(3))
+    return nis, np.asarray(nis < STEREO_GATE)
+
+
+def keep(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
+    """Put N tracks seen from the clones into the state, with the correlations their sightings give them.
+
+    A landmark's error is that which its measurements' errors and the poses' errors give its best point:
+    ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``.
+    """
+    count, window = linearised.residuals.shape[:2]
+    H_point = linearised.H_point.reshape(count, 3 * window, 3)
+    cov_each = np.linalg.inv(np.swapaxes(H_point, 1, 2) @ H_point)
+    pull = (-cov_each @ np.swapaxes(H_point, 1, 2)).reshape(count, 3, window, 3)
+    jacobian = np.zeros((3 * count, joint.cov.shape[0]))
+    blocks = np.einsum("fiwj,fwjk->fiwk", pull, linearised.H_pose)
+    jacobian[:, joint.clone_columns] = blocks.reshape(3 * count, 6 * window)
+    cov = np.zeros((count, 3, count, 3))
+    cov[np.arange(count), :, np.arange(count), :] = cov_each
+    joint.add_landmarks(track_ids, points, jacobian, cov.reshape(3 * count, 3 * count))

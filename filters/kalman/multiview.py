@@ -1,0 +1,153 @@
+"""Landmarks seen from several poses of a window: triangulation, and measurements freed of the landmark.
+
+Everything works on F tracks at once, padded to W poses: ``uvs_px`` (F, W, 3) with a mask ``seen`` (F, W).
+Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial
+navigation", eqs. 17-26; the stereo measurement replaces their monocular one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew
+from toolkit.models import stereo
+from toolkit.sequence import StereoRig
+
+_ITERATIONS, _FIRST_DAMPING = 6, 1e-3
+# A track whose best disparity is below this tells the direction but not the depth; its linearisation is no use.
+LEAST_DISPARITY_PX = 1.0
+
+
+class Sightings(NamedTuple):
+    """F tracks as seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px and who saw what (F, W)."""
+
+    track_ids: IntArray
+    uvs_px: Array
+    seen: BoolArray
+
+    def select(self, rows: BoolArray) -> "Sightings":
+        """Return some of the tracks."""
+        return Sightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
+
+
+class Linearised(NamedTuple):
+    """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3)."""
+
+    residuals: Array
+    H_pose: Array
+    H_point: Array
+    depth_m: Array
+
+
+def linearise(sightings: Sightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
+    """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
+
+    Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
+    What was not seen is zero throughout.
+    """
+    whitener = np.linalg.inv(np.linalg.cholesky(rig.cov_uv_px2))
+    seen = sightings.seen[..., None]
+    points_cam, _ = _in_camera(points, poses, rig)
+    points_cam_at, points_imu_at = _in_camera(points, poses_at, rig)
+    safe, safe_at = _in_front(points_cam), _in_front(points_cam_at)
+    residuals = np.where(seen, (sightings.uvs_px - stereo.project(safe, rig)) @ whitener.T, 0.0)
+    d_uv_d_imu = whitener @ stereo.projection_jacobian(safe_at, rig) @ rig.T_imu_cam[:3, :3].T
+    d_uv_d_imu = np.where(seen[..., None], d_uv_d_imu, 0.0)
+    H_pose = np.concatenate([d_uv_d_imu @ skew(points_imu_at), -d_uv_d_imu], axis=-1)
+    H_point = d_uv_d_imu @ np.swapaxes(poses_at[:, :3, :3], -1, -2)
+    depth_m = np.where(sightings.seen, points_cam[..., 2], np.inf)
+    return Linearised(residuals, H_pose, H_point, depth_m)
+
+
+def _in_camera(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Return points (F, 3) in the camera and in the IMU frame of each pose (W, 4, 4), both (F, W, 3)."""
+    T_imu_world, T_cam_imu = se3_inverse(poses), se3_inverse(rig.T_imu_cam)
+    points_imu = np.einsum("wij,fj->fwi", T_imu_world[:, :3, :3], points) + T_imu_world[:, :3, 3]
+    return points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3], points_imu
+
+
+def _in_front(points_cam: Array) -> Array:
+    """Return the points with a depth that can be divided by; callers gate those that were not in front."""
+    result = points_cam.copy()
+    result[..., 2] = np.where(np.abs(result[..., 2]) < 1e-3, 1e-3, result[..., 2])
+    return result
+
+
+def triangulate(sightings: Sightings, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
+    """Return the points (F, 3) that fit all sightings best, and which of them (F,) can be relied on.
+
+    Levenberg-Marquardt over all tracks at once, from the stereo triangulation with the largest disparity. A
+    point is reliable if it lies in front of every pose that saw it and had a disparity worth the name.
+    """
+    disparity_px = np.where(sightings.seen, stereo.disparity_px(sightings.uvs_px), -np.inf)
+    nearest = np.argmax(disparity_px, axis=1)
+    rows = np.arange(len(nearest))
+    wide = disparity_px[rows, nearest] > LEAST_DISPARITY_PX
+    uvs_px = np.where(wide[:, None], sightings.uvs_px[rows, nearest], [rig.cx_px + 1.0, rig.cx_px, rig.cy_px])
+    points = stereo.triangulate_world(uvs_px, poses[nearest], rig)
+    damping = np.full(len(points), _FIRST_DAMPING)
+    now = linearise(sightings, points, poses, poses, rig)
+    cost = _cost(now)
+    for _ in range(_ITERATIONS):
+        H, g = _normal_equations(now)
+        H = H + damping[:, None, None] * H * np.eye(3)
+        tried = points + np.linalg.solve(H + 1e-12 * np.eye(3), g[..., None])[..., 0]
+        then = linearise(sightings, tried, poses, poses, rig)
+        better = _cost(then) < cost
+        points = np.where(better[:, None], tried, points)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        if np.all(~better | (cost - _cost(then) < 1e-6 * cost)):
+            break
+        now = _chosen(better, then, now)
+        cost = np.where(better, _cost(then), cost)
+    final = linearise(sightings, points, poses, poses, rig)
+    return points, wide & (final.depth_m > 0.1).all(axis=1)
+
+
+def _chosen(rows: BoolArray, new: Linearised, old: Linearised) -> Linearised:
+    """Return the new linearisation of some tracks (F,) and the old one of the others."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return np.where(np.expand_dims(rows, tuple(range(1, a.ndim))), a, b)
+
+    return Linearised(*[pick(a, b) for a, b in zip(new, old, strict=True)])
+
+
+def _cost(linearised: Linearised) -> Array:
+    squares: Array = np.einsum("fwi,fwi->f", linearised.residuals, linearised.residuals)
+    return np.where((linearised.depth_m > 0.0).all(axis=1), squares, np.inf)
+
+
+def _normal_equations(linearised: Linearised) -> tuple[Array, Array]:
+    H_point = linearised.H_point
+    return (
+        np.einsum("fwij,fwik->fjk", H_point, H_point),
+        np.einsum("fwij,fwi->fj", H_point, linearised.residuals),
+    )
+
+
+class Constraints(NamedTuple):
+    """What F tracks say of the W poses alone: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
+
+    residuals: Array
+    H: Array
+    dof: IntArray
+
+
+def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
+    """Project the measurements onto the left null space of the landmark's Jacobian (MSCKF, eqs. 23-24)."""
+    tracks, window = seen.shape
+    q, _ = np.linalg.qr(linearised.H_point.reshape(tracks, 3 * window, 3), mode="complete")
+    null_space = np.swapaxes(q[:, :, 3:], 1, 2)
+    residuals = (null_space @ linearised.residuals.reshape(tracks, 3 * window, 1))[..., 0]
+    blocks = null_space.reshape(tracks, 3 * window - 3, window, 3)
+    H = np.einsum("frwi,fwij->frwj", blocks, linearised.H_pose).reshape(tracks, 3 * window - 3, 6 * window)
+    return Constraints(residuals, H, 3 * seen.sum(axis=1) - 3)
+
+
+def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:
+    """Return an equivalent system (k, n), (k,) with no more rows than columns, by QR (MSCKF, eqs. 28-30)."""
+    if len(residuals) <= H.shape[1]:
+        return H, residuals
+    triangle = np.asarray(np.linalg.qr(np.column_stack([H, residuals]), mode="r"))
+    return triangle[: H.shape[1], :-1], triangle[: H.shape[1], -1]

@@ -1,0 +1,138 @@
+"""The multi-state constraint Kalman filter: a window of cloned poses, tied by tracks whose landmarks are eliminated.
+
+What it approximates: a track speaks once, when it ends or spans the window, and poses that left the window are
+never corrected again (Mourikis & Roumeliotis 2007). With ``landmarks`` the tracks that span the window stay in
+the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator
+design for vision-aided inertial navigation").
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from filters.kalman import joint_landmarks, multiview
+from filters.kalman.belief import initial_belief
+from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.gate import gate_at, mahalanobis_squared
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import Linearisation
+from filters.kalman.multiview import Constraints, Linearised, Sightings
+from filters.kalman.prediction import predictor
+from filters.kalman.tracks import WindowTracks
+from toolkit.estimate import Estimate, Landmarks
+from toolkit.estimator import Setup
+from toolkit.geometry import Array, BoolArray
+from toolkit.sequence import Motion, Packet, StereoFrame
+
+# An IMU ties poses over a second so well that tracks may take as long to speak. A measured twist is a
+# hundred times looser: a track that waits lets the pose run off, and its linearisation with it.
+CLONES = {"imu": 12, "twist": 5}
+
+
+@dataclass(frozen=True)
+class WindowSize:
+    """How many past poses are kept and how many long-lived landmarks."""
+
+    clones: int
+    landmarks: int = 0
+
+
+class SlidingWindowFilter:
+    """Propagate, clone, correct by landmarks and by finished tracks, drop the oldest pose."""
+
+    def __init__(self, setup: Setup, linearisation: Linearisation, size: WindowSize) -> None:
+        self._rig, self._size, self._at = setup.rig, size, linearisation
+        self._predictor = predictor(setup)
+        self._joint = JointBelief(initial_belief(setup.prior, setup.motion_kind))
+        self._tracks = WindowTracks()
+        self._memory = LandmarkMemory()
+
+    def step(self, packet: Packet) -> Estimate:
+        """Take in one packet and say where the IMU is."""
+        if packet.motion is not None:
+            self._propagate(packet.motion)
+        self._joint.clone(packet.index)
+        innovation = Innovation()
+        self._correct_by_landmarks(packet.frame, innovation)
+        self._tracks.add_frame(_without(packet.frame, self._joint))
+        self._correct_by_tracks(innovation)
+        if len(self._joint.clones) > self._size.clones:
+            self._forget_oldest_clone()
+        return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())
+
+    def landmarks(self) -> Landmarks:
+        """Return every landmark that was ever triangulated, as last known."""
+        self._memory.remember(self._joint.landmark_ids, self._joint.points)
+        return self._memory.landmarks()
+
+    def _propagate(self, motion: Motion) -> None:
+        step = self._predictor.step(self._joint.core, motion)
+        self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
+
+    def _correct_by_landmarks(self, frame: StereoFrame, innovation: Innovation) -> None:
+        """Correct by the landmarks of the state that the frame shows; marginalise those it does not."""
+        joint = self._joint
+        lost = ~joint_landmarks.seen_again(joint, frame)
+        self._memory.remember(joint.landmark_ids[lost], joint.points[lost])
+        joint.forget_landmarks(lost)
+        if not len(joint.landmark_ids):
+            return
+        said = joint_landmarks.innovations(joint, frame, self._at, self._rig)
+        nis, accepted = joint_landmarks.gated(joint, said)
+        innovation.add(nis, np.full(len(nis), 3), accepted)
+        if accepted.any():
+            H, residuals = said.H[accepted], said.residuals[accepted]
+            joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), joint_landmarks.columns(joint))
+
+    def _correct_by_tracks(self, innovation: Innovation) -> None:
+        """Let the tracks that ended speak, and those that span a full window before its oldest pose leaves."""
+        ended = self._tracks.take(self._tracks.ended())
+        self._speak(ended.select(ended.seen.sum(axis=1) >= 2), 0, innovation)
+        if len(self._joint.clones) > self._size.clones:
+            spanning = self._tracks.take(self._tracks.spanning())
+            self._speak(spanning, self._size.landmarks - len(self._joint.landmark_ids), innovation)
+
+    def _speak(self, sightings: Sightings, room: int, innovation: Innovation) -> None:
+        """Correct the window by tracks and keep as many of them as landmarks as there is room for."""
+        joint = self._joint
+        points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
+        sightings, points = sightings.select(reliable), points[reliable]
+        if not len(points):
+            return
+        linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
+        said = multiview.without_landmark(linearised, sightings.seen)
+        accepted = self._gated(said, innovation)
+        if not accepted.any():
+            return
+        self._memory.remember(sightings.track_ids[accepted], points[accepted])
+        kept = np.flatnonzero(accepted)[: max(room, 0)]
+        if len(kept):
+            of_kept = Linearised(*[array[kept] for array in linearised])
+            joint_landmarks.keep(joint, sightings.track_ids[kept], points[kept], of_kept)
+        H, residuals = multiview.compressed(*_stacked(said, accepted))
+        joint.update(H, residuals, joint.clone_columns)
+
+    def _gated(self, said: Constraints, innovation: Innovation) -> BoolArray:
+        P = self._joint.cov[self._joint.clone_columns, self._joint.clone_columns]
+        spread = said.H @ P @ np.swapaxes(said.H, 1, 2)
+        nis = mahalanobis_squared(said.residuals, spread + np.eye(spread.shape[1]))
+        accepted = np.asarray(nis < gate_at(said.dof))
+        innovation.add(nis, said.dof, accepted)
+        return accepted
+
+    def _forget_oldest_clone(self) -> None:
+        self._joint.forget_clones(np.arange(len(self._joint.clones)) == 0)
+        self._tracks.drop_column(0)
+
+
+def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
+    """Return the frame without the sightings of the state's landmarks."""
+    rows = ~np.isin(frame.track_ids, joint.landmark_ids)
+    return StereoFrame(frame.t_ns, frame.track_ids[rows], frame.uvs_px[rows])
+
+
+def _stacked(said: Constraints, accepted: BoolArray) -> tuple[Array, Array]:
+    """Return the rows of the accepted tracks that say anything, under each other."""
+    H = said.H[accepted].reshape(-1, said.H.shape[2])
+    speaks = H.any(axis=1)
+    return H[speaks], said.residuals[accepted].reshape(-1)[speaks]

@@ -1,0 +1,14 @@
+"""Sliding window of cloned poses tied by tracks (Mourikis & Roumeliotis 2007)."""
+
+from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from filters.kalman.speaker import Speaker
+from toolkit.estimator import Estimator, Setup
+
+RUNG, CHANGE = 60, "+ window of past poses"
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    size = WindowSize(CLONES[setup.motion_kind])
+    return Speaker(SlidingWindowFilter(setup, AtLatestEstimates(), size))

@@ -1,0 +1,216 @@
+"""The documentation works as printed: files, programs and commands run, links lead somewhere, tables are the tool's."""
+
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.estimate import Trajectory
+from toolkit.report.trajectory_files import write_tum
+
+PROJECT = Path(__file__).parents[2]
+PAGES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")), PROJECT / "data/README.md")
+
+_FENCE = re.compile(r"^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?\n(?P<text>.*?)^```$", re.M | re.S)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block of a page; one with a title is the file of that name."""
+
+    language: str
+    title: str | None
+    text: str
+
+
+def blocks(page: Path) -> list[Block]:
+    found = _FENCE.finditer(page.read_text(encoding="utf-8"))
+    return [Block(b["language"], b["title"], b["text"]) for b in found]
+
+
+def commands(block: Block) -> Iterator[str]:
+    """Yield each ``vislam`` command; what sets up the environment before it is the CI's to run."""
+    if block.language == "sh":
+        parts = (part.strip() for line in block.text.splitlines() for part in line.split("&&"))
+        yield from (part for part in parts if part.startswith("vislam "))
+
+
+class Desk:
+    """A copy of the packages in a directory of its own: files dropped into it are found, and nothing else sees them."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+
+    def write(self, block: Block) -> None:
+        assert block.title is not None
+        (self.directory / block.title).write_text(block.text, encoding="utf-8")
+
+    def vislam(self, command: str) -> str:
+        return self._python("-m", "toolkit.cli", *shlex.split(command)[1:])
+
+    def run(self, program: str) -> str:
+        return self._python("-c", program)
+
+    def _python(self, *arguments: str) -> str:
+        # -m and -c put the working directory first on the path, so the copy is what is imported.
+        ended = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=self.directory,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        # 1 is a result, too: an estimator of an example may diverge, and its text says so.
+        assert ended.returncode in (0, 1), f"{arguments}: {ended.stderr}"
+        assert "Traceback" not in ended.stderr, f"{arguments}: {ended.stderr}"
+        return ended.stdout
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    for package in ("toolkit", "filters"):
+        shutil.copytree(PROJECT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    _write_own_drive(tmp_path)
+    return Desk(tmp_path)
+
+
+def _write_own_drive(directory: Path) -> None:
+    """Write ``my_drive.npz`` as the course writes its recordings, and ``my_drive.tum``, its truth."""
+    sequence = load_sequence("drive").truncated(60)
+    seen, frames_t_ns, rig = sequence.observations, sequence.frames_t_ns, sequence.rig
+    tracks, row = np.unique(seen.track_id, return_inverse=True)
+    features = np.full((4, tracks.size, frames_t_ns.size), -1.0)
+    features[:, row, seen.frame] = seen.uv_px.T[[0, 2, 1, 2]]
+    twists = sequence.motion.values[np.searchsorted(sequence.motion.t_ns, frames_t_ns)]
+    np.savez(
+        directory / "my_drive.npz",
+        time_stamps=frames_t_ns[None] / 1e9,
+        features=features,
+        linear_velocity=twists[:, :3].T,
+        angular_velocity=twists[:, 3:].T,
+        K=np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]]),
+        b=np.array(rig.baseline_m),
+        imu_T_cam=rig.T_imu_cam,
+    )
+    assert sequence.truth is not None
+    write_tum(Trajectory(sequence.truth.t_ns, sequence.truth.T_world_imu), directory / "my_drive.tum")
+
+
+def _name(page: Path) -> str:
+    return str(page.relative_to(PROJECT))
+
+
+def _runs(page: Path) -> bool:
+    return any(block.language == "python" or any(commands(block)) for block in blocks(page))
+
+
+by_page = pytest.mark.parametrize("page", PAGES, ids=_name)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if _runs(page)], ids=_name)
+def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, desk: Desk) -> None:
+    printed: dict[str, str] = {}
+    for block in blocks(page):
+        if block.title is not None:
+            desk.write(block)
+        elif block.language == "python":
+            desk.run(block.text)
+        elif block.text.startswith("$ vislam"):
+            _assert_tables_agree(block.text, printed[block.text.partition("\n")[0].removeprefix("$ ")])
+        printed |= {command: desk.vislam(command) for command in commands(block)}
+
+
+def _assert_tables_agree(shown: str, printed: str) -> None:
+    there = _rows(printed)
+    for row, cells in _rows(shown).items():
+        for cell, fresh in zip(cells[:-2], there[row][:-2], strict=True):  # the last two are times of a machine
+            if "-" in (cell, fresh):
+                assert cell == fresh, row
+            else:
+                # Two decimals are shown, and other versions of the libraries round another way.
+                assert float(cell) == pytest.approx(float(fresh), rel=0.1, abs=0.02), row
+
+
+def _rows(text: str) -> dict[tuple[str, ...], list[str]]:
+    """Return the cells of every row of every table in a text, by sequence, estimator, output and status."""
+    rows, sequence = {}, ""
+    for line in text.splitlines():
+        words = line.split()
+        if re.match(r"\S+: \d+ frames, ", line):
+            sequence = words[0]
+        elif words[1:2] in (["causal"], ["final"]):
+            rows[sequence, *words[:3]] = words[3:]
+    return rows
+
+
+def test_the_examples_of_extending_do_what_the_page_says(desk: Desk) -> None:
+    for block in blocks(PROJECT / "docs/extending.md"):
+        if block.title is not None:
+            desk.write(block)
+    listed = desk.vislam("vislam list")
+    assert all(name in listed for name in ("constant-velocity", "plain-json", "path_ratio"))
+    desk.vislam("vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run")
+    runs = json.loads((desk.directory / "run/metrics.json").read_text())["runs"]
+    assert [run["status"] for run in runs] == ["diverged", "diverged", "ok", "ok"]
+    # White noise of 0.1 m on steps of 0.5 m and more lengthens a path by no more than a few percent.
+    assert runs[-1]["metrics"]["path_ratio"] == pytest.approx(1.0, abs=0.1)
+
+
+@by_page
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        name, _, anchor = target.partition("#")
+        if name.startswith("https:"):
+            continue
+        linked = (page.parent / name).resolve() if name else page
+        assert linked.exists(), target
+        assert linked.is_relative_to(PROJECT), target
+        assert not anchor or anchor in _anchors(linked), target
+
+
+def _anchors(page: Path) -> set[str]:
+    """Return what GitHub calls the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@by_page
+def test_lines_are_short_and_no_path_is_that_of_one_machine(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"(?<![\w.])/(work|home|tmp|Users)/", text)
+    prose = [line for line in text.splitlines() if not line.startswith("|")]
+    assert max(map(len, prose)) <= 120
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    reached, waiting = set[Path](), [PROJECT / "README.md"]
+    while waiting:
+        page = waiting.pop()
+        reached.add(page)
+        links = re.findall(r"\]\(([^)#\s]+\.md)", page.read_text(encoding="utf-8"))
+        found = {(page.parent / link).resolve() for link in links if not link.startswith("https:")}
+        waiting += found - reached - set(waiting)
+    assert set(PAGES) <= reached
+
+
+def test_exit_statuses_are_those_of_the_help() -> None:
+    from toolkit.cli import parser
+
+    told = re.findall(r"^  (\d+) ", parser().format_help(), flags=re.M)
+    assert re.findall(r"^\| (\d+) \|", (PROJECT / "README.md").read_text(encoding="utf-8"), flags=re.M) == told
+
+
+def test_pictures_are_small() -> None:
+    for picture in (PROJECT / "docs/images").iterdir():
+        assert picture.stat().st_size <= 150_000, picture.name

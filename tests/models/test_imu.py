@@ -1,0 +1,167 @@
+"""The IMU model: its transition and noise, that they are those of GTSAM's CombinedImuFactor, and its order.
+
+An implicit function links the two: the factor's residual r(x_i, x_j) vanishes at our prediction, so the error it
+carries from i to j is F = -(dr/dx_j)^-1 dr/dx_i and its noise, seen at j, is (dr/dx_j)^-1 cov (dr/dx_j)^-T. Its
+velocity is perturbed in the world, ours in the body.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
+from toolkit.models import factors, imu
+from toolkit.models.factors import B, V, X
+from toolkit.sequence import GRAVITY_WORLD, ImuMotion
+from toolkit.simulation import FLIGHT, noise_free, simulate
+from toolkit.start import start_from_measurements
+
+PARAMS = imu.preintegration_params(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
+BIAS = np.array([0.05, -0.08, 0.03, 0.004, -0.006, 0.002])
+
+
+class State(NamedTuple):
+    T_world_imu: Array
+    v_world: Array
+    bias: Array
+
+    def moved(self, delta: Array) -> "State":
+        """Return the state perturbed by (15,) in the order and on the side of GTSAM."""
+        v_world = self.v_world + self.T_world_imu[:3, :3] @ delta[6:9]
+        return State(self.T_world_imu @ se3_exp(delta[:6]), v_world, self.bias + delta[9:])
+
+    def error_to(self, other: "State") -> Array:
+        """Return the perturbation (15,) of this state that gives the other."""
+        pose_error = se3_log(se3_inverse(self.T_world_imu) @ other.T_world_imu)
+        velocity_error = self.T_world_imu[:3, :3].T @ (other.v_world - self.v_world)
+        return np.concatenate([pose_error, velocity_error, other.bias - self.bias])
+
+
+@pytest.fixture
+def motion() -> ImuMotion:
+    """A tenth of a second of lively motion in twenty uneven steps."""
+    rng = np.random.default_rng(1)
+    accel = np.array([0.5, -0.7, 9.6]) + rng.standard_normal((20, 3))
+    gyro = np.array([0.4, -0.9, 0.7]) + 0.3 * rng.standard_normal((20, 3))
+    return ImuMotion(rng.uniform(0.003, 0.007, 20), accel, gyro)
+
+
+@pytest.fixture
+def state() -> State:
+    return State(se3_exp(np.array([0.4, -0.8, 1.1, 3.0, -2.0, 5.0])), np.array([3.0, -1.0, 0.5]), BIAS + 0.01)
+
+
+def predicted(preintegration: imu.Preintegration, start: State) -> State:
+    step = imu.predict(preintegration, *start)
+    return State(step.T_world_imu, step.v_world, start.bias)
+
+
+def test_transition_is_the_derivative_of_the_prediction(motion, state, numerical_jacobian):
+    """The preintegration stays as it is, made about another bias than the state's: its own bias Jacobian counts."""
+    preintegration = imu.preintegrate(motion, BIAS, PARAMS)
+    end = predicted(preintegration, state)
+    numerical = numerical_jacobian(lambda d: end.error_to(predicted(preintegration, state.moved(d))), 15)
+    # Entries are of the order of 1; the differences are good to 1e-10.
+    np.testing.assert_allclose(imu.predict(preintegration, *state).transition, numerical, atol=1e-9)
+
+
+def test_bias_jacobian_describes_a_new_preintegration_too(motion, numerical_jacobian):
+    """What the filter does at each frame: preintegrate afresh about the latest bias."""
+    start = State(np.eye(4), np.array([3.0, -1.0, 0.5]), BIAS)
+
+    def again(delta: Array) -> State:
+        moved = start.moved(delta)
+        return predicted(imu.preintegrate(motion, moved.bias, PARAMS), moved)
+
+    numerical = numerical_jacobian(lambda d: again(np.zeros(15)).error_to(again(d)), 15)
+    transition = imu.predict(imu.preintegrate(motion, BIAS, PARAMS), *start).transition
+    dt_s = motion.dt_s.sum()
+    # The midpoint turn of each specific force also depends on the gyro bias, by half a step; GTSAM's Jacobian does not
+    # know: over n steps that is 1 / n of the effect on the velocity, 0.5 g dt^2, and less on the position.
+    half_step = 0.5 * 9.81 * dt_s**2 / len(motion.dt_s)
+    np.testing.assert_allclose(transition[:6], numerical[:6], atol=1.5 * half_step * dt_s)
+    np.testing.assert_allclose(transition[6:9], numerical[6:9], atol=1.5 * half_step)
+    np.testing.assert_allclose(transition[9:], numerical[9:], atol=1e-9)
+
+
+def test_noise_covariance_is_that_of_the_sampled_noise(motion):
+    """Monte Carlo: every sample of the interval gets the white noise of its density, the bias walks on."""
+    noise = FLIGHT.motion.noise
+    start = State(np.eye(4), np.zeros(3), np.zeros(6))
+    clean = imu.predict(imu.preintegrate(motion, np.zeros(6), PARAMS), *start)
+    end, rng, draws = State(clean.T_world_imu, clean.v_world, start.bias), np.random.default_rng(7), 2000
+    density = np.repeat([noise.accel_noise_density, noise.gyro_noise_density], 3)
+    errors = np.empty((draws, 9))
+    for i in range(draws):
+        white = density * rng.standard_normal((motion.dt_s.size, 6)) / np.sqrt(motion.dt_s)[:, None]
+        noisy = ImuMotion(motion.dt_s, motion.accel_mps2 + white[:, :3], motion.gyro_radps + white[:, 3:])
+        errors[i] = end.error_to(predicted(imu.preintegrate(noisy, np.zeros(6), PARAMS), start))[:9]
+    normal = np.linalg.solve(np.linalg.cholesky(clean.cov[:9, :9]), errors.T)
+    # The sample covariance of 2000 normal draws: each entry has a standard error of 0.022 or 0.032; five of them.
+    # The midpoint rule shifts the white noise of the gyro by half a step, which is 1 / n of its effect at most.
+    np.testing.assert_allclose(normal @ normal.T / draws, np.eye(9), atol=0.16 + 0.05)
+    bias_walk = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3) ** 2 * motion.dt_s.sum()
+    np.testing.assert_allclose(clean.cov[9:, 9:], np.diag(bias_walk), rtol=1e-9, atol=1e-18)
+
+
+def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: State, end: State, k: int) -> tuple[Array, ...]:
+    """Return the factor's residual (15,) between two states and the transition and noise (15, 15) it implies."""
+    values = gtsam.Values()
+    for index, state in ((k - 1, start), (k, end)):
+        values.insert(X(index), gtsam.Pose3(state.T_world_imu))
+        values.insert(V(index), state.v_world)
+        values.insert(B(index), gtsam.imuBias.ConstantBias(state.bias[:3], state.bias[3:]))
+    whitened, _ = factor.linearize(values).jacobian()
+    jacobian = np.linalg.solve(factor.noiseModel().R(), whitened)
+    poses, velocities, biases = (jacobian[:, i : i + w] for i, w in ((0, 6), (6, 3), (18, 6)))
+    d_start = np.hstack([poses, velocities @ start.T_world_imu[:3, :3], biases])
+    poses, velocities, biases = (jacobian[:, i : i + w] for i, w in ((9, 6), (15, 3), (24, 6)))
+    d_end = np.hstack([poses, velocities @ end.T_world_imu[:3, :3], biases])
+    assert list(factor.keys()) == [X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k)]
+    noise_at_end = np.linalg.solve(d_end, np.linalg.solve(d_end, factor.noiseModel().covariance()).T)
+    return factor.unwhitenedError(values), -np.linalg.solve(d_end, d_start), noise_at_end
+
+
+def test_filter_equals_gtsams_factor_on_every_interval_of_kitti00():
+    sequence = load_sequence("kitti00")
+    prior = start_from_measurements(sequence)
+    params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
+    start, compared = State(prior.T_world_imu, prior.v_world, prior.bias), 0
+    for packet in sequence.packets():
+        if packet.motion is None:
+            continue
+        preintegration = imu.preintegrate(packet.motion, prior.bias, params)
+        step = imu.predict(preintegration, *start)
+        end = State(step.T_world_imu, step.v_world, start.bias)
+        factor = factors.imu_factor(preintegration, packet.index)
+        residual, transition, noise = factor_in_filter_terms(factor, start, end, packet.index)
+        # 1e-9 is the promise of docs; double precision gives 1e-14 on entries of the order of 1.
+        np.testing.assert_allclose(residual, 0.0, atol=1e-9)
+        np.testing.assert_allclose(step.transition, transition, rtol=0.0, atol=1e-9)
+        # Variances of rotation, velocity and bias differ by many orders: compare correlations.
+        sigma = np.sqrt(np.diag(noise))
+        np.testing.assert_allclose(step.cov / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=1e-9)
+        start, compared = end, compared + 1
+    assert compared == sequence.frame_count - 1
+
+
+def drift_m(rate_hz: float) -> float:
+    """Return where 5 s of exact IMU samples of the flight lead, integrated at once, against the truth."""
+    scenario = noise_free(replace(FLIGHT, duration_s=5.0))
+    sequence = simulate(replace(scenario, motion=replace(scenario.motion, rate_hz=rate_hz)), 0)
+    state = State(sequence.prior.T_world_imu, sequence.prior.v_world, np.zeros(6))
+    for packet in sequence.packets():
+        if packet.motion is not None:
+            state = predicted(imu.preintegrate(packet.motion, np.zeros(6), PARAMS), state)
+    return float(np.linalg.norm(state.T_world_imu[:3, 3] - sequence.truth.T_world_imu[-1, :3, 3]))
+
+
+def test_integration_is_of_second_order():
+    """Halving the sample interval divides the error by four; a first-order rule divides it by two."""
+    coarse, fine = drift_m(100.0), drift_m(200.0)
+    assert coarse / fine == pytest.approx(4.0, rel=0.1)  # what is left is of the next even order
+    assert fine < 1e-3

@@ -1,0 +1,170 @@
+"""The twist model: kinematics, Jacobian and noise of an interval, and that they are those of its GTSAM factor."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log
+from toolkit.models import factors, twist
+from toolkit.models.factors import B, X
+from toolkit.sequence import TwistMotion, TwistNoise
+from toolkit.simulation import DRIVE, simulate
+
+NOISE = TwistNoise(np.array([0.05, 0.03, 0.02]), np.array([0.004, 0.002, 0.006]), np.full(3, 1e-4))
+BIAS = np.array([0.01, -0.02, 0.015])
+
+
+@pytest.fixture
+def motion() -> TwistMotion:
+    """Four uneven pieces with fast turns, so that every Lie-group term counts."""
+    rng = np.random.default_rng(3)
+    return TwistMotion(rng.uniform(0.05, 0.15, 4), 8.0 * rng.standard_normal((4, 3)), 2.0 * rng.standard_normal((4, 3)))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return simulate(DRIVE, 0)
+
+
+def test_pose_follows_the_exponential_of_each_twist(drive):
+    """Kang, eq. 1, with GTSAM's exponential map."""
+    compared = 0
+    for packet in drive.packets():
+        if packet.motion is None:
+            continue
+        expected = gtsam.Pose3()
+        for dt_s, v_mps, w_radps in zip(packet.motion.dt_s, packet.motion.v_mps, packet.motion.w_radps, strict=True):
+            expected = expected.compose(gtsam.Pose3.Expmap(dt_s * np.concatenate([w_radps - BIAS, v_mps])))
+        step = twist.integrate(packet.motion, BIAS, drive.noise)
+        # Two closed forms of the same series on steps of 1 m: the last digits.
+        np.testing.assert_allclose(step.T_start_end, expected.matrix(), atol=1e-13)
+        compared += 1
+    assert compared == drive.frame_count - 1
+
+
+def test_bias_jacobian_is_the_derivative(motion, numerical_jacobian):
+    step = twist.integrate(motion, BIAS, NOISE)
+
+    def moved(delta: Array) -> Array:
+        return se3_log(se3_inverse(step.T_start_end) @ twist.integrate(motion, BIAS + delta, NOISE).T_start_end)
+
+    # Entries of the order of 1 over values of the order of 1.
+    np.testing.assert_allclose(step.d_step_d_bias, numerical_jacobian(moved, 3), atol=1e-9)
+
+
+def test_covariance_carries_each_samples_noise_to_the_end(motion, numerical_jacobian):
+    """J Q J^T with the whole Jacobian of the end in all samples, found numerically."""
+    step = twist.integrate(motion, BIAS, NOISE)
+
+    def moved(delta: Array) -> Array:
+        w, v = np.split(delta.reshape(-1, 6), 2, axis=1)
+        noisy = TwistMotion(motion.dt_s, motion.v_mps + v, motion.w_radps + w)
+        return se3_log(se3_inverse(step.T_start_end) @ twist.integrate(noisy, BIAS, NOISE).T_start_end)
+
+    jacobian = numerical_jacobian(moved, 24)
+    density_squared = np.concatenate([NOISE.gyro_noise_density, NOISE.velocity_noise_density]) ** 2
+    of_samples = np.concatenate([density_squared / dt_s for dt_s in motion.dt_s])
+    expected = (jacobian * of_samples) @ jacobian.T
+    np.testing.assert_allclose(step.cov, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_covariance_is_that_of_drawn_noise(motion):
+    rng, draws = np.random.default_rng(5), 1500
+    step = twist.integrate(motion, BIAS, NOISE)
+    errors = np.empty((draws, 6))
+    for i in range(draws):
+        root_dt = np.sqrt(motion.dt_s)[:, None]
+        v_mps = motion.v_mps + NOISE.velocity_noise_density * rng.standard_normal((4, 3)) / root_dt
+        w_radps = motion.w_radps + NOISE.gyro_noise_density * rng.standard_normal((4, 3)) / root_dt
+        end = twist.integrate(TwistMotion(motion.dt_s, v_mps, w_radps), BIAS, NOISE).T_start_end
+        errors[i] = se3_log(se3_inverse(step.T_start_end) @ end)
+    normal = np.linalg.solve(np.linalg.cholesky(step.cov), errors.T)
+    # Entries of the sample covariance of 1500 draws have a standard error of 0.026 (0.037 on the diagonal): five.
+    np.testing.assert_allclose(normal @ normal.T / draws, np.eye(6), atol=0.18)
+
+
+def test_noise_of_an_interval_does_not_depend_on_how_it_is_cut():
+    """A held twist cut in two is the same motion with the same noise: what a continuous density means."""
+    v_mps, w_radps = np.array([[7.0, 0.5, -0.2]]), np.array([[0.1, -0.2, 0.9]])
+    whole = twist.integrate(TwistMotion(np.array([0.1]), v_mps, w_radps), BIAS, NOISE)
+    halves = TwistMotion(np.array([0.04, 0.06]), np.repeat(v_mps, 2, axis=0), np.repeat(w_radps, 2, axis=0))
+    cut = twist.integrate(halves, BIAS, NOISE)
+    np.testing.assert_allclose(cut.T_start_end, whole.T_start_end, atol=1e-14)
+    np.testing.assert_allclose(cut.d_step_d_bias, whole.d_step_d_bias, atol=1e-14)
+    # Between the cuts the first part's noise is carried on by the motion, in one piece it acts on average: the
+    # difference is of second order in the step, (0.7 m)^2 of the rotation's variance.
+    assert np.abs(cut.cov - whole.cov).max() < 0.5 * 0.7**2 * whole.cov[:3, :3].max()
+    np.testing.assert_allclose(cut.cov[:3, :3], whole.cov[:3, :3], rtol=0.01, atol=0.01 * whole.cov[0, 0])
+
+
+def test_bias_walk_grows_with_time():
+    np.testing.assert_allclose(twist.bias_walk_cov(NOISE, 0.5), np.diag(np.full(3, 0.5e-8)), rtol=1e-12)
+
+
+def values_of(start: Array, end: Array, bias: Array) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(X(4), gtsam.Pose3(start))
+    values.insert(X(5), gtsam.Pose3(end))
+    values.insert(B(4), bias)
+    return values
+
+
+def unwhitened(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> Array:
+    """Return the Jacobian (6, 15) in start, end and bias."""
+    whitened, _ = factor.linearize(values).jacobian()
+    jacobian: Array = np.linalg.solve(factor.noiseModel().R(), whitened)
+    return jacobian
+
+
+def test_factor_equals_the_filters_prediction_on_every_interval_of_the_drive(drive):
+    """Zero residual at the prediction, and there the filter's transition and noise (see test_imu)."""
+    start, compared = drive.truth.T_world_imu[0], 0
+    for packet in drive.packets():
+        if packet.motion is None:
+            continue
+        step = twist.integrate(packet.motion, BIAS, drive.noise)
+        factor, end = factors.twist_factor(step, BIAS, 5), start @ step.T_start_end
+        values = values_of(start, end, BIAS)
+        d_start, d_end, d_bias = np.split(unwhitened(factor, values), [6, 12], axis=1)
+        np.testing.assert_allclose(factor.unwhitenedError(values), 0.0, atol=1e-9)
+        # Adjoints hold positions up to the drive's extent of 300 m; in them 1e-9 is twelve digits.
+        transition = se3_adjoint(se3_inverse(step.T_start_end))
+        np.testing.assert_allclose(-np.linalg.solve(d_end, d_start), transition, atol=1e-9)
+        np.testing.assert_allclose(-np.linalg.solve(d_end, d_bias), step.d_step_d_bias, atol=1e-9)
+        np.testing.assert_allclose(factor.noiseModel().covariance(), step.cov, rtol=1e-9, atol=1e-9 * step.cov.max())
+        start, compared = end, compared + 1
+    assert compared == drive.frame_count - 1
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-4, 0.05, 0.5])
+def test_factor_jacobians_are_derivatives_away_from_the_prediction(motion, size, numerical_jacobian):
+    rng = np.random.default_rng(11)
+    step = twist.integrate(motion, BIAS, NOISE)
+    start = se3_exp(rng.standard_normal(6))
+    end = start @ step.T_start_end @ se3_exp(size * rng.standard_normal(6))
+    bias = BIAS + 0.1 * size * rng.standard_normal(3)
+    factor = factors.twist_factor(step, BIAS, 5)
+
+    def residual(delta: Array) -> Array:
+        moved = values_of(start @ se3_exp(delta[:6]), end @ se3_exp(delta[6:12]), bias + delta[12:])
+        return np.asarray(factor.unwhitenedError(moved))
+
+    found = unwhitened(factor, values_of(start, end, bias))
+    numerical = numerical_jacobian(residual, 15)
+    np.testing.assert_allclose(found[:, :12], numerical[:, :12], atol=1e-8)
+    # The factor leaves out the derivative of exp at the step's change c: J_r(c) = 1 - ad(c) / 2 + ...
+    change = step.d_step_d_bias @ (bias - BIAS)
+    left_out = np.linalg.norm(change) * np.abs(step.d_step_d_bias).max()
+    np.testing.assert_allclose(found[:, 12:], numerical[:, 12:], atol=1e-8 + left_out)
+
+
+def test_factor_and_walk_stand_between_the_right_variables():
+    step = twist.integrate(TwistMotion(np.array([0.1]), np.ones((1, 3)), np.ones((1, 3))), BIAS, NOISE)
+    assert list(factors.twist_factor(step, BIAS, 5).keys()) == [X(4), X(5), B(4)]
+    walk = factors.gyro_bias_walk_factor(NOISE, 0.25, 5)
+    assert list(walk.keys()) == [B(4), B(5)]
+    np.testing.assert_allclose(walk.noiseModel().covariance(), twist.bias_walk_cov(NOISE, 0.25), rtol=1e-12, atol=1e-20)
+    values = gtsam.Values()
+    values.insert(B(4), np.array([1.0, 2.0, 3.0]))
+    values.insert(B(5), np.array([1.5, 2.0, 2.0]))
+    np.testing.assert_allclose(walk.unwhitenedError(values), [0.5, 0.0, -1.0], atol=1e-15)
