@@ -12,7 +12,7 @@ from filters.graph.landmarks import restricted, worth_smoothing
 from filters.graph.motion import motion_graph
 from filters.graph.robust import solve_in_stages
 from filters.kalman.decoupled import DecoupledEkf
-from toolkit.estimate import Estimate, Finished, Landmarks
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
@@ -41,7 +41,7 @@ class Batch:
         """Remember the packet and carry the causal pass on; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
-        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.rejected)
+        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched)
         self._frames.append(restricted(packet.frame, passed))
 
     def finish(self) -> Finished:
@@ -50,9 +50,9 @@ class Batch:
         track_ids = worth_smoothing(self._frames, known)
         frames = [restricted(f, np.isin(f.track_ids, track_ids)) for f in self._frames]
         solution = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
-        stamps_ns = [p.frame.t_ns for p in self._packets]
+        states = [self._motion.read(solution.values, p.index, p.frame.t_ns) for p in self._packets]
         points = np.array([solution.values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
-        return Finished(self._motion.read(solution.values, stamps_ns), Landmarks(track_ids, points), solution.converged)
+        return Finished(Trajectory.of(states), Landmarks(track_ids, points), solution.converged)
 
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""

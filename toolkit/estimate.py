@@ -88,6 +88,12 @@ class Landmarks:
         return self.track_ids.size
 
     @classmethod
+    def of(cls, points: Mapping[int, Array]) -> "Landmarks":
+        """Collect landmarks from a mapping of track id to point (3,)."""
+        ids = np.array(sorted(points), dtype=np.int64)
+        return cls(ids, np.array([points[i] for i in ids.tolist()]).reshape(-1, 3))
+
+    @classmethod
     def none(cls) -> "Landmarks":
         """Return a map without landmarks."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))

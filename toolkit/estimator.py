@@ -2,14 +2,15 @@
 
 An installed package announces, in the entry-point group ``toolkit.estimators``, a package whose modules are
 estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its
-summary and its function ``build(setup)`` makes one.
+summary and its function ``build(setup)`` makes one. A module may also stand on the ladder, in which every rung
+changes one thing: the constant ``RUNG`` is its place, ``CHANGE`` what it changes against the rung before.
 """
 
 import ast
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -21,6 +22,8 @@ from toolkit.geometry import Array
 from toolkit.sequence import MotionNoise, Packet, Prior, StereoRig
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
+# Among the names of estimators to compare, this word stands for all that have a rung.
+LADDER = "ladder"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +60,33 @@ class EstimatorEntry:
 
     def summary(self) -> str:
         """Return the first line of the module's docstring, without importing the module."""
-        docstring = ast.get_docstring(ast.parse(self.path.read_text(encoding="utf-8"))) or ""
-        return docstring.partition("\n")[0]
+        return (ast.get_docstring(self._tree()) or "").partition("\n")[0]
+
+    def rung(self) -> int | None:
+        """Return the estimator's place on the ladder, or None; read without importing the module, as is all here."""
+        rung = self._constants().get("RUNG")
+        return rung if isinstance(rung, int) else None
+
+    def change(self) -> str:
+        """Return what the estimator changes against the rung before it; empty where the module does not say."""
+        change = self._constants().get("CHANGE")
+        return change if isinstance(change, str) else ""
+
+    def _tree(self) -> ast.Module:
+        return ast.parse(self.path.read_text(encoding="utf-8"))
+
+    def _constants(self) -> dict[str, object]:
+        """Return the module's top-level assignments of literals, alone or in tuples, by name."""
+        found: dict[str, object] = {}
+        for statement in self._tree().body:
+            if isinstance(statement, ast.Assign):
+                pairs = [pair for target in statement.targets for pair in _paired(target, statement.value)]
+            elif isinstance(statement, ast.AnnAssign) and statement.value is not None:
+                pairs = _paired(statement.target, statement.value)
+            else:
+                continue
+            found |= {t.id: v.value for t, v in pairs if isinstance(t, ast.Name) and isinstance(v, ast.Constant)}
+        return found
 
     def load(self) -> Build:
         """Import the estimator and return its ``build``.
@@ -91,6 +119,28 @@ def discover() -> dict[str, EstimatorEntry]:
                 name = module.name.replace("_", "-")
                 found[name] = EstimatorEntry(name, f"{package}.{module.name}", Path(folder) / f"{module.name}.py")
     return dict(sorted(found.items()))
+
+
+def _paired(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:
+    """Pair each name on the left of an assignment with its expression on the right."""
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
+        return list(zip(target.elts, value.elts, strict=True))
+    return [(target, value)]
+
+
+def ladder() -> tuple[EstimatorEntry, ...]:
+    """Return every estimator that stands on the ladder, from the lowest rung up."""
+    on_it = [(rung, name, entry) for name, entry in discover().items() if (rung := entry.rung()) is not None]
+    return tuple(entry for _, _, entry in sorted(on_it, key=lambda placed: placed[:2]))
+
+
+def find_all(names: Iterable[str]) -> dict[str, EstimatorEntry]:
+    """Return the estimators of the names, each once and in their order; LADDER stands for all of its rungs."""
+    found: dict[str, EstimatorEntry] = {}
+    for name in names:
+        for entry in ladder() if name == LADDER else (find(name),):
+            found.setdefault(entry.name, entry)
+    return found
 
 
 def find(name: str) -> EstimatorEntry:

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray
-from toolkit.sequence import NS_PER_S, TwistNoise
+from toolkit.sequence import TwistNoise
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
 TRACKED_PIXEL_SIGMA_PX = 0.5

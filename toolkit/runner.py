@@ -98,11 +98,11 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
     if not finished.converged:
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
-    for output, trajectory in (("causal", causal), ("final", finished.trajectory)):
-        reason = None if trajectory is None else contradiction(trajectory, sequence)
+    reasons = [None if t is None else contradiction(t, sequence) for t in (causal, finished.trajectory)]
+    for reason in dict.fromkeys(reasons):
         if reason is not None:
             status = "diverged"
-            log.append(f"the {output} trajectory diverged: {reason}")
+            log.append(f"the trajectory diverged: {reason}")
     return Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
 
 

@@ -6,7 +6,6 @@ from all of them and serves the held-out reprojection error.
 """
 
 import hashlib
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -14,14 +13,22 @@ from typing import Literal, Self
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S, Pairing, cut_at
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, read_only
+from toolkit.geometry import (
+    Array,
+    BoolArray,
+    IntArray,
+    quaternion_from_rotation,
+    read_only,
+    rotation_from_quaternion,
+    se3,
+)
 
-NS_PER_S = 1_000_000_000
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
-
-Pairing = Literal["start", "end", "mean"]
+# A calibration written with three decimals is off by less; a product of doubles is off by no more.
+_MOST_ROTATION_DEFECT, _ORTHONORMAL = 5e-3, 1e-14
 
 
 def _freeze(value: object, **shapes: tuple[int | None, ...]) -> None:
@@ -37,6 +44,22 @@ def _freeze(value: object, **shapes: tuple[int | None, ...]) -> None:
             wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
             raise DataError(f"{type(value).__name__}.{name} has shape {array.shape}, expected {wanted}")
         object.__setattr__(value, name, array)
+
+
+def _rigid(T_imu_cam: Array) -> Array:
+    """Return an extrinsic with its rotation made orthonormal: files write it with few decimals.
+
+    Raises DataError where it is no rigid motion at all.
+    """
+    if T_imu_cam.shape != (4, 4):
+        return T_imu_cam
+    rotation = T_imu_cam[:3, :3]
+    defect = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (defect < _MOST_ROTATION_DEFECT and np.linalg.det(rotation) > 0.0):
+        raise DataError("T_imu_cam is not a rigid motion: its rotation is not orthonormal; check the calibration")
+    if defect < _ORTHONORMAL:
+        return T_imu_cam
+    return se3(rotation_from_quaternion(quaternion_from_rotation(rotation)), T_imu_cam[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +80,7 @@ class StereoRig:
     cov_uv_px2: Array
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "T_imu_cam", _rigid(np.asarray(self.T_imu_cam, dtype=float)))
         _freeze(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
 
 
@@ -247,7 +271,7 @@ class Provenance:
 class Sequence:
     """One recording: calibration, noise, frame stamps (K,), sightings, motion samples, and truth if there is any.
 
-    A sequence may still carry the faults of its file (see :mod:`toolkit.datasets.audit`); only
+    A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only
     :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2.
     """
 
@@ -365,23 +389,7 @@ def check_runnable(sequence: Sequence) -> None:
 def _cut(samples: MotionSamples, frames_t_ns: IntArray) -> Iterator[Motion]:
     """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
     twist = isinstance(samples, TwistSamples)
-    pairing: Pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
-    inside = samples.t_ns[(samples.t_ns > frames_t_ns[0]) & (samples.t_ns < frames_t_ns[-1])]
-    knots = np.union1d(inside, frames_t_ns)
-    dt_s = np.diff(knots) / NS_PER_S
-    rows = _paired(samples.t_ns, samples.values, knots, pairing)
-    starts = np.searchsorted(knots, frames_t_ns)
-    for begin, end in itertools.pairwise(starts):
-        part = (read_only(dt_s[begin:end]), read_only(rows[begin:end, :3]), read_only(rows[begin:end, 3:]))
+    pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
+    for dt_s, rows in cut_at(frames_t_ns, samples.t_ns, samples.values, pairing):
+        part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]))
         yield TwistMotion(*part) if twist else ImuMotion(*part)
-
-
-def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing) -> Array:
-    """Return the value (n, 6) that stands for each of the n intervals between knots."""
-    if pairing == "start":
-        return values[np.searchsorted(t_ns, knots[:-1], side="right") - 1]
-    if pairing == "end":
-        return values[np.searchsorted(t_ns, knots[1:], side="left")]
-    relative_s, knots_s = (t_ns - knots[0]) / NS_PER_S, (knots - knots[0]) / NS_PER_S
-    at_knots: Array = np.stack([np.interp(knots_s, relative_s, column) for column in values.T], axis=1)
-    return 0.5 * (at_knots[:-1] + at_knots[1:])

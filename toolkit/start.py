@@ -10,11 +10,12 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp, transform
 from toolkit.models import factors, imu, stereo
 from toolkit.models.factors import B, L, V, X
-from toolkit.sequence import NS_PER_S, ImuMotion, ImuNoise, Packet, Prior, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import ImuMotion, ImuNoise, Packet, Prior, Sequence, StereoFrame, StereoRig
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
 # What the gauge is held to (rad, m), and what is thought of biases before any measurement (m/s^2, rad/s).

@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from filters.kalman.landmarks import LEAST_DISPARITY_PX
 from toolkit.estimate import Landmarks
 from toolkit.geometry import BoolArray, IntArray
 from toolkit.models import stereo
 from toolkit.sequence import StereoFrame
 
-# A landmark that was never nearer than this, or seen only once, ties no poses together: it only slows the solve.
-LEAST_DISPARITY_PX, FEWEST_SIGHTINGS = 2.0, 2
+# A landmark seen only once ties no poses together: it only slows the solve.
+FEWEST_SIGHTINGS = 2
 
 
 def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:

@@ -10,7 +10,7 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from toolkit.estimate import Estimate, Trajectory
+from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import factors, imu, twist
@@ -30,8 +30,8 @@ class MotionGraph(Protocol):
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""
 
-    def read(self, values: gtsam.Values, stamps_ns: list[int]) -> Trajectory:
-        """Return states 0, 1, ... with their stamps."""
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        """Return state k."""
 
 
 def motion_graph(setup: Setup) -> MotionGraph:
@@ -39,10 +39,6 @@ def motion_graph(setup: Setup) -> MotionGraph:
     if isinstance(setup.noise, TwistNoise):
         return _TwistGraph(setup.noise, setup.prior)
     return _ImuGraph(setup.noise, setup.prior, setup.gravity_world)
-
-
-def _poses(values: gtsam.Values, count: int) -> Array:
-    return np.stack([values.atPose3(X(k)).matrix() for k in range(count)])
 
 
 def _pose_prior(prior: Prior) -> gtsam.NonlinearFactor:
@@ -70,10 +66,9 @@ class _TwistGraph:
         values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
         values.insert(B(k), estimate.bias[3:])
 
-    def read(self, values: gtsam.Values, stamps_ns: list[int]) -> Trajectory:
-        gyro_bias = np.stack([values.atVector(B(k)) for k in range(len(stamps_ns))])
-        bias = np.hstack([np.zeros_like(gyro_bias), gyro_bias])
-        return Trajectory(np.array(stamps_ns), _poses(values, len(stamps_ns)), bias=bias)
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        bias = np.concatenate([np.zeros(3), values.atVector(B(k))])
+        return Estimate(t_ns, values.atPose3(X(k)).matrix(), bias=bias)
 
 
 class _ImuGraph:
@@ -104,11 +99,9 @@ class _ImuGraph:
         values.insert(V(k), estimate.v_world)
         values.insert(B(k), _constant_bias(estimate.bias))
 
-    def read(self, values: gtsam.Values, stamps_ns: list[int]) -> Trajectory:
-        count = len(stamps_ns)
-        v_world = np.stack([values.atVector(V(k)) for k in range(count)])
-        bias = np.stack([values.atConstantBias(B(k)).vector() for k in range(count)])
-        return Trajectory(np.array(stamps_ns), _poses(values, count), v_world, bias)
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        pose, velocity, bias = values.atPose3(X(k)), values.atVector(V(k)), values.atConstantBias(B(k))
+        return Estimate(t_ns, pose.matrix(), v_world=velocity, bias=bias.vector())
 
 
 def _constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:

@@ -18,12 +18,11 @@ from toolkit.sequence import StereoRig
 
 
 class PoseCorrection(NamedTuple):
-    """The corrected belief, who passed the gate (N,), and the sum of their NIS with its degrees of freedom."""
+    """The corrected belief, who passed the gate (N,), and the NIS (N,) of every sighting, of three degrees each."""
 
     belief: Belief
     accepted: BoolArray
-    nis: float
-    nis_dof: int
+    nis: Array
 
 
 def correct_pose(belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig) -> PoseCorrection:
@@ -38,7 +37,7 @@ def correct_pose(belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: Ste
     accepted = (nis < STEREO_GATE) & (predicted.depth_m > 0.0)
     weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov)), 0.0)
     corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
-    return PoseCorrection(corrected, accepted, float(nis[accepted].sum()), 3 * int(accepted.sum()))
+    return PoseCorrection(corrected, accepted, nis)
 
 
 def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:

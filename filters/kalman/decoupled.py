@@ -8,12 +8,18 @@ import numpy as np
 
 from filters.kalman.belief import initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
+from filters.kalman.diagnostics import Innovation
+from filters.kalman.gate import STEREO_GATE
 from filters.kalman.landmarks import TrackedMap
 from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.sequence import Packet
+
+# This filter is too sure of itself for its gate to speak for a smoother, which relinearises: only a sighting this
+# many times beyond the gate is a mismatch to every estimator.
+MISMATCH_FACTOR = 4.0
 
 
 class DecoupledEkf:
@@ -24,7 +30,7 @@ class DecoupledEkf:
         self._predictor = predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
-        self._rejected: IntArray = np.empty(0, dtype=np.int64)
+        self._mismatched: IntArray = np.empty(0, dtype=np.int64)
 
     @property
     def bias(self) -> Array:
@@ -32,22 +38,24 @@ class DecoupledEkf:
         return self._belief.bias
 
     @property
-    def rejected(self) -> IntArray:
-        """Return the ids of the tracks whose sighting in the last frame did not pass the gate."""
-        return self._rejected
+    def mismatched(self) -> IntArray:
+        """Return the ids of the tracks whose sighting in the last frame is beyond all doubt a mismatch."""
+        return self._mismatched
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
             self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
         seen, uvs_px = self._map.seen_again(packet.frame)
-        nis, nis_dof, accepted = np.nan, 0, np.ones(len(seen), dtype=bool)
+        self._mismatched = np.empty(0, dtype=np.int64)
+        innovation = Innovation()
         if len(seen):
-            self._belief, accepted, nis, nis_dof = correct_pose(self._belief, seen, uvs_px, self._rig)
+            self._belief, accepted, nis = correct_pose(self._belief, seen, uvs_px, self._rig)
+            innovation.add(nis, np.full(len(seen), 3), accepted)
+            self._mismatched = seen.track_ids[nis > MISMATCH_FACTOR * STEREO_GATE]
             seen = correct_landmarks_gated(seen, uvs_px, self._belief, self._rig, accepted)
-        self._rejected = seen.track_ids[~accepted]
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
-        return self._belief.estimate(packet.frame.t_ns, nis=nis, nis_dof=nis_dof)
+        return self._belief.estimate(packet.frame.t_ns, **innovation.info())
 
     def landmarks(self) -> Landmarks:
         """Return every landmark the filter ever had, as it last knew it."""

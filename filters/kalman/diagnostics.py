@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, IntArray
 
@@ -46,5 +44,4 @@ class LandmarkMemory:
 
     def landmarks(self) -> Landmarks:
         """Return them all."""
-        ids = np.array(sorted(self.points), dtype=np.int64)
-        return Landmarks(ids, np.array([self.points[i] for i in ids.tolist()]).reshape(-1, 3))
+        return Landmarks.of(self.points)

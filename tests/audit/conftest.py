@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.sequence import NS_PER_S, Observations, Sequence, TwistSamples
+from toolkit.sequence import Observations, Sequence, TwistSamples
 from toolkit.simulation import SCENARIOS, simulate
 
 DURATION_S = 30.0

@@ -22,6 +22,13 @@ def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:
         assert violations(json.loads((path / "metrics.json").read_text())) == []
 
 
+def test_several_sequences_take_the_place_of_an_earlier_run_of_theirs(vislam: Vislam) -> None:
+    for _ in range(2):
+        assert vislam("compare", "drive", "drive-imu", *DEAD_RECKONING, "--out", "all") == 0
+    Path("file").touch()
+    assert vislam("compare", "drive", "drive-imu", *DEAD_RECKONING, "--out", "file") == 4
+
+
 def test_results_go_to_a_new_directory_each_time(vislam: Vislam) -> None:
     for _ in range(2):
         assert vislam("compare", "drive", *DEAD_RECKONING) == 0

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.cutting import NS_PER_S
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
-from toolkit.sequence import NS_PER_S, ImuNoise, ImuSamples
+from toolkit.sequence import ImuNoise, ImuSamples
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import scipy.io
 
+from toolkit.cutting import NS_PER_S
 from toolkit.datasets import load_sequence, utias_mat
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
-from toolkit.sequence import NS_PER_S, Sequence, TwistNoise, TwistSamples
+from toolkit.sequence import Sequence, TwistNoise, TwistSamples
 
 DRIVES = [
     ("2011_09_26_drive_0001_sync_KLT", 108, 707, 10501),

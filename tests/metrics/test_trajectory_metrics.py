@@ -55,6 +55,20 @@ def test_with_an_imu_a_heading_is_free_and_a_tilt_is_an_error(make_sequence, dri
         assert score(sequence, tilted).values[key] > 1.2 * as_is[key]
 
 
+@pytest.mark.parametrize(
+    ("motion", "tilt_rad", "remarked"), [("imu", 0.05, True), ("imu", 0.0, False), ("twist", 0.05, False)]
+)
+def test_worlds_that_disagree_on_a_measured_vertical_are_remarked(
+    make_sequence, drive, perturb, score, motion, tilt_rad, remarked
+):
+    sequence = make_sequence(drive(400), track_count=3, motion=motion)
+    estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)
+    notes = score(sequence, se3_exp(np.array([0.0, tilt_rad, 0.0, 0.0, 0.0, 0.0])) @ estimate).notes
+    for key in ("ate_none_m", "ate_yaw_m"):
+        assert ("differ by about 3 deg" in notes.get(key, "")) == remarked
+    assert "ate_se3_m" not in notes
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_heading_fit_is_the_least_squares_one(seed):
     rng = np.random.default_rng(seed)

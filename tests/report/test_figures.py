@@ -1,5 +1,6 @@
 """Figures show the data: the same colours everywhere, equal scale from above, no point squashing the rest."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,10 @@ import pytest
 
 from toolkit.estimate import Landmarks
 from toolkit.geometry import about_z, se3
-from toolkit.report.comparison import Comparison
+from toolkit.report.comparison import Comparison, Row
 from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
 from toolkit.report.figures.alignment import errors_to, onto_truth, truth_during
-from toolkit.report.figures.style import colour_of
+from toolkit.report.figures.style import colour_of, width_of
 
 
 def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparison) -> None:
@@ -47,6 +48,34 @@ def test_aligned_errors_vanish_where_only_yaw_and_position_differ(comparison: Co
     # Positions of 100 m and a fitted angle: some 1e-16 relative of each.
     assert errors.position_m.max() < 1e-10
     assert np.abs(errors.heading_deg).max() < 1e-9
+
+
+def test_equal_lines_do_not_hide_each_other(comparison: Comparison) -> None:
+    widths = [width_of(comparison, run.estimator) for run in comparison.runs]
+    assert all(above < below for below, above in itertools.pairwise(widths))
+
+
+def test_estimators_that_agree_to_rounding_look_so(without_truth: Comparison) -> None:
+    late = without_truth.runs[1]
+    assert late.final is not None
+    rounded = replace(late.final, T_world_imu=late.final.T_world_imu * (1.0 + 1e-15))
+    twins = (replace(late, estimator="twin", final=rounded), late)
+    rows = tuple(Row(run, "final", without_truth.rows[-1].scores) for run in twins)
+    (drawn,) = errors_over_time.draw(replace(without_truth, runs=twins, rows=rows))
+    position, heading = drawn.figure.axes
+    assert position.get_ylim()[1] >= 1e-3
+    assert heading.get_ylim()[1] >= 1e-2
+
+
+def test_one_slow_step_at_the_end_does_not_bend_the_running_median(comparison: Comparison) -> None:
+    steady = comparison.runs[0]
+    step_s = np.full(steady.timings.step_s.size, 1e-3)
+    step_s[[0, -1]] = 1.0
+    slow = replace(steady, timings=replace(steady.timings, step_s=step_s))
+    (drawn,) = frame_times.draw(replace(comparison, runs=(slow,)))
+    dots, median = drawn.figure.axes[0].get_lines()
+    assert np.max(dots.get_ydata()) == pytest.approx(1e3)
+    assert np.max(median.get_ydata()) == pytest.approx(1.0)
 
 
 def test_without_truth_the_figure_says_it_shows_differences(without_truth: Comparison) -> None:

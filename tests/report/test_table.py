@@ -3,10 +3,11 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from toolkit.metrics import Scores
-from toolkit.report.comparison import Comparison
+from toolkit.report.comparison import Comparison, Row
 from toolkit.report.report_md import report_text
 from toolkit.report.table import COLUMNS, as_markdown, as_text, comparison_table
 from toolkit.report.terminal import comparison_text
@@ -84,3 +85,29 @@ def test_audit_start_and_facts_are_told(comparison: Comparison) -> None:
         assert comparison.findings[0].detail in words
         assert comparison.prior.source in words
         assert all(fact in words for fact in comparison.sequence.provenance.facts)
+
+
+def test_a_recording_without_image_features_says_so(comparison: Comparison) -> None:
+    sequence = comparison.sequence
+    blind = replace(sequence, observations=sequence.observations.select(np.zeros(len(sequence.observations), bool)))
+    for text in (
+        comparison_text(replace(comparison, sequence=blind)),
+        report_text(replace(comparison, sequence=blind), {}),
+    ):
+        assert "no image features" in text
+        assert "can only integrate the measured motion" in text
+
+
+def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(comparison: Comparison) -> None:
+    def remarked(row: Row) -> Row:
+        values = dict(row.scores.values) | {"ate_yaw_m": 1.0, "reproj_median_px": 1.0, "reproj_rmse_px": 1.0}
+        notes = {"ate_yaw_m": "tilted", "reproj_median_px": "half of them", "reproj_rmse_px": "half of them"}
+        return replace(row, scores=Scores(values, notes))
+
+    rows = tuple(remarked(row) for row in comparison.rows[:2])
+    told = replace(comparison, runs=comparison.runs[:1], rows=rows)
+    assert "ate_yaw_m: tilted" in comparison_text(told)
+    assert "half of them" not in comparison_text(told)
+    report = report_text(told, {})
+    assert "- reproj_median_px, reproj_rmse_px: half of them" in report
+    assert report.count("tilted") == 1

@@ -10,6 +10,9 @@ from toolkit.geometry import IntArray
 # What a cast of NaN to int64 gives.
 NOT_A_TIME = np.iinfo(np.int64).min
 
+# With more of the stamps late than this the order itself is wrong, not some of the stamps.
+MOST_LATE = 0.5
+
 
 def check(evidence: Evidence) -> Symptom | None:
     """Count the stamps that are not after all the stamps before them; sort, first of equals kept."""
@@ -17,6 +20,10 @@ def check(evidence: Evidence) -> Symptom | None:
     frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
     if frames + samples == 0:
         return None
+    detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
+    if max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
+        why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
     remedy = sequence
     if frames:
         remedy = keep_frames(remedy, _in_order(sequence.frames_t_ns))
@@ -24,7 +31,7 @@ def check(evidence: Evidence) -> Symptom | None:
         remedy = keep_samples(remedy, _in_order(sequence.motion.t_ns))
     return Symptom(
         count=frames + samples,
-        detail=f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them",
+        detail=detail,
         treatment="sorted by time; of equal stamps the first is kept; stamps that are no time are dropped",
         remedy=remedy,
     )

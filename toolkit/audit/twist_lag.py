@@ -14,8 +14,9 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
 from toolkit.audit.parts.robust import Scalar, slope
+from toolkit.cutting import Pairing
 from toolkit.geometry import BoolArray, IntArray
-from toolkit.sequence import Pairing, Sequence, TwistSamples
+from toolkit.sequence import Sequence, TwistSamples
 
 LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 # The lag must be known to this and differ from the present pairing's by so many standard errors.

@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults, names
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from toolkit.cli.arguments import Subcommands
+    from toolkit.report.session import Request
 
 SEQUENCES = ("kitti00", "drive")
 ESTIMATORS = ("dead-reckoning", "ekf", "batch")
@@ -38,7 +41,7 @@ def add_to(subcommands: Subcommands) -> None:
         metavar="NAME,...",
         type=names,
         default=ESTIMATORS,
-        help=f"what to compare, see 'vislam list' (default: {','.join(ESTIMATORS)})",
+        help=f"what to compare, see 'vislam list'; 'ladder' is every rung (default: {','.join(ESTIMATORS)})",
     )
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
     parser.add_argument("--out", metavar="DIR", type=Path, help="run directory (default: runs/<date and time>)")
@@ -51,6 +54,19 @@ def add_to(subcommands: Subcommands) -> None:
         help="where the first state comes from; a start from the truth is labelled (default: measurements)",
     )
     parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of simulated sequences (default: 0)")
+    parser.add_argument(
+        "--seeds",
+        metavar="N",
+        type=at_least(1),
+        default=1,
+        help="repeat simulated sequences over N seeds, from --seed",
+    )
+    parser.add_argument(
+        "--workers",
+        metavar="N",
+        type=at_least(1),
+        help="processes side by side with --seeds (default: one a CPU)",
+    )
     parser.set_defaults(command=command)
 
 
@@ -58,9 +74,7 @@ def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
     from toolkit.audit import faults
     from toolkit.cli.arguments import UsageError
-    from toolkit.report.progress import progress_on
-    from toolkit.report.session import Request, compare_all
-    from toolkit.report.terminal import comparison_text
+    from toolkit.report.session import Request
 
     if options.truth is not None and len(options.sequences) != 1:
         raise UsageError("--truth goes with exactly one SEQUENCE (see vislam compare --help)")
@@ -75,11 +89,43 @@ def command(options: argparse.Namespace) -> int:
         seed=options.seed,
         command=shlex.join(options.command_line),
     )
+    compared = _over_seeds(request, options) if options.seeds > 1 or options.workers is not None else _once(request)
     all_ok = True
-    for comparison, directory in compare_all(request, lambda label: progress_on(sys.stderr, label)):
-        print(comparison_text(comparison), f"\nresults: {directory}\n", sep="\n", flush=True)
-        all_ok = all_ok and comparison.all_ok
+    for text, directory, ok in compared:
+        print(text, f"\nresults: {directory}\n", sep="\n", flush=True)
+        all_ok = all_ok and ok
     return 0 if all_ok else 1
+
+
+def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
+    """Yield each comparison as text, where its results are, and whether every run ended well."""
+    from toolkit.report.progress import progress_on
+    from toolkit.report.session import compare_all
+    from toolkit.report.terminal import comparison_text
+
+    for comparison, directory in compare_all(request, lambda label: progress_on(sys.stderr, label)):
+        yield comparison_text(comparison), directory, comparison.all_ok
+
+
+def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple[str, Path, bool]]:
+    """Yield the same for each comparison over seeds; what cannot be repeated over seeds is a UsageError."""
+    from toolkit.cli.arguments import UsageError
+    from toolkit.report.progress import progress_on
+    from toolkit.report.seeds_md import seeds_text
+    from toolkit.report.seeds_session import OverSeedsRequest, compare_over_seeds
+    from toolkit.sweep.over_seeds import is_drawn_from_a_seed
+    from toolkit.sweep.processes import usable_cpus
+
+    if options.seeds == 1:
+        raise UsageError("--workers goes with --seeds of 2 and more (see vislam compare --help)")
+    if options.truth is not None:
+        raise UsageError("--truth and --seeds exclude each other: every seed has the truth of its own simulation")
+    for source in request.sources:
+        if not is_drawn_from_a_seed(source):
+            raise UsageError(f"--seeds repeats simulated sequences, and {source} is the same under every seed")
+    asked = OverSeedsRequest(request, options.seeds, options.workers or usable_cpus())
+    for over, directory in compare_over_seeds(asked, lambda label: progress_on(sys.stderr, label)):
+        yield seeds_text(over), directory, over.all_ok
 
 
 def _new_run() -> Path:

@@ -31,7 +31,7 @@ _T_CAM_IMU = np.array(
 )
 _FACTS = (
     "KITTI odometry 00, frames 14-153, from the gtsam wheel: real stereo tracks, real 100 Hz IMU",
-    "-1.6 % scale error in the tracks which stereo alone cannot see; "
+    "the tracks carry a scale error of -1.6 %, which stereo alone cannot see; "
     "stereo bundle adjustment ends with about 2.2 % drift",
     "camera and IMU clocks were aligned by yaw rate to +-5 ms",
 )

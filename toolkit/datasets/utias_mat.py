@@ -12,22 +12,14 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from toolkit.cutting import NS_PER_S
 from toolkit.datasets.parts.fields import Fields, check_frame_count, check_rigid
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
-from toolkit.sequence import (
-    NS_PER_S,
-    Observations,
-    Provenance,
-    Sequence,
-    StereoRig,
-    Truth,
-    TwistNoise,
-    TwistSamples,
-)
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
 
 _NOT_SEEN = -1.0
 _REQUIRED = (

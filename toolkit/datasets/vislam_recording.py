@@ -15,6 +15,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
+from toolkit.cutting import Pairing
 from toolkit.errors import DataError, OutputError
 from toolkit.geometry import Array
 from toolkit.sequence import (
@@ -23,7 +24,6 @@ from toolkit.sequence import (
     MotionNoise,
     MotionSamples,
     Observations,
-    Pairing,
     Prior,
     Provenance,
     Sequence,

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.common.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
 from toolkit.metrics.common.judged import Judged
 from toolkit.metrics.common.relative import angles_deg, lengths, relative_errors, rmse
 from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
-from toolkit.sequence import NS_PER_S
 
 ORDER = 20
 METRICS = {

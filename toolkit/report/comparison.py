@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from toolkit.audit import Finding
     from toolkit.estimate import Output, Run, Status
     from toolkit.metrics import Scores
@@ -36,7 +38,8 @@ class Comparison:
     """Several estimators on the same packets of one sequence, from the same start.
 
     ``sequence`` is what the estimators read, after any repair; ``findings`` is what the audit saw in the
-    recording before; ``rows`` are in the order of ``runs``, causal before final.
+    recording before; ``rows`` are in the order of ``runs``, causal before final. ``changes`` says, on a ladder
+    only, what each estimator changes against the rung before.
     """
 
     sequence: Sequence
@@ -44,6 +47,7 @@ class Comparison:
     prior: Prior
     runs: tuple[Run, ...]
     rows: tuple[Row, ...]
+    changes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def all_ok(self) -> bool:

@@ -10,6 +10,9 @@ from pathlib import Path
 import toolkit
 from toolkit.report.comparison import Comparison
 from toolkit.report.metrics_json import Json
+from toolkit.sequence import Sequence
+from toolkit.sweep.over_seeds import OverSeeds
+from toolkit.sweep.processes import usable_cpus
 
 SCHEMA = "vislam.manifest/1"
 _PACKAGES = {
@@ -25,26 +28,51 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 def build(comparison: Comparison, command: str, seed: int) -> Json:
     """Return the manifest of a comparison made by ``command`` with ``seed``."""
-    sequence = comparison.sequence
+    return {
+        **_made_by(command),
+        "sequence": _sequence(comparison.sequence),
+        "start": comparison.prior.source,
+        "estimators": [run.estimator for run in comparison.runs],
+        "seeds": {"sequence": seed},
+        "threads": {"cpus": usable_cpus(), **{name: os.environ.get(name) for name in _THREAD_VARIABLES}},
+        **_machine(),
+    }
+
+
+def build_over_seeds(over: OverSeeds, first: Sequence, command: str) -> Json:
+    """Return the manifest of a comparison over seeds; ``first`` is the recording of the first seed."""
+    return {
+        **_made_by(command),
+        "sequence": _sequence(first),
+        "start": over.start,
+        "estimators": list(over.estimators),
+        "seeds": {"sequence": over.seeds[0], "count": len(over.seeds)},
+        "threads": {"cpus": usable_cpus(), "workers": over.workers, "per_worker": 1},
+        **_machine(),
+    }
+
+
+def _made_by(command: str) -> Json:
     return {
         "schema": SCHEMA,
         "command": command,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"python": platform.python_version(), **{name: _version(p) for name, p in _PACKAGES.items()}},
         "git_revision": git_revision(Path(toolkit.__file__).parent),
-        "sequence": {
-            "name": sequence.name,
-            "hash": sequence.content_hash(),
-            "format": sequence.provenance.format,
-            "source": sequence.provenance.source,
-        },
-        "start": comparison.prior.source,
-        "estimators": [run.estimator for run in comparison.runs],
-        "seeds": {"sequence": seed},
-        "threads": {"cpus": _usable_cpus(), **{name: os.environ.get(name) for name in _THREAD_VARIABLES}},
-        "cpu": cpu_model(),
-        "os": platform.platform(),
     }
+
+
+def _sequence(sequence: Sequence) -> Json:
+    return {
+        "name": sequence.name,
+        "hash": sequence.content_hash(),
+        "format": sequence.provenance.format,
+        "source": sequence.provenance.source,
+    }
+
+
+def _machine() -> Json:
+    return {"cpu": cpu_model(), "os": platform.platform()}
 
 
 def git_revision(package: Path) -> str | None:
@@ -82,9 +110,3 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def _usable_cpus() -> int | None:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count()

@@ -10,18 +10,18 @@ from toolkit.report.figures import write_figures
 from toolkit.report.report_md import report_text
 from toolkit.report.trajectory_files import write_landmarks, write_tum
 
-_MANIFEST = "manifest.json"
+MANIFEST = "manifest.json"
 
 
 def check_run_directory(target: Path) -> None:
     """Raise OutputError unless a run directory can be written at ``target``."""
-    check_replaceable(target, _is_run_directory)
+    check_replaceable(target, is_run_directory)
 
 
-def _is_run_directory(directory: Path) -> bool:
+def is_run_directory(directory: Path) -> bool:
     """Say whether a directory holds a manifest of ours; many programs write a file of that name."""
     try:
-        told = json.loads((directory / _MANIFEST).read_text(encoding="utf-8"))
+        told = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     return isinstance(told, dict) and told.get("schema") == manifest.SCHEMA
@@ -32,7 +32,7 @@ def write_run(comparison: Comparison, target: Path, *, command: str, seed: int) 
 
     Raises OutputError where ``target`` cannot be written or holds something else; nothing is left behind then.
     """
-    with replaced_directory(target, _is_run_directory) as directory:
+    with replaced_directory(target, is_run_directory) as directory:
         _write_text(directory / "metrics.json", metrics_json.to_text(metrics_json.build(comparison)))
         _write_trajectories(comparison, directory)
         figures = directory / "figures"
@@ -40,7 +40,7 @@ def write_run(comparison: Comparison, target: Path, *, command: str, seed: int) 
         captions = write_figures(comparison, figures)
         _write_text(directory / "report.md", report_text(comparison, captions))
         told = manifest.build(comparison, command, seed)
-        _write_text(directory / _MANIFEST, json.dumps(told, indent=2) + "\n")
+        _write_text(directory / MANIFEST, json.dumps(told, indent=2) + "\n")
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:

@@ -11,7 +11,7 @@ from toolkit.audit import Audit, audit
 from toolkit.datasets import load_sequence
 from toolkit.datasets.parts.truth_file import load_truth, with_truth
 from toolkit.estimate import Output, Run
-from toolkit.estimator import Build, find
+from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.metrics import Scores, describe, score_run
 from toolkit.report.atomic import check_parent
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of
@@ -21,7 +21,7 @@ from toolkit.sequence import Prior, Sequence, Truth
 from toolkit.start import start_from_measurements, start_from_truth
 
 ProgressFor = Callable[[str], AbstractContextManager[Progress]]
-_STARTS: dict[Start, Callable[[Sequence], Prior]] = {
+STARTS: dict[Start, Callable[[Sequence], Prior]] = {
     "measurements": start_from_measurements,
     "truth": start_from_truth,
 }
@@ -31,8 +31,8 @@ _STARTS: dict[Start, Callable[[Sequence], Prior]] = {
 class Request:
     """What to compare and where to write it.
 
-    ``keep`` names the faults that the audit reports but leaves as they are; ``command`` is kept in the
-    manifest.
+    ``estimators`` are names, or the word for the whole ladder; ``keep`` names the faults that the audit reports
+    but leaves as they are; ``command`` is kept in the manifest.
     """
 
     sources: tuple[str, ...]
@@ -62,13 +62,15 @@ def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[C
     EstimatorError for an unknown or unavailable estimator, OutputError where the results cannot be written,
     DataError for a recording or truth that cannot be used.
     """
-    builds = {name: find(name).load() for name in request.estimators}
+    entries = find_all(request.estimators)
+    builds = {name: entry.load() for name, entry in entries.items()}
     if len(request.sources) == 1:
         check_run_directory(request.out)
     else:
         check_parent(request.out)  # its sub-directories are checked once the sequences' names are known
     for case in _cases(request, progress_for):
         comparison = compare(case.audited, case.prior, builds, progress_for)
+        comparison = replace(comparison, changes=changes_of(request, entries))
         with progress_for(f"{comparison.sequence.name}: figures and report"):
             write_run(comparison, case.directory, command=request.command, seed=request.seed)
         yield comparison, case.directory
@@ -96,6 +98,11 @@ def _score(run: Run, output: Output, sequence: Sequence) -> Scores:
     return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
 
 
+def changes_of(request: Request, entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
+    """Return what each estimator changes against the rung before it, where the ladder was asked for; else nothing."""
+    return {name: entry.change() for name, entry in entries.items()} if LADDER in request.estimators else {}
+
+
 def load_audited(source: str, truth: Truth | None, keep: frozenset[str], seed: int) -> Audit:
     """Load a recording, attach a truth given apart from it, and audit it."""
     sequence = load_sequence(source, seed)
@@ -118,7 +125,7 @@ def _cases(request: Request, progress_for: ProgressFor) -> list[_Case]:
     directories = [request.out] if len(audits) == 1 else [request.out / name for name in names]
     for directory in directories:
         check_run_directory(directory)
-    start = _STARTS[request.start]
+    start = STARTS[request.start]
     return [_Case(a, start(a.sequence), d) for a, d in zip(audits, directories, strict=True)]
 
 

@@ -40,6 +40,7 @@ COLUMNS = (
     Column("total_s", ("total", "", "s"), 2),
 )
 _LABELS = (("estimator", "", ""), ("output", "", ""), ("status", "", ""))
+_CHANGE = ("change", "", "")
 
 
 class Table(NamedTuple):
@@ -53,11 +54,21 @@ class Table(NamedTuple):
 def comparison_table(comparison: Comparison) -> Table:
     """Return one row for each kind of output; pairs and coverage always, other metrics where some row has one."""
     columns = [c for c in COLUMNS if c.key in ("pairs", "coverage_percent") or _has_value(comparison, c.key)]
+    changes = _changes(comparison)
     rows = tuple(
-        (row.estimator, row.output, row.status, *(_cell(row, column) for column in columns))
-        for row in comparison.rows
-    )  # fmt: skip
-    return Table((*_LABELS, *(c.heading for c in columns)), rows, labels=len(_LABELS))
+        (row.estimator, row.output, row.status, *change, *(_cell(row, column) for column in columns))
+        for row, change in zip(comparison.rows, changes, strict=True)
+    )
+    labels = (*_LABELS, _CHANGE) if comparison.changes else _LABELS
+    return Table((*labels, *(c.heading for c in columns)), rows, labels=len(labels))
+
+
+def _changes(comparison: Comparison) -> list[tuple[str, ...]]:
+    """Return a cell a row with what its estimator changes, told once an estimator; no cells without a ladder."""
+    if not comparison.changes:
+        return [()] * len(comparison.rows)
+    names = [row.estimator for row in comparison.rows]
+    return [("" if name in names[:i] else comparison.changes.get(name, ""),) for i, name in enumerate(names)]
 
 
 def as_text(table: Table) -> str:

@@ -3,9 +3,9 @@
 import math
 from pathlib import Path
 
+from toolkit.cutting import NS_PER_S
 from toolkit.estimate import Landmarks, Trajectory
 from toolkit.geometry import quaternion_from_rotation
-from toolkit.sequence import NS_PER_S
 
 TUM_HEADER = "# t_s x_m y_m z_m qx qy qz qw: the IMU in the world; quaternions are Hamilton, scalar last"
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.sequence import (
     GRAVITY_WORLD,
-    NS_PER_S,
     ImuNoise,
     Observations,
     Prior,
@@ -134,7 +134,7 @@ def _prior(scenario: Scenario, motion: Kinematics, rng: np.random.Generator) -> 
         v_world=motion.v_world[0] + truth[:3, :3] @ error[6:],
         bias=np.zeros(6),
         cov=np.diag(np.concatenate([_PRIOR_SIGMA, bias_sigma]) ** 2),
-        source="simulation: the truth, disturbed by an error drawn from this covariance",
+        source="simulation: the truth, disturbed by an error drawn from its covariance",
     )
 
 

@@ -4,9 +4,10 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.audit.parts.vision import usable_pairs
+from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, se3_exp, se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
-from toolkit.sequence import NS_PER_S, Sequence
+from toolkit.sequence import Sequence
 
 
 def median_one_step_px(sequence: Sequence, T_imu_cam: Array) -> float:

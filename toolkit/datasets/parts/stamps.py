@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
-from toolkit.sequence import NS_PER_S
 
 # No recording lies beyond the year 5000, nor has a sample only every half minute.
 _LATEST_S = 1e11

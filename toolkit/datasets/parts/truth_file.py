@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.cutting import NS_PER_S
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, rotation_from_quaternion, se3, so3_log
-from toolkit.sequence import NS_PER_S, Sequence, Truth
+from toolkit.sequence import Sequence, Truth
 
 _COLUMNS = 8
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.

@@ -58,6 +58,18 @@ def associate(estimate: Trajectory, truth: Truth, frame_period_ns: float) -> Mat
     return Matched(truth_t_ns[scored], truth_poses[scored], estimates, path_m[scored])
 
 
+def truth_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple[BoolArray, Array]:
+    """Return which of the stamps (N,) the truth reaches, and the true poses (n, 4, 4) there, by the rule above.
+
+    The same rule with the roles exchanged: here the truth is interpolated, for what is stated about an estimate
+    belongs to the estimate's own stamp.
+    """
+    known = finite_poses(truth.T_world_imu)
+    if not known.any() or t_ns.size == 0:
+        return np.zeros(t_ns.size, dtype=bool), np.empty((0, 4, 4))
+    return _at_stamps(truth.t_ns[known], truth.T_world_imu[known], t_ns, frame_period_ns)
+
+
 def _at_stamps(t_ns: IntArray, poses: Array, at_ns: IntArray, frame_period_ns: float) -> tuple[BoolArray, Array]:
     """Return which of the stamps (M,) the poses reach, and the poses (n, 4, 4) at those."""
     tolerance_ns = min(STAMP_TOLERANCE_NS, median_period_ns(at_ns) / 4.0) if at_ns.size > 1 else STAMP_TOLERANCE_NS

@@ -1,6 +1,6 @@
 """The figures of a comparison as PNG files, one module a figure; drawn without a display."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from toolkit.report.comparison import Comparison
@@ -17,9 +17,13 @@ _DRAWINGS: tuple[Callable[[Comparison], Iterator[NamedFigure]], ...] = (
 
 def write_figures(comparison: Comparison, directory: Path) -> dict[str, str]:
     """Draw every figure the comparison has data for into PNG files; return file name -> caption, in order."""
+    return save((figure for drawing in _DRAWINGS for figure in drawing(comparison)), directory)
+
+
+def save(figures: Iterable[NamedFigure], directory: Path) -> dict[str, str]:
+    """Save figures as PNG files; return file name -> caption, in order."""
     captions: dict[str, str] = {}
-    for drawing in _DRAWINGS:
-        for name, caption, figure in drawing(comparison):
-            figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
-            captions[f"{name}.png"] = caption
+    for name, caption, figure in figures:
+        figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
+        captions[f"{name}.png"] = caption
     return captions

@@ -15,7 +15,7 @@ LANDMARK_COLOUR = "#8a949f"
 # Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
 _LINE_OF: dict[Output, str] = {"causal": "--", "final": "-"}
-_WIDEST, _THINNEST = 3.6, 1.2
+_WIDEST, _THINNEST = 2.8, 1.2
 
 
 class NamedFigure(NamedTuple):

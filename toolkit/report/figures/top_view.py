@@ -22,7 +22,7 @@ from toolkit.report.figures.style import (
 )
 
 _LINE_WIDTH = 1.5
-_TRUTH_WIDTH = 5.0
+_TRUTH_WIDTH = 4.0
 _LANDMARK_QUANTILES = (0.02, 0.98)
 _MARGIN = 0.06
 _LARGEST_IN = (10.0, 7.5)
@@ -101,7 +101,7 @@ def _draw_run(axes: Axes, comparison: Comparison, run: Run, width: float) -> Arr
     positions = _from_above(comparison, run, trajectory.positions)
     colour, label = colour_of(comparison, run.estimator), f"{run.estimator} {output}{_trouble(run)}"
     axes.plot(*positions.T, color=colour, linewidth=width, linestyle=line_of(output), label=label, zorder=3)
-    axes.plot(*positions[:1].T, "o", color=colour, markersize=5, markeredgecolor="white", zorder=4)
+    axes.plot(*positions[:1].T, "o", color=colour, markersize=7, markeredgecolor="white", zorder=4)
     return positions
 
 

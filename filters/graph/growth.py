@@ -1,0 +1,84 @@
+"""How an incremental smoother's graph grows by one packet: new factors, first values, and what they concern.
+
+The sightings are those the causal pass of the decoupled filter lets through its gate, as in every smoother here.
+"""
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from filters.graph.landmarks import restricted
+from filters.graph.motion import MotionGraph, motion_graph
+from filters.kalman.belief import Belief, initial_belief
+from filters.kalman.decoupled import DecoupledEkf
+from filters.kalman.gate import STEREO_GATE
+from filters.kalman.landmarks import LEAST_DISPARITY_PX
+from filters.kalman.prediction import predicted, predictor
+from toolkit.estimator import Setup
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors
+from toolkit.sequence import Packet, StereoFrame
+
+# Sightings that passed the gate at the causal pass but strain it here are weighed down from the gate's own bound.
+HUBER_THRESHOLD = float(np.sqrt(STEREO_GATE))
+
+
+@dataclass
+class Grown:
+    """New factors and values, and the keys of every state and landmark they concern."""
+
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    state_keys: list[int] = field(default_factory=list)
+    landmark_ids: list[int] = field(default_factory=list)
+
+
+class Growth:
+    """Turns packets into what they add to a graph; remembers which landmarks the graph has."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._causal_pass = DecoupledEkf(setup)
+        self._predictor = predictor(setup)
+        self._stereo = StereoFactors(setup.rig, gtsam.noiseModel.mEstimator.Huber.Create(HUBER_THRESHOLD))
+        self._in_graph: set[int] = set()
+        self.motion: MotionGraph = motion_graph(setup)
+        self.belief: Belief = initial_belief(setup.prior, setup.motion_kind)
+
+    def by(self, packet: Packet) -> Grown:
+        """Return what a packet adds, the new state being predicted from ``belief``, the latest known."""
+        grown = Grown()
+        self._causal_pass.step(packet)
+        self._add_state(packet, grown)
+        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched)
+        self._add_sightings(restricted(packet.frame, passed), packet.index, grown)
+        return grown
+
+    def forget(self, landmark_ids: set[int]) -> None:
+        """Take note that landmarks have left the graph; seen again, they start anew."""
+        self._in_graph -= landmark_ids
+
+    def _add_state(self, packet: Packet, grown: Grown) -> None:
+        if packet.motion is None:
+            new = self.motion.prior()
+        else:
+            new = self.motion.step(packet.motion, self.belief.bias, packet.index)
+            self.belief = predicted(self.belief, self._predictor.step(self.belief, packet.motion))
+        for factor in new:
+            grown.factors.add(factor)
+        self.motion.insert(grown.values, self.belief.estimate(packet.frame.t_ns), packet.index)
+        grown.state_keys = list(grown.values.keys())
+
+    def _add_sightings(self, frame: StereoFrame, k: int, grown: Grown) -> None:
+        near = stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX
+        known = np.array([i in self._in_graph for i in frame.track_ids.tolist()], dtype=bool)
+        used = restricted(frame, known | near)
+        new = restricted(frame, ~known & near)
+        points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._setup.rig)
+        for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
+            grown.values.insert(L(track_id), point)
+        for factor in self._stereo.of(used, k):
+            grown.factors.add(factor)
+        grown.landmark_ids = used.track_ids.tolist()
+        self._in_graph.update(grown.landmark_ids)

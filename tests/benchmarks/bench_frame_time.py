@@ -1,0 +1,87 @@
+"""Time per frame of the filters and in total of the smoothers, as ratios to a fixed NumPy workload of the same run.
+
+Not part of the test run: absolute times belong to a machine. The ratio to the reference, timed in the same process
+just before each run, is what may be compared between machines and commits.
+
+    python tests/benchmarks/bench_frame_time.py [ESTIMATOR ...]
+    python -m pytest -s tests/benchmarks/bench_frame_time.py
+"""
+
+# ruff: noqa: E402 - the number of threads must be set before NumPy is imported
+import os
+
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from toolkit import runner
+from toolkit.audit import audit
+from toolkit.datasets import load_sequence
+from toolkit.estimator import find
+from toolkit.sequence import Sequence
+from toolkit.start import start_from_measurements
+
+DATA = Path(__file__).parents[2] / os.environ.get("VISLAM_DATA", "../shared/data")
+RECORDINGS = ("drive", "drive-imu", "kitti00", str(DATA / "ucsd" / "03.npz"))
+ESTIMATORS = ("dead-reckoning", "ekf", "batch")
+
+
+def reference_ms() -> float:
+    """Return the milliseconds of the reference: 400 times what a filter does to 64 landmarks, best of three."""
+    rng = np.random.default_rng(0)
+    roots, jacobians = rng.standard_normal((64, 3, 3)), rng.standard_normal((64, 3, 6))
+    covs = roots @ np.swapaxes(roots, 1, 2) + np.eye(3)
+    times = []
+    for _ in range(3):
+        began = time.perf_counter()
+        for _ in range(400):
+            weighted = np.swapaxes(jacobians, 1, 2) @ np.linalg.inv(covs)
+            np.linalg.inv((weighted @ jacobians).sum(axis=0) + np.eye(6))
+        times.append(time.perf_counter() - began)
+    return 1e3 * min(times)
+
+
+class _Unheard:
+    def advance(self, done: int, total: int) -> None:
+        """Take no note."""
+
+
+def _recordings() -> Iterator[Sequence]:
+    for source in RECORDINGS:
+        if "/" in source and not Path(source).exists():
+            print(f"{source}: not there, left out (set VISLAM_DATA)")
+            continue
+        yield audit(load_sequence(source)).sequence
+
+
+def measure(names: tuple[str, ...]) -> None:
+    """Print one line for each estimator on each recording."""
+    print(
+        f"{'recording':<12}{'estimator':<16}{'status':<10}{'ms/frame':>9}{'p95':>8}{'total s':>9}{'reference ms':>14}"
+    )
+    for sequence in _recordings():
+        prior = start_from_measurements(sequence)
+        for name in names:
+            reference = reference_ms()
+            run = runner.run(name, find(name).load(), sequence, prior, _Unheard())
+            step_ms, total_s = 1e3 * run.timings.step_s, run.timings.total_s
+            print(
+                f"{sequence.name:<12}{name:<16}{run.status:<10}{step_ms.mean():>9.3f}{np.quantile(step_ms, 0.95):>8.3f}"
+                f"{total_s:>9.2f}{reference:>14.1f}   "
+                f"frame/reference {step_ms.mean() / reference:.4f}, total/reference {1e3 * total_s / reference:.1f}"
+            )
+
+
+def test_frame_times_are_printed() -> None:
+    """Only printed: a benchmark asserts nothing about time."""
+    measure(ESTIMATORS)
+
+
+if __name__ == "__main__":
+    measure(tuple(sys.argv[1:]) or ESTIMATORS)

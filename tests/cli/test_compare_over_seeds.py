@@ -1,0 +1,70 @@
+"""``vislam compare --seeds`` and the ladder: their results, and one line for what cannot be repeated."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toolkit import estimator
+from toolkit.report.seeds_json import violations
+
+Vislam = Callable[..., int]
+QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10")
+
+
+def test_a_run_directory_over_seeds(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("compare", "drive", *QUICK, "--seeds", "3", "--seed", "5", "--out", "run") == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "results: run\n" in told.out
+    document = json.loads(Path("run/seeds.json").read_text())
+    assert violations(document) == []
+    assert document["seeds"] == [5, 6, 7]
+    assert len(set(document["hashes"])) == 3
+    manifest = json.loads(Path("run/manifest.json").read_text())
+    assert manifest["seeds"] == {"sequence": 5, "count": 3}
+    assert manifest["sequence"]["hash"] == document["hashes"][0]
+    figures = sorted(path.name for path in Path("run/figures").iterdir())
+    assert figures == ["errors_over_seeds.png", "nees_over_seeds.png"]
+    assert all(name in Path("run/report.md").read_text() for name in figures)
+
+
+def test_several_sequences_get_a_directory_each_and_replace_what_was_there(vislam: Vislam) -> None:
+    for _ in range(2):
+        assert vislam("compare", "drive", "drive-imu", *QUICK, "--seeds", "2", "--workers", "1", "--out", "all") == 0
+    assert sorted(path.name for path in Path("all").iterdir()) == ["drive", "drive-imu"]
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("kitti00", "--seeds", "2"), "kitti00 is the same under every seed"),
+        (("recording.npz", "--seeds", "2"), "recording.npz is the same under every seed"),
+        (("drive", "--seeds", "0"), "at least 1"),
+        (("drive", "--seeds", "2", "--truth", "gt.tum"), "exclude each other"),
+        (("drive", "--workers", "2"), "--workers goes with --seeds"),
+    ],
+)
+def test_what_cannot_be_repeated_is_a_wrong_command_line(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], why: str
+) -> None:
+    if words[0] == "drive" and "--truth" in words:
+        Path("gt.tum").write_text("")
+    assert vislam("compare", *words, *QUICK) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert why in told
+    assert not Path("runs").exists()
+
+
+def test_the_table_has_the_change_of_each_rung_once(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lowest = estimator.ladder()[:2]
+    monkeypatch.setattr(estimator, "ladder", lambda: lowest)
+    assert vislam("compare", "drive", "--estimators", "ladder", "--max-frames", "10", "--out", "run") == 0
+    table = capsys.readouterr().out.partition("start:")[0]
+    for entry in lowest:
+        assert table.count(entry.change()) == 1
+    assert f"| {lowest[0].change()} |" in Path("run/report.md").read_text()

@@ -1,0 +1,335 @@
+"""What every estimator promises, whoever wrote it: a new file in an announced package is tested here unasked."""
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from toolkit import runner
+from toolkit.errors import DataError, EstimatorError
+from toolkit.estimate import Estimate, Finished, Run, Trajectory
+from toolkit.estimator import Build, Setup, discover, find
+from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.models.stereo import triangulate_world
+from toolkit.sequence import Packet, Sequence
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, noise_free, simulate
+
+# Forty frames each: tracks have come and gone, and the whole of it is quick for every estimator there will ever be.
+SCENARIOS = {
+    "drive": replace(DRIVE, duration_s=4.0),
+    "drive-imu": replace(DRIVE_IMU, duration_s=4.0),
+    "flight": replace(FLIGHT, duration_s=2.0),
+}
+SEED = 4
+# Exact IMU samples at 1 kHz are integrated by the midpoint rule, which errs by dt^2 / 12 times the change of the jerk:
+# up to 1e-6 m and 1e-7 rad here. Twists are exact: only rounding is left, and the same limit is generous.
+NOISE_FREE_M, NOISE_FREE_RAD = {"twist": 1e-6, "imu": 5e-6}, 1e-6
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
+# Where the kind of motion samples makes no difference to what is asked.
+both_kinds = pytest.mark.parametrize("scenario", ["drive", "flight"])
+
+
+@pytest.fixture(scope="module", params=sorted(discover()))
+def name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def build(name: str) -> Build:
+    try:
+        return find(name).load()
+    except EstimatorError as unavailable:
+        pytest.skip(str(unavailable))
+
+
+@cache
+def recording(scenario: str) -> Sequence:
+    return simulate(SCENARIOS[scenario], SEED)
+
+
+@cache
+def exact_recording(scenario: str) -> Sequence:
+    return simulate(noise_free(SCENARIOS[scenario]), SEED)
+
+
+def setup_of(sequence: Sequence) -> Setup:
+    assert sequence.prior is not None
+    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+
+
+class Unheard:
+    def advance(self, done: int, total: int) -> None:
+        """Take no note."""
+
+
+def run_on(name: str, build: Build, sequence: Sequence) -> Run:
+    assert sequence.prior is not None
+    return runner.run(name, build, sequence, sequence.prior, Unheard())
+
+
+class Watched(NamedTuple):
+    """One run over a recording: what went in and what came out, each with a copy made at that moment."""
+
+    given: tuple[object, ...]
+    given_copies: list[Array]
+    online: list[Estimate | None]
+    online_copies: list[list[Array]]
+    finished: Finished
+
+
+@cache
+def watched(build: Build, scenario: str) -> Watched:
+    """Run an estimator once for all the tests that only look at what it said."""
+    sequence = recording(scenario)
+    setup, packets = setup_of(sequence), list(sequence.packets())
+    given = (setup, *packets)
+    given_copies = [array.copy() for array in arrays_of(given)]
+    estimator, online = build(setup), list[Estimate | None]()
+    online_copies: list[list[Array]] = []
+    for packet in packets:
+        online.append(estimator.step(packet))
+        online_copies.append([array.copy() for array in arrays_of(online[-1])])
+    return Watched(given, given_copies, online, online_copies, estimator.finish())
+
+
+def arrays_of(value: object) -> Iterator[Array]:
+    """Yield every array in a value of toolkit.estimate or toolkit.sequence."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from arrays_of(item)
+    elif hasattr(value, "__dataclass_fields__"):
+        for field in fields(value):
+            yield from arrays_of(getattr(value, field.name))
+
+
+def assert_bit_identical(one: object, other: object) -> None:
+    pairs = list(zip(arrays_of(one), arrays_of(other), strict=True))
+    assert pairs
+    for left, right in pairs:
+        np.testing.assert_array_equal(left, right)
+
+
+@every_scenario
+def test_it_is_causal(build: Build, scenario: str) -> None:
+    """Withholding later packets leaves earlier answers bit-identical."""
+    sequence, online = recording(scenario), watched(build, scenario).online
+    for count in (2, len(online) // 2):
+        estimator = build(setup_of(sequence))
+        for packet, full in zip(sequence.truncated(count).packets(), online, strict=False):
+            early = estimator.step(packet)
+            assert (early is None) == (full is None)
+            if early is not None and full is not None:
+                assert_bit_identical(early, full)
+                np.testing.assert_equal(dict(early.info), dict(full.info))
+
+
+@every_scenario
+def test_it_is_deterministic(build: Build, scenario: str) -> None:
+    sequence, before = recording(scenario), watched(build, scenario)
+    again = build(setup_of(sequence))
+    for packet, said in zip(sequence.packets(), before.online, strict=True):
+        now = again.step(packet)
+        if said is not None:
+            assert_bit_identical(now, said)
+    assert_bit_identical(again.finish(), before.finished)
+
+
+@every_scenario
+def test_an_answer_does_not_change_after_it_was_given(build: Build, scenario: str) -> None:
+    run = watched(build, scenario)
+    for said, copies in zip(run.online, run.online_copies, strict=True):
+        for array, copy in zip(arrays_of(said), copies, strict=True):
+            np.testing.assert_array_equal(array, copy)
+
+
+@every_scenario
+def test_packets_and_setup_stay_untouched(build: Build, scenario: str) -> None:
+    run = watched(build, scenario)
+    for array, copy in zip(arrays_of(run.given), run.given_copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def assert_close_to_truth(trajectory: Trajectory, sequence: Sequence) -> None:
+    assert sequence.truth is not None
+    error = se3_log(se3_inverse(sequence.truth.T_world_imu) @ trajectory.T_world_imu)
+    assert np.linalg.norm(error[:, 3:], axis=1).max() < NOISE_FREE_M[sequence.motion_kind]
+    assert np.linalg.norm(error[:, :3], axis=1).max() < NOISE_FREE_RAD
+
+
+@every_scenario
+def test_without_noise_it_recovers_the_truth(name: str, build: Build, scenario: str) -> None:
+    sequence = exact_recording(scenario)
+    run = run_on(name, build, sequence)
+    assert run.status == "ok"
+    assert run.final is not None
+    for trajectory in (run.causal, run.final):
+        if trajectory is not None:
+            assert_close_to_truth(trajectory, sequence)
+
+
+@both_kinds
+def test_without_noise_its_landmarks_are_where_they_are(name: str, build: Build, scenario: str) -> None:
+    sequence = exact_recording(scenario)
+    landmarks = run_on(name, build, sequence).landmarks
+    visible, truth = sequence.visible, sequence.truth
+    assert truth is not None
+    assert (np.diff(landmarks.track_ids) > 0).all()
+    assert np.isin(landmarks.track_ids, visible.track_id).all()
+    _, first = np.unique(visible.track_id, return_index=True)
+    points = triangulate_world(visible.uv_px[first], truth.T_world_imu[visible.frame[first]], sequence.rig)
+    expected = points[np.searchsorted(visible.track_id[first], landmarks.track_ids)]
+    # A landmark is at most 40 m from its pose: its angle's error comes on top of the position's.
+    limit_m = NOISE_FREE_M[sequence.motion_kind] + 40.0 * NOISE_FREE_RAD
+    assert np.abs(landmarks.points_world - expected).max(initial=0.0) < limit_m
+
+
+def assert_covariances(covs: Array) -> None:
+    np.testing.assert_array_equal(covs, np.swapaxes(covs, 1, 2))
+    # Units differ by orders of magnitude: what must be positive definite is the matrix of correlations.
+    sigmas = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
+    assert (sigmas > 0.0).all()
+    assert (np.linalg.eigvalsh(covs / (sigmas[:, :, None] * sigmas[:, None, :])) > 0.0).all()
+
+
+@every_scenario
+def test_covariances_are_symmetric_and_positive_definite_at_every_step(build: Build, scenario: str) -> None:
+    run = watched(build, scenario)
+    online, finished = run.online, run.finished
+    given = [e.cov for e in online if e is not None and e.cov is not None]
+    if finished.trajectory.cov is not None:
+        given.extend(finished.trajectory.cov)
+    for size in {len(cov) for cov in given}:
+        assert size in (6, 9, 15)
+        assert_covariances(np.stack([cov for cov in given if len(cov) == size]))
+    if finished.landmarks.cov is not None:
+        assert_covariances(finished.landmarks.cov)
+
+
+@every_scenario
+def test_rotations_stay_rotations(build: Build, scenario: str) -> None:
+    run = watched(build, scenario)
+    online, finished = run.online, run.finished
+    poses = [finished.trajectory.T_world_imu, *(e.T_world_imu[None] for e in online if e is not None)]
+    rotations = np.concatenate(poses)[:, :3, :3]
+    # Rounding of some hundred products.
+    assert np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max() < 1e-12
+
+
+@every_scenario
+def test_stamps_are_those_of_the_frames_and_the_end_covers_all_of_them(build: Build, scenario: str) -> None:
+    run = watched(build, scenario)
+    online, finished = run.online, run.finished
+    frames_t_ns = recording(scenario).frames_t_ns
+    assert len({e is None for e in online}) == 1, "it answers at every frame or only at the end"
+    assert [e.t_ns for e in online if e is not None] in ([], frames_t_ns.tolist())
+    np.testing.assert_array_equal(finished.trajectory.t_ns, frames_t_ns)
+    assert finished.trajectory.T_world_imu.shape == (frames_t_ns.size, 4, 4)
+
+
+def without_vision(sequence: Sequence, frames: range) -> Sequence:
+    return replace(sequence, observations=sequence.observations.select(~np.isin(sequence.observations.frame, frames)))
+
+
+@both_kinds
+@pytest.mark.parametrize(
+    "blind",
+    [range(10, 11), range(10, 30), range(3), range(10**6)],
+    ids=["one frame", "20 frames", "the first frames", "all frames"],
+)
+def test_frames_without_vision_do_not_break_it(name: str, build: Build, scenario: str, blind: range) -> None:
+    sequence = without_vision(recording(scenario), blind)
+    run = run_on(name, build, sequence)
+    assert run.status == "ok", run.log
+    assert run.final is not None
+    assert len(run.final) == sequence.frame_count
+
+
+@both_kinds
+def test_after_a_blackout_it_still_recovers_a_noise_free_truth(name: str, build: Build, scenario: str) -> None:
+    sequence = without_vision(exact_recording(scenario), range(10, 30))
+    run = run_on(name, build, sequence)
+    assert run.status == "ok"
+    assert run.final is not None
+    assert_close_to_truth(run.final, sequence)
+
+
+def with_nan(sequence: Sequence, where: str) -> Sequence:
+    if where == "observation":
+        uv_px = sequence.observations.uv_px.copy()
+        uv_px[len(uv_px) // 2, 1] = np.nan
+        return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+    field = "v_mps" if sequence.motion_kind == "twist" else "accel_mps2"
+    samples = getattr(sequence.motion, field).copy()
+    samples[len(samples) // 2, 1] = np.nan
+    return replace(sequence, motion=replace(sequence.motion, **{field: samples}))
+
+
+@both_kinds
+@pytest.mark.parametrize("where", ["observation", "motion sample"])
+def test_a_measurement_that_is_not_a_number_never_reaches_it(name, build, scenario, where) -> None:
+    with pytest.raises(DataError, match=f"{where} .*not finite"):
+        run_on(name, build, with_nan(recording(scenario), where))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@both_kinds
+@pytest.mark.parametrize("field", ["T_world_imu", "cov"])
+def test_a_start_that_is_not_a_number_never_ends_ok(name, build, scenario, field) -> None:
+    """The prior does not pass through packets(): here the estimator and the runner have to tell."""
+    sequence = recording(scenario)
+    assert sequence.prior is not None
+    bad = getattr(sequence.prior, field).copy()
+    bad[0, 0] = np.nan
+    run = run_on(name, build, replace(sequence, prior=replace(sequence.prior, **{field: bad})))
+    if field == "cov" and run.final is not None and np.isfinite(run.final.T_world_imu).all():
+        # Who does not weigh anything by the prior's covariance may go on, but not state it as its own.
+        assert run.final.cov is None or not np.isfinite(run.final.cov).all() or run.status != "ok"
+    else:
+        assert run.status != "ok"
+        assert run.log
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@both_kinds
+def test_a_packet_that_is_not_a_number_never_ends_in_a_finite_lie(name, build, scenario, monkeypatch) -> None:
+    """With the gatekeeper asleep: a NaN in the motion must show, whatever the estimator does with it."""
+    monkeypatch.setattr("toolkit.sequence.check_runnable", lambda sequence: None)
+    run = run_on(name, build, with_nan(recording(scenario), "motion sample"))
+    assert run.status != "ok"
+
+
+@both_kinds
+def test_two_frames_are_enough(name: str, build: Build, scenario: str) -> None:
+    run = run_on(name, build, recording(scenario).truncated(2))
+    assert run.status == "ok", run.log
+    assert run.final is not None
+    assert len(run.final) == 2
+
+
+def test_track_ids_may_be_large_and_unordered_in_time(name: str, build: Build) -> None:
+    """Ids are names: giving the tracks other ones changes who is withheld, nothing else may break."""
+    sequence = recording("drive")
+    seen = sequence.observations
+    ids = 10**9 - 7 * seen.track_id
+    run = run_on(name, build, replace(sequence, observations=type(seen).sorted(seen.frame, ids, seen.uv_px)))
+    assert run.status == "ok", run.log
+
+
+def test_every_estimator_has_a_one_line_summary(name: str) -> None:
+    summary = find(name).summary()
+    assert 20 <= len(summary) <= 120
+    assert summary.endswith((".", ")"))
+
+
+def test_packet_arrays_are_read_only() -> None:
+    packet: Packet
+    for packet in recording("drive").packets():
+        assert all(not array.flags.writeable for array in arrays_of(packet))

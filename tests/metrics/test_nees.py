@@ -1,0 +1,159 @@
+"""NEES: exact draws are consistent, wrong covariances are not, and the world it is judged in is the right one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.estimate import Trajectory
+from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse, so3_exp
+from toolkit.metrics import Judged, score_run
+from toolkit.metrics.common.consistency import chi2_quantile, nees_band, nees_over_time
+from toolkit.sequence import Prior, Truth
+
+POSES = 4000
+KEYS = ("nees_pose_mean", "nees_ori_mean", "nees_pos_mean", "nees_pose_in_band_percent")
+# Rotation of 1-3 mrad, position of 1-10 cm, correlated: what forgetting a transpose or a block would get wrong.
+_SIGMA = np.array([0.001, 0.003, 0.002, 0.05, 0.01, 0.1])
+_MIX = np.eye(6) + 0.4 * np.tri(6, k=-1)
+COV = np.diag(_SIGMA) @ _MIX @ _MIX.T @ np.diag(_SIGMA)
+
+
+def prior_at(pose):
+    cov = np.eye(15)
+    cov[:6, :6] = COV
+    return Prior(pose, np.zeros(3), np.zeros(6), cov, "test")
+
+
+@pytest.fixture
+def sequence(make_sequence, drive):
+    made = make_sequence(drive(POSES), track_count=3)
+    return replace(made, prior=prior_at(drive(POSES)[0]))
+
+
+def drawn(sequence, make_run, scale=1.0, seed=1):
+    """Return a run whose errors are drawn from ``scale`` times the covariance it states; right, in the body frame."""
+    noise = np.random.default_rng(seed).standard_normal((POSES, 6)) @ np.linalg.cholesky(scale * COV).T
+    # T_true = T_estimate exp(xi)
+    poses = sequence.truth.T_world_imu @ se3_inverse(se3_exp(noise))
+    return stating(make_run, sequence, poses, np.broadcast_to(COV, (POSES, 6, 6)))
+
+
+def stating(make_run, sequence, poses, cov):
+    trajectory = Trajectory(sequence.frames_t_ns[: len(poses)], poses, cov=cov)
+    return make_run(sequence.frames_t_ns, poses, causal=trajectory, final=trajectory)
+
+
+def nees(run, sequence, output="causal"):
+    scores = score_run(run, output, sequence)
+    return [scores.values[key] for key in KEYS]
+
+
+@pytest.mark.parametrize("output", ["causal", "final"])
+def test_exact_draws_have_nees_one_and_are_in_band_at_95_percent(sequence, make_run, output):
+    pose, ori, pos, in_band = nees(drawn(sequence, make_run), sequence, output)
+    # Four sigma: the mean of N chi-square variables over d degrees of freedom scatters by sqrt(2 / (d N)).
+    assert pose == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * POSES)))
+    assert ori == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (3 * POSES)))
+    assert pos == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (3 * POSES)))
+    assert in_band == pytest.approx(95.0, abs=4.0 * 100.0 * np.sqrt(0.95 * 0.05 / POSES))
+
+
+@pytest.mark.parametrize("scale", [0.25, 4.0])
+def test_a_wrong_covariance_leaves_the_band(sequence, make_run, scale):
+    pose, ori, pos, in_band = nees(drawn(sequence, make_run, scale), sequence)
+    assert [pose, ori, pos] == pytest.approx([scale] * 3, rel=0.1)
+    assert in_band < 60.0
+
+
+def test_nees_does_not_depend_on_the_world(sequence, make_run):
+    """Both truth and estimate moved by a rigid motion: errors and covariances are in the body frame."""
+    run = drawn(sequence, make_run)
+    T_new_old = se3(so3_exp(np.array([0.4, -1.1, 2.0])), np.array([300.0, -20.0, 7.0]))
+    truth = replace(sequence.truth, T_world_imu=T_new_old @ sequence.truth.T_world_imu)
+    prior = prior_at(T_new_old @ sequence.prior.T_world_imu)
+    moved = replace(sequence, truth=truth, prior=prior)
+    poses = T_new_old @ run.causal.T_world_imu
+    # 300 m cost three digits of the 1e-16 that a millimetre-sized error starts with.
+    assert nees(stating(make_run, moved, poses, run.causal.cov), moved) == pytest.approx(nees(run, sequence), rel=1e-8)
+
+
+def test_a_wrong_start_counts_where_the_prior_is_about_the_truths_world(sequence, make_run):
+    shifted = sequence.truth.T_world_imu @ se3(np.eye(3), np.array([1.0, 0.0, 0.0]))
+    run = stating(make_run, sequence, shifted, np.broadcast_to(COV, (POSES, 6, 6)))
+    assert nees(run, sequence)[2] > 10.0
+
+
+@pytest.mark.parametrize("prior", [None, "elsewhere"])
+@pytest.mark.parametrize("motion", ["twist", "imu"])
+def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequence, make_run, drive, prior, motion):
+    sequence = make_sequence(drive(200), track_count=3, motion=motion)
+    elsewhere = se3(about_z(1.0), np.array([10.0, 20.0, 30.0]))
+    poses = elsewhere @ drive(200)
+    sequence = replace(sequence, prior=None if prior is None else prior_at(poses[0]))
+    scores = score_run(stating(make_run, sequence, poses, np.broadcast_to(COV, (200, 6, 6))), "causal", sequence)
+    # A perfect estimate: what is left is rounding, far below the covariance.
+    assert scores.values["nees_pose_mean"] < 1e-12
+    assert "world is its own" in scores.notes["nees_pose_mean"]
+
+
+def test_a_world_of_its_own_needs_the_truth_of_its_first_pose(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(50), track_count=3)
+    late = replace(sequence, truth=Truth(sequence.truth.t_ns[20:], sequence.truth.T_world_imu[20:]))
+    run = stating(make_run, sequence, drive(50), np.broadcast_to(COV, (50, 6, 6)))
+    assert nees(run, late) == [None] * 4
+
+
+def test_a_truth_with_other_stamps_is_interpolated(make_sequence, make_run, drive):
+    """Truth between the frames: on the geodesic of a smooth path it is off by far less than the covariance."""
+    sequence = replace(make_sequence(drive(100), track_count=3), prior=prior_at(drive(100)[0]))
+    t_ns = sequence.truth.t_ns
+    between = np.concatenate([t_ns[:1], t_ns[:-1] + 30_000_000])
+    truth = Truth(between, interpolate_poses(t_ns, sequence.truth.T_world_imu, between))
+    run = stating(make_run, sequence, drive(100), np.broadcast_to(COV, (100, 6, 6)))
+    judged = Judged(run, "causal", replace(sequence, truth=truth))
+    found = nees_over_time(judged)
+    assert found.t_ns.tolist() == t_ns[:-1].tolist()  # the last frame is behind the truth's end
+    assert found.pose.max() < 0.05
+
+
+def refused(sequence, run):
+    scores = score_run(run, "causal", sequence)
+    assert [scores.values[key] for key in KEYS] == [None] * 4
+    return scores.notes["nees_pose_mean"]
+
+
+def test_missing_nees_has_its_reason(sequence, make_run):
+    run = drawn(sequence, make_run)
+    dependent = replace(sequence, truth=replace(sequence.truth, independent=False))
+    assert "agreement proves nothing" in refused(dependent, run)
+    assert "no ground truth" in refused(replace(sequence, truth=None), run)
+    silent = replace(run, causal=replace(run.causal, cov=None))
+    assert "states no covariance" in refused(sequence, silent)
+    unknown = replace(run, causal=replace(run.causal, cov=np.full((POSES, 6, 6), np.nan)))
+    assert "finite covariance" in refused(sequence, unknown)
+    indefinite = replace(run, causal=replace(run.causal, cov=run.causal.cov - 2.0 * np.diag(_SIGMA**2)))
+    assert "not positive definite" in refused(sequence, indefinite)
+
+
+def test_the_pose_is_the_first_block_of_a_larger_covariance(sequence, make_run):
+    run = drawn(sequence, make_run)
+    larger = np.tile(np.eye(15), (POSES, 1, 1))
+    larger[:, :6, :6] = COV
+    again = replace(run, causal=replace(run.causal, cov=larger))
+    assert nees(again, sequence) == nees(run, sequence)
+
+
+def test_the_band_is_that_of_the_tables():
+    """Against printed tables of the chi-square distribution: 6, 100 and 3 degrees of freedom."""
+    assert np.array(nees_band(6)) * 6 == pytest.approx([1.24, 14.4], abs=0.05)
+    assert np.array(nees_band(2, 50)) * 100 == pytest.approx([74.2, 129.6], abs=0.1)
+    assert chi2_quantile(0.95, 3) == pytest.approx(7.815, abs=1e-3)
+
+
+@pytest.mark.parametrize("runs", [1, 20])
+def test_the_mean_over_runs_keeps_its_band(runs):
+    rng = np.random.default_rng(4)
+    means = rng.chisquare(6, (runs, 20_000)).mean(axis=0) / 6
+    low, high = nees_band(6, runs)
+    assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 20_000))

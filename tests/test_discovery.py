@@ -1,0 +1,135 @@
+"""Finding estimators: by the files of an announced package, with no list of names and no re-install."""
+
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from toolkit import estimator
+from toolkit.errors import EstimatorError
+from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, discover, find, find_all, ladder
+
+PACKAGE = "temporary_estimators"
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty package that an entry point announces, as an installed distribution would."""
+    folder = tmp_path / PACKAGE
+    folder.mkdir()
+    (folder / "__init__.py").write_text('"""Somebody\'s estimators."""\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    point = EntryPoint(PACKAGE, PACKAGE, ENTRY_POINT_GROUP)
+    monkeypatch.setattr(estimator, "entry_points", lambda group: [point] if group == ENTRY_POINT_GROUP else [])
+    yield folder
+    for module in [m for m in sys.modules if m.partition(".")[0] == PACKAGE]:
+        del sys.modules[module]
+
+
+def write(package: Path, file: str, body: str) -> None:
+    (package / file).write_text(f'"""Stands still and says so."""\n\n{body}\n')
+
+
+def test_the_projects_own_estimators_are_found():
+    assert {"batch", "dead-reckoning", "ekf", "mapping", "seed-ekf"} <= discover().keys()
+
+
+def test_a_new_file_is_a_new_estimator(package):
+    assert discover() == {}
+    write(package, "my_new_filter.py", "def build(setup):\n    return setup")
+    assert list(discover()) == ["my-new-filter"]
+    entry = find("my-new-filter")
+    assert entry.summary() == "Stands still and says so."
+    assert entry.load()("a setup") == "a setup"
+
+
+def test_discovery_and_summaries_import_nothing(package):
+    write(package, "explosive.py", "raise RuntimeError('imported')")
+    assert find("explosive").summary() == "Stands still and says so."
+    assert f"{PACKAGE}.explosive" not in sys.modules
+
+
+def test_folders_and_private_files_are_parts_not_estimators(package):
+    (package / "parts").mkdir()
+    (package / "parts" / "__init__.py").write_text("")
+    write(package, "_helper.py", "")
+    assert discover() == {}
+
+
+def test_several_packages_are_found_together(package, tmp_path, monkeypatch):
+    other = tmp_path / "other_estimators"
+    other.mkdir()
+    (other / "__init__.py").write_text("")
+    write(package, "zebra.py", "build = print")
+    (other / "ant.py").write_text("")
+    points = [EntryPoint(name, name, ENTRY_POINT_GROUP) for name in (PACKAGE, "other_estimators")]
+    monkeypatch.setattr(estimator, "entry_points", lambda group: points)
+    assert list(discover()) == ["ant", "zebra"]
+
+
+def test_a_missing_optional_dependency_makes_one_estimator_unavailable(package):
+    write(package, "needy.py", "import a_package_nobody_has.part\n\ndef build(setup): ...")
+    write(package, "modest.py", "def build(setup): ...")
+    with pytest.raises(EstimatorError, match="needy is unavailable: it needs the package a_package_nobody_has"):
+        find("needy").load()
+    assert callable(find("modest").load())
+
+
+@pytest.mark.parametrize(
+    ("body", "error"),
+    [
+        (f"import {PACKAGE}.prats", ModuleNotFoundError),
+        ("from toolkit.geometri import se3", ModuleNotFoundError),
+        ("from toolkit.geometry import se4", ImportError),
+        ("buildd = setupp", NameError),
+        ("def build(setup)\n    return 1", SyntaxError),
+    ],
+    ids=["own package", "toolkit module", "toolkit name", "name", "syntax"],
+)
+def test_a_typo_still_fails(package, body, error):
+    """It must not pass for a missing dependency: the run would go on without the estimator."""
+    write(package, "typo.py", body) if error is not SyntaxError else (package / "typo.py").write_text(body)
+    with pytest.raises(error):
+        find("typo").load()
+
+
+def test_a_file_without_build_says_what_it_lacks(package):
+    write(package, "empty.py", "")
+    with pytest.raises(EstimatorError, match=r"empty.py defines no function build\(setup\)"):
+        find("empty").load()
+
+
+def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
+    write(package, "aaa.py", 'RUNG, CHANGE = 20, "+ the future"')
+    write(package, "bbb.py", 'RUNG: int = 10\nCHANGE = "the past"')
+    write(package, "ccc.py", "raise RuntimeError('imported')")
+    assert [(entry.name, entry.rung(), entry.change()) for entry in ladder()] == [
+        ("bbb", 10, "the past"),
+        ("aaa", 20, "+ the future"),
+    ]
+    assert find("ccc").rung() is None
+    assert find("ccc").change() == ""
+    assert list(find_all(["ccc", LADDER, "aaa"])) == ["ccc", "bbb", "aaa"]
+    with pytest.raises(EstimatorError, match="no estimator is called ddd"):
+        find_all([LADDER, "ddd"])
+
+
+def test_every_rung_of_the_project_says_what_it_changes():
+    rungs = ladder()
+    assert len({entry.rung() for entry in rungs}) == len(rungs) > 2
+    assert all(entry.change() for entry in rungs)
+
+
+def test_an_unknown_name_lists_the_known_ones(package):
+    write(package, "ant.py", "")
+    write(package, "bee.py", "")
+    with pytest.raises(EstimatorError, match="no estimator is called wasp; there are ant, bee"):
+        find("wasp")
+
+
+def test_an_entry_point_to_nowhere_is_told(monkeypatch):
+    point = EntryPoint("gone", "gone_package", ENTRY_POINT_GROUP)
+    monkeypatch.setattr(estimator, "entry_points", lambda group: [point])
+    with pytest.raises(EstimatorError, match="names gone_package, which is not a package"):
+        discover()

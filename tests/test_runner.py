@@ -1,0 +1,195 @@
+"""The runner: what it keeps, how it judges, and that one estimator's failure stays its own."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit import runner
+from toolkit.errors import DataError, EstimatorError
+from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
+from toolkit.estimator import Estimator, Setup
+from toolkit.sequence import Packet, Sequence
+from toolkit.simulation import DRIVE, noise_free, simulate
+
+FRAMES = 11
+
+
+class Perfect:
+    """Knows the truth and says it; the estimators below each spoil one thing."""
+
+    def __init__(self, poses: np.ndarray) -> None:
+        self.poses, self.said = poses, []
+
+    def step(self, packet: Packet) -> Estimate | None:
+        self.said.append(Estimate(packet.frame.t_ns, self.poses[packet.index], info={"nis": float(packet.index)}))
+        return self.said[-1]
+
+    def finish(self) -> Finished:
+        return Finished(Trajectory.of(self.said), Landmarks.none(), log=("all is well",))
+
+
+@pytest.fixture(scope="module")
+def sequence() -> Sequence:
+    return simulate(noise_free(replace(DRIVE, duration_s=(FRAMES - 1) / 10.0)), 0)
+
+
+class Heard:
+    def __init__(self) -> None:
+        self.calls = []
+
+    def advance(self, done: int, total: int) -> None:
+        self.calls.append((done, total))
+
+
+def run(kind: type[Perfect], sequence: Sequence, progress: Heard | None = None) -> Run:
+    def build(setup: Setup) -> Estimator:
+        assert setup.prior is sequence.prior
+        return kind(sequence.truth.T_world_imu)
+
+    return runner.run("some", build, sequence, sequence.prior, progress or Heard())
+
+
+def test_both_outputs_landmarks_diagnostics_and_log_are_kept(sequence):
+    done = run(Perfect, sequence)
+    assert (done.estimator, done.status, done.log) == ("some", "ok", ("all is well",))
+    for output in ("causal", "final"):
+        np.testing.assert_array_equal(done.trajectory(output).T_world_imu, sequence.truth.T_world_imu)
+    np.testing.assert_array_equal(done.info["nis"], np.arange(FRAMES))
+
+
+def test_progress_hears_every_frame(sequence):
+    heard = Heard()
+    run(Perfect, sequence, heard)
+    assert heard.calls == [(k + 1, FRAMES) for k in range(FRAMES)]
+
+
+class AtTheEnd(Perfect):
+    def step(self, packet: Packet) -> Estimate | None:
+        super().step(packet)
+        return None
+
+
+def test_who_answers_only_at_the_end_has_no_causal_output(sequence):
+    done = run(AtTheEnd, sequence)
+    assert done.causal is None
+    assert done.status == "ok"
+    assert done.info == {}
+
+
+class Breaks(Perfect):
+    def step(self, packet: Packet) -> Estimate | None:
+        if packet.index == 5:
+            raise ZeroDivisionError("the map is empty")
+        return super().step(packet)
+
+
+def test_an_error_ends_the_run_with_its_reason_and_what_was_said_before(sequence):
+    done = run(Breaks, sequence)
+    assert done.status == "failed"
+    assert done.log[0] == "failed after 5 estimates: ZeroDivisionError: the map is empty"
+    assert any("test_runner.py" in line for line in done.log[1:]), "a defect keeps its traceback"
+    assert done.final is None
+    np.testing.assert_array_equal(done.causal.t_ns, sequence.frames_t_ns[:5])
+
+
+class CannotGoOn(Perfect):
+    def finish(self) -> Finished:
+        raise EstimatorError("the smoother's error is not a number")
+
+
+def test_an_estimator_that_cannot_go_on_says_why_in_one_line(sequence):
+    done = run(CannotGoOn, sequence)
+    assert done.status == "failed"
+    assert done.log == (f"failed after {FRAMES} estimates: the smoother's error is not a number",)
+
+
+def test_an_error_while_building_is_a_failed_run(sequence):
+    def build(setup: Setup) -> Estimator:
+        raise ValueError("no such noise")
+
+    done = runner.run("some", build, sequence, sequence.prior, Heard())
+    assert done.status == "failed"
+    assert done.causal is None
+    assert "ValueError: no such noise" in done.log[0]
+
+
+class NotANumber(Perfect):
+    def step(self, packet: Packet) -> Estimate | None:
+        said = super().step(packet)
+        if packet.index >= 7:
+            self.said[-1] = replace(said, T_world_imu=np.full((4, 4), np.nan))
+        return self.said[-1]
+
+
+def test_poses_that_are_not_finite_are_a_divergence(sequence):
+    done = run(NotANumber, sequence)
+    assert done.status == "diverged"
+    assert any("not numbers from estimate 7" in line for line in done.log)
+
+
+class Unconverged(Perfect):
+    def finish(self) -> Finished:
+        return replace(super().finish(), converged=False)
+
+
+def test_a_solve_that_did_not_converge_is_a_failure_that_is_still_shown(sequence):
+    done = run(Unconverged, sequence)
+    assert done.status == "failed"
+    assert done.log[0] == "all is well"
+    assert "did not converge" in done.log[1]
+    assert done.final is not None
+
+
+class Slow(Perfect):
+    def step(self, packet: Packet) -> Estimate | None:
+        time.sleep(0.05 if packet.index == 4 else 0.0)
+        return super().step(packet)
+
+    def finish(self) -> Finished:
+        time.sleep(0.03)
+        return super().finish()
+
+
+def test_a_slow_step_shows_in_the_timings(sequence):
+    timings = run(Slow, sequence).timings
+    assert timings.step_s.shape == (FRAMES,)
+    assert np.argmax(timings.step_s) == 4
+    assert timings.step_s[4] >= 0.05
+    assert timings.finish_s >= 0.03
+    assert timings.total_s >= timings.step_s.sum() + timings.finish_s
+    assert timings.cpu_s < timings.total_s, "sleeping is no work"
+    assert timings.peak_rss_mb > 10.0
+
+
+def test_a_failed_run_has_the_timings_of_what_it_did(sequence):
+    assert run(Breaks, sequence).timings.step_s.shape == (5,)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_the_user_and_the_machine_can_stop_it(sequence, error):
+    class Stopped(Perfect):
+        def step(self, packet: Packet) -> Estimate | None:
+            raise error
+
+    with pytest.raises(error):
+        run(Stopped, sequence)
+
+
+def test_a_sequence_that_cannot_be_run_is_the_datas_fault_not_the_estimators(sequence):
+    backwards = replace(sequence, frames_t_ns=sequence.frames_t_ns[::-1])
+    with pytest.raises(DataError, match="not after the one before"):
+        run(Perfect, backwards)
+
+
+class Truncates(Perfect):
+    def finish(self) -> Finished:
+        return Finished(Trajectory.of(self.said[:3]), Landmarks.none())
+
+
+def test_a_final_answer_for_some_frames_only_is_kept_as_it_is(sequence):
+    """Coverage is scored, not hidden: the metrics say how much of the recording a trajectory covers."""
+    done = run(Truncates, sequence)
+    assert len(done.final) == 3
+    assert done.status == "ok"

@@ -1,0 +1,210 @@
+"""The stream every estimator reads: packets cut once, tracks withheld from all, values nobody can change."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from toolkit.cutting import NS_PER_S, Pairing
+from toolkit.errors import DataError
+from toolkit.geometry import se3, se3_exp
+from toolkit.sequence import (
+    ImuNoise,
+    ImuSamples,
+    Observations,
+    Provenance,
+    Sequence,
+    StereoRig,
+    TwistNoise,
+    TwistSamples,
+    is_held_out,
+)
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+RIG = StereoRig(500.0, 500.0, 320.0, 240.0, 0.2, np.eye(4), np.eye(3))
+THREE = np.full(3, 0.1)
+START_NS = 1_600_000_000 * NS_PER_S
+
+
+def at_ms(*stamps_ms: float) -> np.ndarray:
+    return START_NS + np.round(1e6 * np.array(stamps_ms)).astype(np.int64)
+
+
+def sequence_of(frames_t_ns: np.ndarray, motion: TwistSamples | ImuSamples) -> Sequence:
+    return Sequence(
+        name="made",
+        rig=RIG,
+        noise=TwistNoise(THREE, THREE, THREE) if isinstance(motion, TwistSamples) else ImuNoise(1.0, 1.0, 1.0, 1.0),
+        frames_t_ns=frames_t_ns,
+        observations=Observations(np.empty(0), np.empty(0), np.empty((0, 3))),
+        motion=motion,
+        provenance=Provenance("test", "tests/test_sequence.py"),
+    )
+
+
+def ramp(stamps_ns: np.ndarray) -> np.ndarray:
+    """Values that grow linearly with time: (S, 3), 1 a second on the first axis, 10 and 100 on the others."""
+    return ((stamps_ns - START_NS) / NS_PER_S)[:, None] * np.array([1.0, 10.0, 100.0])
+
+
+def twists(stamps_ns: np.ndarray, pairing: Pairing) -> TwistSamples:
+    return TwistSamples(stamps_ns, ramp(stamps_ns), -ramp(stamps_ns), pairing)
+
+
+@pytest.mark.parametrize(("pairing", "expected"), [("start", [0.0, 0.1]), ("end", [0.1, 0.2]), ("mean", [0.05, 0.15])])
+def test_pairing_says_which_sample_moves_from_frame_to_frame(pairing, expected):
+    frames = at_ms(0, 100, 200)
+    first, *moved = sequence_of(frames, twists(frames, pairing)).packets()
+    assert first.motion is None
+    for packet, value in zip(moved, expected, strict=True):
+        np.testing.assert_allclose(packet.motion.dt_s, [0.1], rtol=1e-12)
+        np.testing.assert_allclose(packet.motion.v_mps, value * np.array([[1.0, 10.0, 100.0]]), atol=1e-9)
+        np.testing.assert_allclose(packet.motion.w_radps, -packet.motion.v_mps)
+
+
+def test_imu_samples_are_cut_and_interpolated_at_the_frames():
+    """Frames between the samples: the pieces are the trapezoids of the linear interpolation, none lost or doubled."""
+    stamps = at_ms(*np.arange(0.0, 101.0, 5.0))
+    frames = at_ms(7, 33.5, 50, 91)
+    packets = list(sequence_of(frames, ImuSamples(stamps, ramp(stamps), -ramp(stamps))).packets())
+    for before, packet in pairwise(packets):
+        start_s, end_s = ((p.frame.t_ns - START_NS) / NS_PER_S for p in (before, packet))
+        # Stamps are whole nanoseconds.
+        assert packet.motion.dt_s.sum() == pytest.approx(end_s - start_s, abs=1e-12)
+        integral = packet.motion.dt_s @ packet.motion.accel_mps2
+        expected = 0.5 * (end_s**2 - start_s**2) * np.array([1.0, 10.0, 100.0])
+        # Linear interpolation on stamps of 1 ns over 100 ms.
+        np.testing.assert_allclose(integral, expected, rtol=1e-7)
+        assert (packet.motion.dt_s > 0.0).all()
+
+
+def test_the_intervals_fill_the_time_between_the_frames():
+    sequence = simulate(replace(FLIGHT, duration_s=2.0), 0)
+    total_s = sum(p.motion.dt_s.sum() for p in sequence.packets() if p.motion is not None)
+    assert total_s == pytest.approx(sequence.duration_s, abs=1e-9)
+
+
+def test_a_longer_recording_begins_with_the_same_packets():
+    sequence = simulate(replace(FLIGHT, duration_s=2.0), 0)
+    for short, long in zip(sequence.truncated(17).packets(), sequence.packets(), strict=False):
+        np.testing.assert_array_equal(short.frame.uvs_px, long.frame.uvs_px)
+        if long.motion is not None:
+            np.testing.assert_array_equal(short.motion.accel_mps2, long.motion.accel_mps2)
+            np.testing.assert_array_equal(short.motion.dt_s, long.motion.dt_s)
+    assert sequence.truncated(17).frame_count == 17
+    assert sequence.truncated(10**6) is sequence
+
+
+def test_withheld_tracks_never_reach_an_estimator():
+    sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
+    shown = np.concatenate([p.frame.track_ids for p in sequence.packets()])
+    assert not is_held_out(shown).any()
+    assert is_held_out(sequence.held_out.track_id).all()
+    assert len(sequence.held_out) + shown.size == len(sequence.observations)
+
+
+@pytest.mark.parametrize("ids", [np.arange(20_000), 7919 * np.arange(20_000), 10**12 + np.arange(20_000)])
+def test_one_track_in_ten_is_withheld_whatever_the_numbering(ids):
+    # A fair draw of 20,000 has a standard deviation of 0.2 %.
+    assert is_held_out(ids).mean() == pytest.approx(0.1, abs=0.01)
+
+
+def test_withholding_depends_on_the_id_alone():
+    ids = np.random.default_rng(1).permutation(1000)
+    np.testing.assert_array_equal(is_held_out(ids), is_held_out(np.arange(1000))[ids])
+
+
+def test_arrays_cannot_be_written_to():
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    for packet in sequence.packets():
+        arrays = [packet.frame.track_ids, packet.frame.uvs_px]
+        if packet.motion is not None:
+            arrays += [packet.motion.dt_s, packet.motion.v_mps, packet.motion.w_radps]
+        for array in arrays:
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 0
+
+
+def test_the_hash_sees_what_an_estimator_sees():
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    same = simulate(replace(DRIVE, duration_s=1.0), 0)
+    assert sequence.content_hash() == same.content_hash()
+    uv_px = sequence.observations.uv_px.copy()
+    uv_px[3, 1] = np.nextafter(uv_px[3, 1], np.inf)
+    changes = {
+        "observations": replace(sequence.observations, uv_px=uv_px),
+        "frames_t_ns": sequence.frames_t_ns + 1,
+        "gravity_world": np.array([0.0, 0.0, -9.8]),
+        "truth": None,
+        "prior": None,
+        "rig": replace(sequence.rig, baseline_m=0.5401),
+        "motion": replace(sequence.motion, pairing="end"),
+        "noise": replace(sequence.noise, gyro_random_walk=THREE),
+    }
+    hashes = {replace(sequence, **{name: value}).content_hash() for name, value in changes.items()}
+    assert len(hashes | {sequence.content_hash()}) == len(changes) + 1
+
+
+def test_the_hash_does_not_see_a_name():
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    assert replace(sequence, name="other").content_hash() == sequence.content_hash()
+
+
+FRAMES = at_ms(0, 100, 200)
+
+
+@pytest.mark.parametrize(
+    ("frames", "stamps", "complaint"),
+    [
+        (at_ms(0), at_ms(0, 100), "1 frame"),
+        (at_ms(0, 200, 100), at_ms(0, 100, 200), "frame 2 is not after"),
+        (at_ms(0, 100, 100), at_ms(0, 100, 200), "frame 2 is not after"),
+        (FRAMES, at_ms(0, 100, 100, 200), "motion sample 2 is not after"),
+        (FRAMES, at_ms(50, 100, 200), "do not span"),
+        (FRAMES, at_ms(0, 100), "do not span"),
+        (FRAMES, at_ms(), "do not span"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_in_one_line(frames, stamps, complaint):
+    with pytest.raises(DataError, match=complaint) as refused:
+        next(iter(sequence_of(frames, twists(stamps, "start")).packets()))
+    assert str(refused.value).startswith("made: ")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_field_of_the_wrong_shape_is_named():
+    with pytest.raises(DataError, match=r"TwistSamples.v_mps has shape \(2, 2\), expected \(any, 3\)"):
+        TwistSamples(FRAMES[:2], np.zeros((2, 2)), np.zeros((2, 3)))
+
+
+def test_an_extrinsic_written_with_few_decimals_is_made_a_rotation():
+    """Calibrations have three to nine decimals; the models take the transpose for the inverse."""
+    exact = se3_exp(np.array([0.7, -1.1, 0.4, 0.1, 0.2, 0.3]))
+    rig = replace(RIG, T_imu_cam=np.round(exact, 4))
+    rotation = rig.T_imu_cam[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    # Nearest to what was written, which is within 5e-5 an entry of the exact one.
+    np.testing.assert_allclose(rig.T_imu_cam, exact, atol=1e-4)
+    assert replace(RIG, T_imu_cam=exact).T_imu_cam.tolist() == exact.tolist()
+
+
+@pytest.mark.parametrize(
+    "rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
+)
+def test_an_extrinsic_that_is_no_rigid_motion_is_refused(rotation):
+    with pytest.raises(DataError, match="not a rigid motion"):
+        replace(RIG, T_imu_cam=se3(rotation, np.zeros(3)))
+
+
+def test_noise_of_another_kind_than_the_motion_is_refused():
+    sequence = sequence_of(FRAMES, twists(FRAMES, "start"))
+    with pytest.raises(DataError, match="not of the kind"):
+        replace(sequence, noise=ImuNoise(1.0, 1.0, 1.0, 1.0))
+
+
+def test_observations_in_any_order_are_sorted_by_frame_then_track():
+    rows = Observations.sorted(np.array([1, 0, 1, 0]), np.array([2, 5, 1, 3]), np.arange(12.0).reshape(4, 3))
+    np.testing.assert_array_equal(rows.frame, [0, 0, 1, 1])
+    np.testing.assert_array_equal(rows.track_id, [3, 5, 1, 2])
+    np.testing.assert_array_equal(rows.uv_px[:, 0], [9.0, 3.0, 6.0, 0.0])
