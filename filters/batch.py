@@ -11,6 +11,7 @@ import numpy as np
 from filters.graph.landmarks import restricted, worth_smoothing
 from filters.graph.motion import motion_graph
 from filters.graph.robust import solve_in_stages
+from filters.kalman.belief import initial_belief
 from filters.kalman.decoupled import DecoupledEkf
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -32,6 +33,7 @@ class Batch:
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
         self._motion = motion_graph(setup)
+        self._first_belief = initial_belief(setup.prior, setup.motion_kind)
         self._causal_pass = DecoupledEkf(setup)
         self._packets: list[Packet] = []
         self._frames: list[StereoFrame] = []
@@ -57,9 +59,9 @@ class Batch:
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""
         graph = gtsam.NonlinearFactorGraph()
-        for factor in self._motion.prior():
+        for factor in self._motion.hold(self._first_belief, 0):
             graph.add(factor)
-        best_bias = self._causal_pass.bias
+        best_bias = self._causal_pass.belief.bias
         for packet in self._packets:
             if packet.motion is not None:
                 for factor in self._motion.step(packet.motion, best_bias, packet.index):

@@ -1,12 +1,13 @@
 """Incremental smoother over the last two seconds; older states are marginalised (Kaess et al. 2012, iSAM2).
 
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
-causal answer is the newest state, its final answer each state as it left the window.
+causal answer is the newest state, its final answer each state as it left the window. Where the window's system
+becomes indeterminate it starts afresh from its newest state, and says so in its log.
 """
 
 import gtsam
 
-from filters.graph.growth import Growth
+from filters.graph.growth import Grown, Growth
 from toolkit.cutting import NS_PER_S
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -27,44 +28,64 @@ class FixedLag:
     """Adds a packet to the window, lets GTSAM relinearise it, reads the states in it."""
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
-        params = gtsam.ISAM2Params()
-        params.setRelinearizeThreshold(0.01)
-        params.relinearizeSkip = 1
-        params.findUnusedFactorSlots = True
-        self._smoother = gtsam.IncrementalFixedLagSmoother(lag_s, params)
+        self._lag_s = lag_s
+        self._smoother = _smoother(lag_s)
         self._growth = Growth(setup)
-        self._lag_ns = int(lag_s * NS_PER_S)
-        self._stamps_ns: list[int] = []
+        self._first_in_window = 0
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
         self._last_seen_ns: dict[int, int] = {}
+        self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         grown = self._growth.by(packet)
-        t_ns = packet.frame.t_ns
-        self._stamps_ns.append(t_ns)
-        elapsed_s = (t_ns - self._stamps_ns[0]) / NS_PER_S
-        keys = grown.state_keys + [L(i) for i in grown.landmark_ids]
-        self._smoother.update(grown.factors, grown.values, dict.fromkeys(keys, elapsed_s))
-        self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, t_ns))
-        self._read(self._smoother.calculateEstimate())
+        try:
+            values = self._updated(grown, packet.frame.t_ns)
+        except RuntimeError as refusal:
+            if "Indeterminate" not in str(refusal):
+                raise
+            values = self._restarted(packet)
+        self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, packet.frame.t_ns))
+        self._read(values, packet)
         return self._states[-1]
 
-    def _read(self, values: gtsam.Values) -> None:
-        """Take over every state and landmark of the window; those that leave it stay as last read."""
-        newest_ns = self._stamps_ns[-1]
-        first = next(k for k, t_ns in enumerate(self._stamps_ns) if t_ns >= newest_ns - self._lag_ns)
-        motion = self._growth.motion
-        self._states[first:] = [motion.read(values, k, self._stamps_ns[k]) for k in range(first, len(self._stamps_ns))]
-        left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < newest_ns - self._lag_ns}
-        for track_id in left:
-            del self._last_seen_ns[track_id]
+    def finish(self) -> Finished:
+        """Return each state as it left the window, and every landmark as last known."""
+        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
+
+    def _updated(self, grown: Grown, t_ns: int) -> gtsam.Values:
+        keys = grown.state_keys + [L(i) for i in grown.landmark_ids]
+        self._smoother.update(grown.factors, grown.values, dict.fromkeys(keys, t_ns / NS_PER_S))
+        return self._smoother.calculateEstimate()
+
+    def _restarted(self, packet: Packet) -> gtsam.Values:
+        """Begin a new window at this packet, from the state predicted for it."""
+        self._log.append(f"frame {packet.index}: the window's system was indeterminate; started afresh from here")
+        self._smoother = _smoother(self._lag_s)
+        self._first_in_window = packet.index
+        self._last_seen_ns.clear()
+        return self._updated(self._growth.afresh(packet), packet.frame.t_ns)
+
+    def _read(self, values: gtsam.Values, packet: Packet) -> None:
+        """Take over every state and landmark of the window; what leaves it stays as last read."""
+        oldest_ns = packet.frame.t_ns - int(self._lag_s * NS_PER_S)
+        stamps_ns = [s.t_ns for s in self._states] + [packet.frame.t_ns]
+        while stamps_ns[self._first_in_window] < oldest_ns:
+            self._first_in_window += 1
+        motion, window = self._growth.motion, range(self._first_in_window, packet.index + 1)
+        self._states[self._first_in_window :] = [motion.read(values, k, stamps_ns[k]) for k in window]
+        left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < oldest_ns}
         self._growth.forget(left)
+        self._last_seen_ns = {i: t_ns for i, t_ns in self._last_seen_ns.items() if i not in left}
         for track_id in self._last_seen_ns:
             self._points[track_id] = values.atPoint3(L(track_id))
         self._growth.belief = self._growth.belief.at(self._states[-1])
 
-    def finish(self) -> Finished:
-        """Return each state as it left the window, and every landmark as last known."""
-        return Finished(Trajectory.of(self._states), Landmarks.of(self._points))
+
+def _smoother(lag_s: float) -> gtsam.IncrementalFixedLagSmoother:
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(0.01)
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    return gtsam.IncrementalFixedLagSmoother(lag_s, params)

@@ -6,9 +6,11 @@ one bad match moves the car. The report's measurement has four rows; ours has vL
 half the variance, which gives the same update.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from filters.kalman.belief import initial_belief
+from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
 from filters.kalman.landmarks import LandmarkMap, TrackedMap
 from filters.kalman.prediction import predicted, predictor
@@ -18,6 +20,9 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
 from toolkit.sequence import Packet
+
+# Standing in for zero, which has no inverse: a bias of 1e-8 rad/s turns by 1e-6 rad in 100 s.
+_HELD_VARIANCE = 1e-16
 
 RUNG, CHANGE = 10, "+ vision, as the report has it"
 
@@ -33,13 +38,13 @@ class SeedEkf:
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
         self._predictor = predictor(setup)
-        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._belief = _without_biases(initial_belief(setup.prior, setup.motion_kind))
         self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
         """Predict (1-2), map (3-10), correct the pose (11-14)."""
         if packet.motion is not None:
-            self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
+            self._belief = _without_biases(predicted(self._belief, self._predictor.step(self._belief, packet.motion)))
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
             seen = correct_landmarks(seen, uvs_px, self._belief.T_world_imu, np.zeros((6, 6)), self._rig).landmarks
@@ -56,3 +61,12 @@ class SeedEkf:
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""
         return self._map.landmarks()
+
+
+def _without_biases(belief: Belief) -> Belief:
+    """Return the belief with its biases held where they are: the report's state has none."""
+    cov = belief.cov.copy()
+    first_bias = (belief.layout.accel_bias or belief.layout.gyro_bias).start
+    cov[first_bias:], cov[:, first_bias:] = 0.0, 0.0
+    cov[first_bias:, first_bias:] = _HELD_VARIANCE * np.eye(len(cov) - first_bias)
+    return replace(belief, cov=cov)

@@ -103,6 +103,7 @@ def _blind(attitude: Array) -> Prior:
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
+    cov = 0.5 * (cov + cov.T)
     source = "the specific force; velocity unknown and taken for zero, for there are too few tracks in the first frames"
     return Prior(se3(attitude, np.zeros(3)), np.zeros(3), np.zeros(6), cov, source)
 

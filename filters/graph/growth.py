@@ -51,22 +51,41 @@ class Growth:
         grown = Grown()
         self._causal_pass.step(packet)
         self._add_state(packet, grown)
-        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched)
-        self._add_sightings(restricted(packet.frame, passed), packet.index, grown)
+        self._add_sightings(self._passed(packet), packet.index, grown)
+        return grown
+
+    def afresh(self, packet: Packet) -> Grown:
+        """Return a new graph that begins with the packet last taken in, held by what the causal pass knows.
+
+        The mean stays ``belief``; the covariance is that of the causal pass, for the old graph's is lost.
+        """
+        grown = Grown()
+        self._in_graph.clear()
+        held = self._causal_pass.belief.at(self.belief.estimate(packet.frame.t_ns))
+        for factor in self.motion.hold(held, packet.index):
+            grown.factors.add(factor)
+        self._add_values(packet, grown)
+        self._add_sightings(self._passed(packet), packet.index, grown)
         return grown
 
     def forget(self, landmark_ids: set[int]) -> None:
         """Take note that landmarks have left the graph; seen again, they start anew."""
         self._in_graph -= landmark_ids
 
+    def _passed(self, packet: Packet) -> StereoFrame:
+        return restricted(packet.frame, ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched))
+
     def _add_state(self, packet: Packet, grown: Grown) -> None:
         if packet.motion is None:
-            new = self.motion.prior()
+            new = self.motion.hold(self.belief, packet.index)
         else:
             new = self.motion.step(packet.motion, self.belief.bias, packet.index)
             self.belief = predicted(self.belief, self._predictor.step(self.belief, packet.motion))
         for factor in new:
             grown.factors.add(factor)
+        self._add_values(packet, grown)
+
+    def _add_values(self, packet: Packet, grown: Grown) -> None:
         self.motion.insert(grown.values, self.belief.estimate(packet.frame.t_ns), packet.index)
         grown.state_keys = list(grown.values.keys())
 

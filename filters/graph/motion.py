@@ -1,28 +1,29 @@
-"""The motion of a sequence as a factor graph: prior, one step a frame, initial values and how to read the result.
+"""The motion of a sequence as a factor graph: what holds a state, one step a frame, values and how to read them.
 
 Two kinds: a measured twist with a gyro bias (3,) at every frame, or raw IMU samples with velocity and both
 biases. A smoother uses either without knowing which.
 """
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
+from filters.kalman.belief import Belief
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import factors, imu, twist
 from toolkit.models.factors import B, V, X
-from toolkit.sequence import ImuMotion, ImuNoise, Motion, Prior, TwistMotion, TwistNoise
+from toolkit.sequence import ImuMotion, ImuNoise, Motion, TwistMotion, TwistNoise
 
 
 class MotionGraph(Protocol):
     """Makes the factors and values of one kind of motion."""
 
-    def prior(self) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield what holds the first state."""
+    def hold(self, belief: Belief, k: int) -> Iterator[gtsam.NonlinearFactor]:
+        """Yield what holds state k at a belief."""
 
     def step(self, motion: Motion, bias: Array, k: int) -> Iterator[gtsam.NonlinearFactor]:
         """Yield what ties state k - 1 to state k, integrated about a bias (6,)."""
@@ -37,23 +38,20 @@ class MotionGraph(Protocol):
 def motion_graph(setup: Setup) -> MotionGraph:
     """Return the maker for the kind of motion and the noise of a setup."""
     if isinstance(setup.noise, TwistNoise):
-        return _TwistGraph(setup.noise, setup.prior)
-    return _ImuGraph(setup.noise, setup.prior, setup.gravity_world)
-
-
-def _pose_prior(prior: Prior) -> gtsam.NonlinearFactor:
-    noise = gtsam.noiseModel.Gaussian.Covariance(prior.cov[:6, :6])
-    return gtsam.PriorFactorPose3(X(0), gtsam.Pose3(prior.T_world_imu), noise)
+        return _TwistGraph(setup.noise)
+    return _ImuGraph(setup.noise, setup.gravity_world)
 
 
 class _TwistGraph:
-    def __init__(self, noise: TwistNoise, prior: Prior) -> None:
-        self._noise, self._prior = noise, prior
+    def __init__(self, noise: TwistNoise) -> None:
+        self._noise = noise
 
-    def prior(self) -> Iterator[gtsam.NonlinearFactor]:
-        yield _pose_prior(self._prior)
-        noise = gtsam.noiseModel.Gaussian.Covariance(self._prior.cov[12:, 12:])
-        yield gtsam.PriorFactorVector(B(0), self._prior.bias[3:], noise)
+    def hold(self, belief: Belief, k: int) -> Iterator[gtsam.NonlinearFactor]:
+        at = gtsam.Values()
+        at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
+        at.insert(B(k), belief.bias[3:])
+        root = _root_information(belief.cov)
+        yield _linear(at, {X(k): root[:, :6], B(k): root[:, 6:]})
 
     def step(self, motion: Motion, bias: Array, k: int) -> Iterator[gtsam.NonlinearFactor]:
         assert isinstance(motion, TwistMotion)
@@ -72,22 +70,18 @@ class _TwistGraph:
 
 
 class _ImuGraph:
-    def __init__(self, noise: ImuNoise, prior: Prior, gravity_world: Array) -> None:
+    def __init__(self, noise: ImuNoise, gravity_world: Array) -> None:
         self._params = imu.preintegration_params(noise, gravity_world)
-        self._prior = prior
 
-    def prior(self) -> Iterator[gtsam.NonlinearFactor]:
-        """Hold pose, velocity and biases jointly: the start's correlations say as much as its variances."""
-        start = gtsam.Values()
-        start.insert(X(0), gtsam.Pose3(self._prior.T_world_imu))
-        start.insert(V(0), self._prior.v_world)
-        start.insert(B(0), _constant_bias(self._prior.bias))
+    def hold(self, belief: Belief, k: int) -> Iterator[gtsam.NonlinearFactor]:
+        at = gtsam.Values()
+        at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
+        at.insert(V(k), belief.v_world)
+        at.insert(B(k), _constant_bias(belief.bias))
         to_world = np.eye(15)
-        to_world[6:9, 6:9] = self._prior.T_world_imu[:3, :3]
-        root = np.linalg.inv(np.linalg.cholesky(to_world @ self._prior.cov @ to_world.T))
-        blocks = (X(0), root[:, :6], V(0), root[:, 6:9], B(0), root[:, 9:])
-        whitened = gtsam.JacobianFactor(*blocks, np.zeros(15), gtsam.noiseModel.Unit.Create(15))
-        yield gtsam.LinearContainerFactor(whitened, start)
+        to_world[6:9, 6:9] = belief.T_world_imu[:3, :3]
+        root = _root_information(to_world @ belief.cov @ to_world.T)
+        yield _linear(at, {X(k): root[:, :6], V(k): root[:, 6:9], B(k): root[:, 9:]})
 
     def step(self, motion: Motion, bias: Array, k: int) -> Iterator[gtsam.NonlinearFactor]:
         assert isinstance(motion, ImuMotion)
@@ -106,3 +100,16 @@ class _ImuGraph:
 
 def _constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:
     return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
+
+
+def _root_information(cov: Array) -> Array:
+    """Return a square root of the inverse of a covariance (d, d)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+
+
+def _linear(at: gtsam.Values, blocks: dict[int, Array]) -> gtsam.NonlinearFactor:
+    """Hold several variables jointly: what their errors have in common says as much as their variances."""
+    size = len(next(iter(blocks.values())))
+    keys_and_blocks: list[Any] = [part for block in blocks.items() for part in block]
+    whitened = gtsam.JacobianFactor(*keys_and_blocks, np.zeros(size), gtsam.noiseModel.Unit.Create(size))
+    return gtsam.LinearContainerFactor(whitened, at)

@@ -6,7 +6,7 @@ landmark, and the filter is too sure of itself: its covariance does not grow wit
 
 import numpy as np
 
-from filters.kalman.belief import initial_belief
+from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
 from filters.kalman.diagnostics import Innovation
 from filters.kalman.gate import STEREO_GATE
@@ -14,7 +14,7 @@ from filters.kalman.landmarks import TrackedMap
 from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import IntArray
 from toolkit.sequence import Packet
 
 # This filter is too sure of itself for its gate to speak for a smoother, which relinearises: only a sighting this
@@ -33,9 +33,9 @@ class DecoupledEkf:
         self._mismatched: IntArray = np.empty(0, dtype=np.int64)
 
     @property
-    def bias(self) -> Array:
-        """Return the latest bias (6,) [accel, gyro]."""
-        return self._belief.bias
+    def belief(self) -> Belief:
+        """Return what the filter believes of the IMU now."""
+        return self._belief
 
     @property
     def mismatched(self) -> IntArray:
