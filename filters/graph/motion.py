@@ -5,6 +5,7 @@ biases. A smoother uses either without knowing which.
 """
 
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any, Protocol
 
 import gtsam
@@ -110,6 +111,6 @@ def _root_information(cov: Array) -> Array:
 def _linear(at: gtsam.Values, blocks: dict[int, Array]) -> gtsam.NonlinearFactor:
     """Hold several variables jointly: what their errors have in common says as much as their variances."""
     size = len(next(iter(blocks.values())))
-    keys_and_blocks: list[Any] = [part for block in blocks.items() for part in block]
-    whitened = gtsam.JacobianFactor(*keys_and_blocks, np.zeros(size), gtsam.noiseModel.Unit.Create(size))
+    arguments: Any = [*chain.from_iterable(blocks.items()), np.zeros(size), gtsam.noiseModel.Unit.Create(size)]
+    whitened = gtsam.JacobianFactor(*arguments)
     return gtsam.LinearContainerFactor(whitened, at)

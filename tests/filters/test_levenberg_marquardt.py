@@ -9,6 +9,7 @@ import pytest
 
 from filters.graph.levenberg_marquardt import Stopping, solve
 from filters.graph.motion import motion_graph
+from filters.kalman.belief import initial_belief
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
@@ -28,7 +29,7 @@ class Problem:
         setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
         motion, maker = motion_graph(setup), StereoFactors(sequence.rig)
         self.graph, self.start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for factor in motion.prior():
+        for factor in motion.hold(initial_belief(sequence.prior, sequence.motion_kind), 0):
             self.graph.add(factor)
         truth, rng = sequence.truth, np.random.default_rng(5)
         for k, packet in enumerate(self.packets):
