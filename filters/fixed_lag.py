@@ -45,7 +45,8 @@ class FixedLag:
         except RuntimeError as refusal:
             if "Indeterminate" not in str(refusal):
                 raise
-            values = self._restarted(packet)
+            grown = self._restarted(packet)
+            values = self._updated(grown, packet.frame.t_ns)
         self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, packet.frame.t_ns))
         self._read(values, packet)
         return self._states[-1]
@@ -59,13 +60,13 @@ class FixedLag:
         self._smoother.update(grown.factors, grown.values, dict.fromkeys(keys, t_ns / NS_PER_S))
         return self._smoother.calculateEstimate()
 
-    def _restarted(self, packet: Packet) -> gtsam.Values:
-        """Begin a new window at this packet, from the state predicted for it."""
+    def _restarted(self, packet: Packet) -> Grown:
+        """Begin a new window at this packet, from the state predicted for it, and return what it begins with."""
         self._log.append(f"frame {packet.index}: the window's system was indeterminate; started afresh from here")
         self._smoother = _smoother(self._lag_s)
         self._first_in_window = packet.index
         self._last_seen_ns.clear()
-        return self._updated(self._growth.afresh(packet), packet.frame.t_ns)
+        return self._growth.afresh(packet)
 
     def _read(self, values: gtsam.Values, packet: Packet) -> None:
         """Take over every state and landmark of the window; what leaves it stays as last read."""

@@ -128,6 +128,7 @@ class Run:
     """One estimator on one sequence: both kinds of output, the map, diagnostics per step, cost and status.
 
     ``causal`` is what was known at each frame and is None for an estimator that answers only at the end.
+    ``timings`` is None for another system's run, read from a file and not made here.
     ``info`` holds the diagnostics of the causal estimates by name, each (N,), NaN where one was not given.
     """
 
@@ -136,10 +137,16 @@ class Run:
     causal: Trajectory | None
     final: Trajectory | None
     landmarks: Landmarks
-    timings: Timings
+    timings: Timings | None
     info: Mapping[str, Array] = field(default_factory=dict)
     log: tuple[str, ...] = ()
 
     def trajectory(self, output: Output) -> Trajectory | None:
         """Return the trajectory of one kind of output."""
         return self.causal if output == "causal" else self.final
+
+    @property
+    def final_is_causal(self) -> bool:
+        """Say whether the final word is what was said at each frame, as a filter's is."""
+        causal, final = self.causal, self.final
+        return causal is not None and final is not None and np.array_equal(causal.T_world_imu, final.T_world_imu)

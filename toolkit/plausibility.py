@@ -17,8 +17,10 @@ from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models import imu, twist
 from toolkit.sequence import ImuNoise, Packet, Sequence, TwistMotion, TwistNoise
 
+# A windowed filter puts corrections off and then makes several frames' worth at once: five times the covariance.
+_LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
-FAR_STEP = float(chdtri(6, 1e-6))
+FAR_STEP = _LUMP_FRAMES * float(chdtri(6, 1e-6))
 # Mismatches and poor noise figures make some steps far in healthy runs too; a tenth of all is no accident.
 MOST_FAR_STEPS = 0.10
 # What a correction may do beyond the noise of an IMU, whose velocity and biases it corrects as well:

@@ -149,7 +149,7 @@ def _rows(text: str) -> dict[tuple[str, ...], list[str]]:
         words = line.split()
         if re.match(r"\S+: \d+ frames, ", line):
             sequence = words[0]
-        elif words[1:2] in (["causal"], ["final"]):
+        elif words[1:2] in (["causal"], ["final"], ["both"]):
             rows[sequence, *words[:3]] = words[3:]
     return rows
 

@@ -13,10 +13,20 @@ from toolkit.report.table import COLUMNS, as_markdown, as_text, comparison_table
 from toolkit.report.terminal import comparison_text
 
 
-def test_every_output_of_every_run_has_a_line(comparison: Comparison) -> None:
-    lines = as_text(comparison_table(comparison)).splitlines()
+def test_every_output_of_every_run_has_a_line_or_shares_one(comparison: Comparison) -> None:
+    lines = [line.split()[:3] for line in as_text(comparison_table(comparison)).splitlines()]
     for row in comparison.rows:
-        assert any(line.split()[:3] == [row.estimator, row.output, row.status] for line in lines)
+        label = "both" if row.run.final_is_causal else row.output
+        assert lines.count([row.estimator, label, row.status]) == 1
+
+
+def test_outputs_that_differ_have_lines_of_their_own(comparison: Comparison) -> None:
+    run = next(run for run in comparison.runs if run.final_is_causal)
+    moved = replace(run.final, T_world_imu=run.final.T_world_imu + np.eye(4, k=3)[None])
+    parted = replace(run, final=moved)
+    rows = tuple(replace(row, run=parted) if row.run is run else row for row in comparison.rows)
+    table = comparison_table(replace(comparison, rows=rows))
+    assert [cells[1] for cells in table.rows if cells[0] == run.estimator] == ["causal", "final"]
 
 
 def test_text_and_markdown_have_the_same_cells(comparison: Comparison) -> None:

@@ -1,6 +1,7 @@
 """Recordings: one module a source. A file dropped into this package is a new format or a new built-in sequence.
 
-A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both. It imports nothing heavy at its
+A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
+estimates of other systems is :class:`BringsReferences` too. It imports nothing heavy at its
 top, because all modules are imported to recognise a path. Parts they share live in the sub-package ``parts``.
 """
 
@@ -13,6 +14,7 @@ from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
 from toolkit.sequence import Sequence
 
 Maker = Callable[[int], Sequence]
@@ -30,6 +32,17 @@ class RecordingFormat(Protocol):
 
     def load(self, path: Path) -> Sequence:
         """Read the recording, its faults included; raise DataError where it cannot be read at all."""
+
+
+@runtime_checkable
+class BringsReferences(Protocol):
+    """A format whose recordings may hold what other systems estimated from them."""
+
+    def references(self, path: Path) -> Mapping[str, Trajectory]:
+        """Read those estimates, by the name a reader sees: the system's, then its file's in brackets.
+
+        Return none where the recording holds none; raise DataError where one cannot be read.
+        """
 
 
 @runtime_checkable
@@ -74,10 +87,26 @@ def load_sequence(source: str, seed: int = 0) -> Sequence:
     if source in built_ins():
         return built_ins()[source](seed)
     path = Path(source).expanduser()
+    return _reader_of(path, source).load(path)
+
+
+def load_references(source: str) -> dict[str, Trajectory]:
+    """Load what other systems estimated from a recording, by name; none where it holds none, or is built in.
+
+    Raises DataError as :func:`load_sequence` does, or where such an estimate cannot be read.
+    """
+    if source in built_ins():
+        return {}
+    path = Path(source).expanduser()
+    reader = _reader_of(path, source)
+    return dict(reader.references(path)) if isinstance(reader, BringsReferences) else {}
+
+
+def _reader_of(path: Path, source: str) -> RecordingFormat:
     _check_readable(path, source)
     for reader in _readers().values():
         if reader.recognises(path):
-            return reader.load(path)
+            return reader
     raise DataError(f"{source}: its content is of no known format; there are {', '.join(formats())}")
 
 

@@ -1,7 +1,11 @@
 """Exports of the OpenVINS simulator: a folder with calib.json and imu, features and truth_cam as csv or csv.gz.
 
+What OpenVINS itself made of the recording may lie beside them as est.txt.
+
 World z is up; accelerations are specific force; T_imu_cam takes the camera to the IMU, and quaternions (w first) take
 the IMU to the world: so read, the truth reprojects the next frame to 1.2 px with 1 px noise, and not to 8 px or more.
+The estimate's q_GtoI is a JPL quaternion of the opposite rotation, x y z w: the same four numbers as Hamilton's of the
+IMU to the world.
 Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
@@ -17,8 +21,10 @@ from toolkit.datasets.parts.csv_table import find_table, first_line, read_column
 from toolkit.datasets.parts.fields import Fields, check_frame_count
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
+from toolkit.datasets.parts.text_table import read_rows
 from toolkit.datasets.parts.truth_file import checked_poses
 from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
 from toolkit.geometry import IntArray, se3, se3_inverse
 from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
 
@@ -29,6 +35,10 @@ _TRUTH_COLUMNS = (
     *("timestamp", "px", "py", "pz", "qx", "qy", "qz", "qw"),
     *("vx", "vy", "vz", "bax", "bay", "baz", "bgx", "bgy", "bgz"),
 )
+_ESTIMATE = "est.txt"
+_ESTIMATE_COLUMNS = "t qx qy qz qw px py pz vx vy vz bgx bgy bgz bax bay baz"
+_ESTIMATE_KIND = "it is OpenVINS' own estimate, one state a line: export it again, or remove it to compare without it"
+_TUM_ORDER = (0, 5, 6, 7, 1, 2, 3, 4)
 _NOISE_KEYS = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _REQUIRED = (
@@ -73,6 +83,19 @@ def load(path: Path) -> Sequence:
         truth=_truth(path),
         gravity_world=calibration.constant("gravity_world", 3),
     )
+
+
+def references(path: Path) -> dict[str, Trajectory]:
+    """Read what OpenVINS estimated, where the export holds it.
+
+    Raises DataError, naming the line, where it is damaged.
+    """
+    estimate = path / _ESTIMATE
+    if not estimate.exists():
+        return {}
+    line_numbers, table = read_rows(estimate, _ESTIMATE_COLUMNS, _ESTIMATE_KIND)
+    t_ns, T_world_imu = checked_poses(estimate, line_numbers, table[:, _TUM_ORDER])
+    return {f"openvins ({_ESTIMATE})": Trajectory(t_ns, T_world_imu)}
 
 
 def _tables(folder: Path) -> tuple[Path, Path]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from toolkit.estimate import Timings
 from toolkit.geometry import Array
 from toolkit.metrics.common.judged import Judged
 from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
@@ -20,11 +21,13 @@ METRICS = {
 def score(judged: Judged) -> Scores:
     """Score the run's timings; the same for both kinds of output, which come from one run."""
     timings = judged.run.timings
+    if timings is None:
+        raise Unavailable("not run here")
     return evaluate(
         {
-            "frame_ms_mean": lambda: float(np.mean(_steps_ms(judged))),
-            "frame_ms_p95": lambda: float(np.percentile(_steps_ms(judged), 95.0)),
-            "frame_ms_max": lambda: float(np.max(_steps_ms(judged))),
+            "frame_ms_mean": lambda: float(np.mean(_steps_ms(timings))),
+            "frame_ms_p95": lambda: float(np.percentile(_steps_ms(timings), 95.0)),
+            "frame_ms_max": lambda: float(np.max(_steps_ms(timings))),
             "total_s": lambda: timings.total_s,
             "cpu_s": lambda: timings.cpu_s,
             "peak_rss_mb": lambda: _measured(timings.peak_rss_mb),
@@ -32,8 +35,8 @@ def score(judged: Judged) -> Scores:
     )
 
 
-def _steps_ms(judged: Judged) -> Array:
-    steps_s = np.asarray(judged.run.timings.step_s)
+def _steps_ms(timings: Timings) -> Array:
+    steps_s = np.asarray(timings.step_s)
     if not steps_s.size:
         raise Unavailable("the run made no step")
     return 1e3 * steps_s

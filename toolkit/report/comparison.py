@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -32,6 +33,11 @@ class Row:
         """Return how the run ended."""
         return self.run.status
 
+    @property
+    def label(self) -> str:
+        """Return the kind of output, or "both" where one line serves for the two."""
+        return "both" if self.run.final_is_causal else self.output
+
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
@@ -50,12 +56,22 @@ class Comparison:
     changes: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def lines(self) -> tuple[Row, ...]:
+        """Return the rows to print: a final answer that only repeats the causal one has no line of its own."""
+        return tuple(row for row in self.rows if not (row.output == "final" and row.run.final_is_causal))
+
+    @property
     def all_ok(self) -> bool:
         """Say whether every estimator ran to the end with a plausible answer."""
         return all(run.status == "ok" for run in self.runs)
 
 
 Start = Literal["measurements", "truth"]
+
+
+def plain_name(name: str) -> str:
+    """Return a name as one of a file, without blanks, brackets and the like; it may come out empty."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._")
 
 
 def outputs_of(run: Run) -> tuple[Output, ...]:

@@ -9,6 +9,8 @@ from toolkit.report.words import finding_lines, missing_lines, remark_lines, seq
 _HOW_TO_READ = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
 estimator knew at each frame, a **final** line on what it said when it had seen everything; compare like with like.
+A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
+read from that file and scored by the same rules.
 
 - **pairs, cover**: how many poses were compared with the truth, and the share of the frames that have an answer at all.
   An error over half a recording is not half an error: read it beside its coverage.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from toolkit.report import manifest, metrics_json
 from toolkit.report.atomic import check_replaceable, replaced_directory
-from toolkit.report.comparison import Comparison
+from toolkit.report.comparison import Comparison, plain_name
 from toolkit.report.figures import write_figures
 from toolkit.report.report_md import report_text
 from toolkit.report.trajectory_files import write_landmarks, write_tum
@@ -50,9 +50,9 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            write_tum(trajectory, trajectories / f"{row.estimator}_{row.output}.tum")
+            write_tum(trajectory, trajectories / f"{plain_name(row.estimator)}_{row.output}.tum")
     for run in comparison.runs:
-        write_landmarks(run.landmarks, landmarks / f"{run.estimator}.csv")
+        write_landmarks(run.landmarks, landmarks / f"{plain_name(run.estimator)}.csv")
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -1,6 +1,5 @@
 """From sources to run directories: load, audit, start, run, score, write; what ``vislam compare`` does."""
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -8,13 +7,14 @@ from pathlib import Path
 
 from toolkit import runner
 from toolkit.audit import Audit, audit
-from toolkit.datasets import load_sequence
+from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.parts.truth_file import load_truth, with_truth
 from toolkit.estimate import Output, Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.metrics import Scores, describe, score_run
 from toolkit.report.atomic import check_parent
-from toolkit.report.comparison import Comparison, Row, Start, outputs_of
+from toolkit.report.comparison import Comparison, Row, Start, outputs_of, plain_name
+from toolkit.report.references import reference_runs
 from toolkit.report.run_directory import check_run_directory, write_run
 from toolkit.runner import Progress
 from toolkit.sequence import Prior, Sequence, Truth
@@ -48,10 +48,11 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """One audited sequence with its start and the directory its results go to."""
+    """One audited sequence with its start, the runs its recording brings, and the directory its results go to."""
 
     audited: Audit
     prior: Prior
+    references: tuple[Run, ...]
     directory: Path
 
 
@@ -69,20 +70,27 @@ def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[C
     else:
         check_parent(request.out)  # its sub-directories are checked once the sequences' names are known
     for case in _cases(request, progress_for):
-        comparison = compare(case.audited, case.prior, builds, progress_for)
+        comparison = compare(case.audited, case.prior, builds, progress_for, case.references)
         comparison = replace(comparison, changes=changes_of(request, entries))
         with progress_for(f"{comparison.sequence.name}: figures and report"):
             write_run(comparison, case.directory, command=request.command, seed=request.seed)
         yield comparison, case.directory
 
 
-def compare(audited: Audit, prior: Prior, builds: Mapping[str, Build], progress_for: ProgressFor) -> Comparison:
-    """Run and score every estimator on the same audited sequence from the same prior."""
+def compare(
+    audited: Audit,
+    prior: Prior,
+    builds: Mapping[str, Build],
+    progress_for: ProgressFor,
+    references: tuple[Run, ...] = (),
+) -> Comparison:
+    """Run and score every estimator on the same audited sequence from the same prior; score the references too."""
     sequence = audited.sequence
     runs = []
     for name, build in builds.items():
         with progress_for(f"{sequence.name}: {name}") as progress:
             runs.append(runner.run(name, build, sequence, prior, progress))
+    runs += references
     rows = tuple(
         Row(one, output, _score(one, output, sequence))
         for one in runs
@@ -114,10 +122,11 @@ def load_audited(source: str, truth: Truth | None, keep: frozenset[str], seed: i
 def _cases(request: Request, progress_for: ProgressFor) -> list[_Case]:
     """Prepare every sequence before any estimator runs; several go into sub-directories by name."""
     truth = None if request.truth is None else load_truth(request.truth)
-    audits = []
+    audits, references = [], []
     for source in request.sources:
         with progress_for(f"{source}: loading and checking"):
             audits.append(load_audited(source, truth, request.keep, request.seed))
+            references.append(load_references(source))
     if request.max_frames is not None:
         # Only now: the audit judges slow faults (a bias, a lag) better on the whole recording.
         audits = [replace(a, sequence=a.sequence.truncated(request.max_frames)) for a in audits]
@@ -126,14 +135,17 @@ def _cases(request: Request, progress_for: ProgressFor) -> list[_Case]:
     for directory in directories:
         check_run_directory(directory)
     start = STARTS[request.start]
-    return [_Case(a, start(a.sequence), d) for a, d in zip(audits, directories, strict=True)]
+    return [
+        _Case(a, start(a.sequence), reference_runs(brought, a.sequence), d)
+        for a, brought, d in zip(audits, references, directories, strict=True)
+    ]
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
     """Turn sequence names into directory names, all different; a second ``drive`` becomes ``drive-2``."""
     taken: list[str] = []
     for name in names:
-        plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip(".") or "sequence"
+        plain = plain_name(name) or "sequence"
         candidate, n = plain, 2
         while candidate in taken:
             candidate, n = f"{plain}-{n}", n + 1

@@ -52,12 +52,15 @@ class Table(NamedTuple):
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """Return one row for each kind of output; pairs and coverage always, other metrics where some row has one."""
+    """Return one row for each kind of output that says something of its own.
+
+    Pairs and coverage always have a column, other metrics where some row has one.
+    """
     columns = [c for c in COLUMNS if c.key in ("pairs", "coverage_percent") or _has_value(comparison, c.key)]
     changes = _changes(comparison)
     rows = tuple(
-        (row.estimator, row.output, row.status, *change, *(_cell(row, column) for column in columns))
-        for row, change in zip(comparison.rows, changes, strict=True)
+        (row.estimator, row.label, row.status, *change, *(_cell(row, column) for column in columns))
+        for row, change in zip(comparison.lines, changes, strict=True)
     )
     labels = (*_LABELS, _CHANGE) if comparison.changes else _LABELS
     return Table((*labels, *(c.heading for c in columns)), rows, labels=len(labels))
@@ -66,8 +69,8 @@ def comparison_table(comparison: Comparison) -> Table:
 def _changes(comparison: Comparison) -> list[tuple[str, ...]]:
     """Return a cell a row with what its estimator changes, told once an estimator; no cells without a ladder."""
     if not comparison.changes:
-        return [()] * len(comparison.rows)
-    names = [row.estimator for row in comparison.rows]
+        return [()] * len(comparison.lines)
+    names = [row.estimator for row in comparison.lines]
     return [("" if name in names[:i] else comparison.changes.get(name, ""),) for i, name in enumerate(names)]
 
 
@@ -96,7 +99,7 @@ def as_markdown(table: Table) -> str:
 
 
 def _has_value(comparison: Comparison, key: str) -> bool:
-    return any(row.scores.values.get(key) is not None for row in comparison.rows)
+    return any(row.scores.values.get(key) is not None for row in comparison.lines)
 
 
 def _cell(row: Row, column: Column) -> str:

@@ -73,7 +73,7 @@ def missing_lines(comparison: Comparison) -> Iterator[str]:
 
     A run without any answer is explained by its status already and left out here.
     """
-    rows = [row for row in comparison.rows if row.run.trajectory(row.output) is not None]
+    rows = [row for row in comparison.lines if row.run.trajectory(row.output) is not None]
     empty: dict[tuple[str, str], list[str]] = {}
     for column in COLUMNS:
         by_reason: dict[str, list[Row]] = {}
@@ -105,7 +105,7 @@ def remark_lines(comparison: Comparison) -> Iterator[str]:
 
 def _remarks(comparison: Comparison, wanted: Callable[[str], bool]) -> Iterator[str]:
     """Yield each remark once, behind the metrics and the rows it is about."""
-    rows = [row for row in comparison.rows if row.run.trajectory(row.output) is not None]
+    rows = [row for row in comparison.lines if row.run.trajectory(row.output) is not None]
     noted: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         for key, note in row.scores.notes.items():

@@ -11,11 +11,13 @@ import numpy as np
 
 from toolkit.cutting import NS_PER_S
 from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.parts.text_table import read_rows
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, rotation_from_quaternion, se3, so3_log
 from toolkit.sequence import Sequence, Truth
 
-_COLUMNS = 8
+_COLUMNS = "t x y z qx qy qz qw"
+_KIND = "a truth file is TUM text, one pose a line"
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
 _UNIT_TOLERANCE = 1e-2
 # A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
@@ -37,7 +39,7 @@ def load_truth(path: Path) -> Truth:
     eight finite numbers a line, time does not increase or is not in seconds, or quaternions are not unit
     length or look w first.
     """
-    line_numbers, table = _table(path)
+    line_numbers, table = read_rows(path, _COLUMNS, _KIND)
     t_ns, T_world_imu = checked_poses(path, line_numbers, table)
     if _looks_w_first(table[:, 1:4], table[:, 4:]):
         raise DataError(f"{path}: {_W_FIRST}")
@@ -76,31 +78,6 @@ def with_truth(sequence: Sequence, truth: Truth) -> Sequence:
     if _rates_fit_w_first(sequence, truth):
         raise DataError(f"{sequence.name}: the truth turns as the gyro says only if read w first; {_W_FIRST}")
     return replace(sequence, truth=truth)
-
-
-def _table(path: Path) -> tuple[list[int], Array]:
-    """Return the line numbers and the rows (N, 8) of a file."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file; a truth file is TUM text, one pose a line") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    lines = [(n, line.partition("#")[0].split()) for n, line in enumerate(text.splitlines(), start=1)]
-    rows = [(n, words) for n, words in lines if words]
-    if not rows:
-        raise DataError(f"{path}: the file holds no poses; a truth file is TUM text, one pose a line")
-    return [n for n, _ in rows], np.array([_numbers(path, n, words) for n, words in rows])
-
-
-def _numbers(path: Path, line_number: int, words: list[str]) -> list[float]:
-    if len(words) != _COLUMNS:
-        hint = "; columns are separated by blanks, not commas" if any("," in word for word in words) else ""
-        raise DataError(f"{path}: line {line_number} has {len(words)} columns, expected 8 (t x y z qx qy qz qw){hint}")
-    try:
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise DataError(f"{path}: line {line_number} is not numeric ({error}); expected t x y z qx qy qz qw") from error
 
 
 def _w_first(quaternions: Array) -> Array:

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from toolkit.cutting import NS_PER_S
-from toolkit.estimate import Run
 from toolkit.geometry import Array
 from toolkit.metrics.common.alignment import Alignment
 from toolkit.report.comparison import Comparison, Row
@@ -40,7 +39,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         trajectory = row.run.trajectory(row.output)
         if trajectory is None or trajectory.T_world_imu is reference.truth.T_world_imu:
             continue
-        if row.output == "causal" and _says_the_same(row.run):
+        if row.output == "causal" and row.run.final_is_causal:
             continue
         errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
         if errors is not None:
@@ -62,8 +61,12 @@ def _truth(comparison: Comparison) -> _Reference | None:
 
 
 def _last_good_answer(comparison: Comparison) -> _Reference | None:
-    """Take the last trajectory of a run that is ok for the reference: with the defaults, the smoother's."""
-    for row in reversed(comparison.rows):
+    """Take the last trajectory made here of a run that is ok: with the defaults, the smoother's.
+
+    Only where there is none is it one that was read from a file.
+    """
+    made_here_last = sorted(comparison.rows, key=lambda row: row.run.timings is not None)
+    for row in reversed(made_here_last):
         trajectory = row.run.trajectory(row.output)
         if row.status == "ok" and trajectory is not None:
             name = f"{row.estimator} {row.output}"
@@ -84,7 +87,7 @@ def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference:
         t_s = (errors.t_ns - start_ns) / NS_PER_S
         look = {"color": colour_of(comparison, row.estimator), "linestyle": line_of(row.output)}
         width = width_of(comparison, row.estimator)
-        label = f"{row.estimator} {'causal = final' if _says_the_same(row.run) else row.output}"
+        label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
         position.plot(t_s, errors.position_m, linewidth=width, label=label, **look)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
     quiet(position, f"{comparison.sequence.name}: position {reference.what}", "", "position [m]")
@@ -94,13 +97,6 @@ def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference:
     heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
     figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
     return NamedFigure("errors_over_time", reference.caption, figure)
-
-
-def _says_the_same(run: Run) -> bool:
-    """Say whether both outputs of a run agree, as a filter's do; one line then stands for both."""
-    if run.causal is None or run.final is None:
-        return False
-    return np.array_equal(run.causal.T_world_imu, run.final.T_world_imu)
 
 
 def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:

@@ -15,18 +15,18 @@ _SMOOTHED_FRAMES = 15
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the time of each step by frame, on a logarithmic axis, with the finish in the legend."""
-    timed = [run for run in comparison.runs if run.timings.step_s.size]
+    timed = [(run, run.timings) for run in comparison.runs if run.timings is not None and run.timings.step_s.size]
     if not timed:
         return
     figure = new_figure(9.6, 4.2)
     axes = figure.add_subplot()
-    for run in timed:
-        step_ms = np.maximum(run.timings.step_s * _MS, 1e-4)
+    for run, timings in timed:
+        step_ms = np.maximum(timings.step_s * _MS, 1e-4)
         colour = colour_of(comparison, run.estimator)
         axes.plot(step_ms, ".", color=colour, markersize=2.5, alpha=0.35)
         label = f"{run.estimator}: mean {float(step_ms.mean()):.2f} ms"
-        if run.timings.finish_s > run.timings.step_s.sum():
-            label += f",\nthen {run.timings.finish_s:.1f} s at the end"
+        if timings.finish_s > timings.step_s.sum():
+            label += f",\nthen {timings.finish_s:.1f} s at the end"
         axes.plot(_running_median(step_ms), color=colour, linewidth=width_of(comparison, run.estimator), label=label)
     axes.set_yscale("log")
     low, high = axes.get_ylim()

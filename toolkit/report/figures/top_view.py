@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from toolkit.estimate import Output, Run
 from toolkit.geometry import Array
-from toolkit.report.comparison import Comparison
+from toolkit.report.comparison import Comparison, plain_name
 from toolkit.report.figures.alignment import alignment_words, onto_truth, truth_during
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
@@ -57,7 +57,7 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
     caption = (
         f"Trajectory of {run.estimator} from above, from the dot on; {mapped}. {alignment_words(comparison.sequence)}"
     )
-    return NamedFigure(f"top_{run.estimator}", caption, figure)
+    return NamedFigure(f"top_{plain_name(run.estimator)}", caption, figure)
 
 
 def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
