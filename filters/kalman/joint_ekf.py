@@ -38,9 +38,8 @@ class JointEkf:
             self._propagate(packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
-        self._forget_lost(packet.frame)
-        if len(self._joint.landmark_ids):
-            self._correct(packet.frame, innovation)
+        joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
+        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, innovation)
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
         return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())
@@ -53,20 +52,6 @@ class JointEkf:
     def _propagate(self, motion: Motion) -> None:
         step = self._predictor.step(self._joint.core, motion)
         self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
-
-    def _forget_lost(self, frame: StereoFrame) -> None:
-        lost = ~joint_landmarks.seen_again(self._joint, frame)
-        self._memory.remember(self._joint.landmark_ids[lost], self._joint.points[lost])
-        self._joint.forget_landmarks(lost)
-
-    def _correct(self, frame: StereoFrame, innovation: Innovation) -> None:
-        joint = self._joint
-        said = joint_landmarks.innovations(joint, frame, self._at, self._rig)
-        nis, accepted = joint_landmarks.gated(joint, said)
-        innovation.add(nis, np.full(len(nis), 3), accepted)
-        if accepted.any():
-            H, residuals = said.H[accepted], said.residuals[accepted]
-            joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), joint_landmarks.columns(joint))
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
+from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
@@ -23,9 +24,23 @@ class Innovations(NamedTuple):
     H: Array
 
 
-def seen_again(joint: JointBelief, frame: StereoFrame) -> BoolArray:
-    """Say which landmarks (L,) of the state the frame shows."""
-    return np.isin(joint.landmark_ids, frame.track_ids)
+def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
+    """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
+    lost = ~np.isin(joint.landmark_ids, frame.track_ids)
+    memory.remember(joint.landmark_ids[lost], joint.points[lost])
+    joint.forget_landmarks(lost)
+
+
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation) -> None:
+    """Correct everything by the landmarks of the state, every one of which the frame must show."""
+    if not len(joint.landmark_ids):
+        return
+    said = innovations(joint, frame, at, rig)
+    nis, accepted = gated(joint, said)
+    innovation.add(nis, np.full(len(nis), 3), accepted)
+    if accepted.any():
+        H, residuals = said.H[accepted], said.residuals[accepted]
+        joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
 
 
 def innovations(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> Innovations:

@@ -53,7 +53,8 @@ class SlidingWindowFilter:
             self._propagate(packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
-        self._correct_by_landmarks(packet.frame, innovation)
+        joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
+        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, innovation)
         self._tracks.add_frame(_without(packet.frame, self._joint))
         self._correct_by_tracks(innovation)
         if len(self._joint.clones) > self._size.clones:
@@ -68,21 +69,6 @@ class SlidingWindowFilter:
     def _propagate(self, motion: Motion) -> None:
         step = self._predictor.step(self._joint.core, motion)
         self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
-
-    def _correct_by_landmarks(self, frame: StereoFrame, innovation: Innovation) -> None:
-        """Correct by the landmarks of the state that the frame shows; marginalise those it does not."""
-        joint = self._joint
-        lost = ~joint_landmarks.seen_again(joint, frame)
-        self._memory.remember(joint.landmark_ids[lost], joint.points[lost])
-        joint.forget_landmarks(lost)
-        if not len(joint.landmark_ids):
-            return
-        said = joint_landmarks.innovations(joint, frame, self._at, self._rig)
-        nis, accepted = joint_landmarks.gated(joint, said)
-        innovation.add(nis, np.full(len(nis), 3), accepted)
-        if accepted.any():
-            H, residuals = said.H[accepted], said.residuals[accepted]
-            joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), joint_landmarks.columns(joint))
 
     def _correct_by_tracks(self, innovation: Innovation) -> None:
         """Let the tracks that ended speak, and those that span a full window before its oldest pose leaves."""
