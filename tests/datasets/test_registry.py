@@ -76,3 +76,9 @@ def test_a_path_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(DataError, match=r"cannot be read \(Not a directory\)"):
         load_sequence(str(tmp_path / "file" / "03.npz"))
+
+
+def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
+    (tmp_path / "drive.npz").touch()
+    with pytest.raises(DataError, match="is empty"):
+        load_sequence(str(tmp_path / "drive.npz"))

@@ -260,3 +260,9 @@ def test_the_committed_recordings_are_the_simulators(scenario: str, duration_s: 
     assert committed.truth is not None
     assert fresh.truth is not None
     np.testing.assert_allclose(committed.truth.T_world_imu, fresh.truth.T_world_imu, atol=1e-9)
+
+
+def test_a_file_in_the_way_of_the_folder_is_named(tmp_path: Path, drive: Sequence) -> None:
+    (tmp_path / "taken").touch()
+    with pytest.raises(OutputError, match="taken is a file"):
+        vislam_recording.save(drive, tmp_path / "taken" / "recording")

@@ -107,7 +107,9 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
     for reader in _readers().values():
         if reader.recognises(path):
             return reader
-    raise DataError(f"{source}: its content is of no known format; there are {', '.join(formats())}")
+    empty = path.is_file() and path.stat().st_size == 0
+    what = "the file is empty and so of no known format" if empty else "its content is of no known format"
+    raise DataError(f"{source}: {what}; there are {', '.join(formats())}")
 
 
 def _check_readable(path: Path, source: str) -> None:

@@ -88,7 +88,13 @@ def save(sequence: Sequence, directory: Path) -> None:
             (finished / _TEXT).write_text(text + "\n", encoding="utf-8")
             _put_in_place(finished, directory, Path(workshop) / "replaced")
     except OSError as error:
-        raise OutputError(f"cannot write {directory}: {error.strerror or error}; choose another folder") from error
+        raise OutputError(f"cannot write {directory}: {_cause(directory, error)}; choose another folder") from error
+
+
+def _cause(directory: Path, error: OSError) -> str:
+    """Say what stands in the way of a folder: a file in its path, or what the system says."""
+    in_the_way = next((parent for parent in directory.parents if parent.is_file()), None)
+    return f"{in_the_way} is a file" if in_the_way else error.strerror or str(error)
 
 
 def _entries(directory: Path) -> list[Path]:
