@@ -179,3 +179,14 @@ def test_a_start_from_truth_needs_truth_at_the_first_frame():
     late = replace(truth, t_ns=truth.t_ns[5:], T_world_imu=truth.T_world_imu[5:], v_world=None, bias=None)
     with pytest.raises(DataError, match="no truth at the first frame"):
         start_from_truth(replace(sequence, truth=late))
+
+
+def test_an_adjustment_without_a_sound_solution_is_said_and_not_raised(monkeypatch):
+    def refuse(graph, values):
+        raise RuntimeError("Indeterminate linear system detected while working near variable 1 (Symbol: v0).")
+
+    monkeypatch.setattr("toolkit.start.gtsam.Marginals", refuse)
+    sequence = replace(simulate(replace(FLIGHT, duration_s=3.0), 0), prior=None)
+    prior = start_from_measurements(sequence)
+    assert "no sound solution" in prior.source
+    assert np.isfinite(prior.cov).all()

@@ -42,7 +42,7 @@ def start_from_measurements(sequence: Sequence) -> Prior:
     attitudes = _attitudes(motions)
     tracks = _tracks_worth_using([p.frame for p in packets])
     if len(packets) < FEWEST_FRAMES or tracks.size < FEWEST_TRACKS:
-        return _blind(attitudes[0])
+        return _blind(attitudes[0], "there are too few tracks in the first frames")
     return _adjusted([_only(p.frame, tracks) for p in packets], motions, attitudes, sequence)
 
 
@@ -99,12 +99,13 @@ def _attitudes(motions: list[ImuMotion]) -> list[Array]:
     return [level @ turn for turn in turns]
 
 
-def _blind(attitude: Array) -> Prior:
+def _blind(attitude: Array, why: str) -> Prior:
+    """Return what the specific force alone says, and in its source why vision says nothing."""
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
     cov = 0.5 * (cov + cov.T)
-    source = "the specific force; velocity unknown and taken for zero, for there are too few tracks in the first frames"
+    source = f"the specific force; velocity unknown and taken for zero, for {why}"
     return Prior(se3(attitude, np.zeros(3)), np.zeros(3), np.zeros(6), cov, source)
 
 
@@ -159,10 +160,14 @@ def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: li
         if k:
             graph.add(factors.imu_factor(imu.preintegrate(motions[k - 1], np.zeros(6), params), k))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
-    solved = optimizer.optimize()
-    if not np.isfinite(optimizer.error()):
-        return _blind(attitudes[0])
-    return _first_state(graph, solved, len(frames))
+    try:
+        solved = optimizer.optimize()
+        if np.isfinite(optimizer.error()):
+            return _first_state(graph, solved, len(frames))
+    except RuntimeError as refusal:
+        if "Indeterminate" not in str(refusal):
+            raise
+    return _blind(attitudes[0], "the adjustment of the first frames has no sound solution")
 
 
 def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:

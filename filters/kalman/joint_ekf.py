@@ -10,12 +10,12 @@ from filters.kalman import joint_landmarks, multiview
 from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import Linearisation
+from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Sightings
 from filters.kalman.prediction import predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.sequence import Motion, Packet, StereoFrame
+from toolkit.sequence import Packet, StereoFrame
 
 
 class JointEkf:
@@ -35,7 +35,7 @@ class JointEkf:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
-            self._propagate(packet.motion)
+            propagate(self._joint, self._predictor, self._at, packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
@@ -48,10 +48,6 @@ class JointEkf:
         """Return every landmark there ever was, as last known."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
-
-    def _propagate(self, motion: Motion) -> None:
-        step = self._predictor.step(self._joint.core, motion)
-        self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""

@@ -59,3 +59,9 @@ class AtFirstEstimates:
     def points(self, joint: JointBelief) -> Array:
         """Return the landmarks as first estimated."""
         return joint.first_points
+
+
+def propagate(joint: JointBelief, predictor: Predictor, at: Linearisation, motion: Motion) -> None:
+    """Carry a joint belief over the motion between two frames, linearised as chosen."""
+    step = predictor.step(joint.core, motion)
+    joint.propagate(step, at.transition(predictor, joint, step, motion))

@@ -15,14 +15,14 @@ from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.gate import gate_at, mahalanobis_squared
 from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import Linearisation
+from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Constraints, Linearised, Sightings
 from filters.kalman.prediction import predictor
 from filters.kalman.tracks import WindowTracks
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray
-from toolkit.sequence import Motion, Packet, StereoFrame
+from toolkit.sequence import Packet, StereoFrame
 
 # An IMU ties poses over a second so well that tracks may take as long to speak. A measured twist is a
 # hundred times looser: a track that waits lets the pose run off, and its linearisation with it.
@@ -50,7 +50,7 @@ class SlidingWindowFilter:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
-            self._propagate(packet.motion)
+            propagate(self._joint, self._predictor, self._at, packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
@@ -65,10 +65,6 @@ class SlidingWindowFilter:
         """Return every landmark that was ever triangulated, as last known."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
-
-    def _propagate(self, motion: Motion) -> None:
-        step = self._predictor.step(self._joint.core, motion)
-        self._joint.propagate(step, self._at.transition(self._predictor, self._joint, step, motion))
 
     def _correct_by_tracks(self, innovation: Innovation) -> None:
         """Let the tracks that ended speak, and those that span a full window before its oldest pose leaves."""

@@ -1,29 +1,11 @@
 """Recordings small enough to write, spoil and read again in a test, and the way to the real ones."""
 
 import json
-import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-PROJECT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="session")
-def real() -> Callable[[str], Path]:
-    """Return a real recording by its place in the shared data, or skip where it is absent."""
-    root = Path(os.environ.get("VISLAM_DATA", "../shared/data"))
-
-    def find(name: str) -> Path:
-        path = PROJECT / root / name
-        if not path.exists():
-            pytest.skip(f"needs the real data {name} under VISLAM_DATA")
-        return path
-
-    return find
 
 
 @pytest.fixture
