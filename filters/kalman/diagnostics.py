@@ -8,12 +8,16 @@ from toolkit.geometry import Array, BoolArray, IntArray
 
 @dataclass
 class Innovation:
-    """The sum of the accepted NIS of a frame, its degrees of freedom, and how many passed the gate."""
+    """The sum of the accepted NIS of a frame, its degrees of freedom, and how many passed the gate.
+
+    ``unconverged`` counts iterated updates that were broken off.
+    """
 
     nis: float = 0.0
     dof: int = 0
     tested: int = 0
     accepted: int = 0
+    unconverged: int = 0
 
     def add(self, nis: Array, dof: IntArray, accepted: BoolArray) -> None:
         """Count N tests."""
@@ -29,6 +33,7 @@ class Innovation:
             "nis_dof": self.dof,
             "gate_tested": self.tested,
             "gate_accepted": self.accepted,
+            "unconverged": self.unconverged,
         }
 
 

@@ -4,14 +4,16 @@ Only this class touches the covariance. Every quantity that measurements lineari
 is estimated now, and as it was first estimated; which of the two a Jacobian uses is the filter's choice.
 """
 
+from copy import copy
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from filters.kalman.belief import Belief
 from filters.kalman.prediction import Step
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 
 
 class JointBelief:
@@ -100,18 +102,45 @@ class JointBelief:
 
     def update(self, H: Array, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
-        carried = H @ self._cov[columns]
-        root = np.linalg.cholesky(carried[:, columns] @ H.T + np.eye(len(residual)))
-        half_gain = solve_triangular(root, carried, lower=True, check_finite=False)
-        self.move(half_gain.T @ solve_triangular(root, residual, lower=True, check_finite=False))
+        root, half_gain = self._half_gain(H, columns)
         self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
+        self.move(half_gain.T @ solve_triangular(root, residual, lower=True, check_finite=False))
+
+    def learn(self, H: Array, columns: slice) -> None:
+        """Reduce the covariance by what whitened measurements with Jacobian (m, k) tell; the estimates stay."""
+        _, half_gain = self._half_gain(H, columns)
+        self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
+
+    def _half_gain(self, H: Array, columns: slice) -> tuple[Array, Array]:
+        """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
+        carried = H @ self._cov[columns]
+        root = np.asarray(np.linalg.cholesky(carried[:, columns] @ H.T + np.eye(len(H))), dtype=float)
+        half_gain: Array = solve_triangular(root, carried, lower=True, check_finite=False)
+        return root, half_gain
 
     def move(self, delta: Array) -> None:
         """Move every estimate by an error (n,); first estimates stay."""
+        self._displace(delta)
+
+    def displaced(self, delta: Array) -> Self:
+        """Return the estimates as a move would leave them; the covariance is still that before it."""
+        result = copy(self)
+        result._displace(delta)
+        return result
+
+    def _displace(self, delta: Array) -> None:
         d, clones = self._core.layout.size, self.clone_columns
         self._core = self._core.moved(delta[:d], self._core.cov)
         self.clones = self.clones @ se3_exp(delta[clones].reshape(-1, 6))
         self.points = self.points + delta[clones.stop :].reshape(-1, 3)
+
+    def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
+        """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
+
+        They are those of L measurements, each of the newest clone (L, 3, 6) and of a landmark (L, 3, 3).
+        """
+        newest = delta[self.clone_columns][-6:]
+        return H_pose @ se3_right_jacobian(newest), H_point
 
 
 def _symmetric(cov: Array) -> Array:

@@ -4,10 +4,13 @@ What it approximates: past poses and landmarks out of view are marginalised at o
 what is in view, and nothing is ever relinearised (Smith, Self & Cheeseman 1990; Bailey et al. 2006).
 """
 
+from collections.abc import Callable
+from typing import Protocol
+
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.belief import initial_belief
+from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
@@ -15,16 +18,34 @@ from filters.kalman.multiview import Sightings
 from filters.kalman.prediction import predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.sequence import Packet, StereoFrame
+from toolkit.sequence import Packet, StereoFrame, StereoRig
+
+
+class Correct(Protocol):
+    """Corrects a joint belief by the landmarks of its state, every one of which the frame must show."""
+
+    def __call__(
+        self, joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation, /
+    ) -> None:
+        """Correct and say what was tested."""
 
 
 class JointEkf:
-    """Propagate, correct pose and landmarks together, forget the landmarks lost, start those new."""
+    """Propagate, correct pose and landmarks together, forget the landmarks lost, start those new.
 
-    def __init__(self, setup: Setup, linearisation: Linearisation) -> None:
-        self._rig, self._at = setup.rig, linearisation
+    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is found.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        linearisation: Linearisation,
+        belief: Callable[[Belief], JointBelief] = JointBelief,
+        correct: Correct = joint_landmarks.correct,
+    ) -> None:
+        self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._predictor = predictor(setup)
-        self._joint = JointBelief(initial_belief(setup.prior, setup.motion_kind))
+        self._joint = belief(initial_belief(setup.prior, setup.motion_kind))
         self._memory = LandmarkMemory()
 
     @property
@@ -39,7 +60,7 @@ class JointEkf:
         self._joint.clone(packet.index)
         innovation = Innovation()
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, innovation)
+        self._correct(self._joint, packet.frame, self._at, self._rig, innovation)
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
         return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())

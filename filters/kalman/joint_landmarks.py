@@ -17,6 +17,15 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import StereoFrame, StereoRig
 
 
+class Seen(NamedTuple):
+    """Whitened residuals (L, 3) of the state's landmarks, Jacobians to pose (L, 3, 6) and landmark (L, 3, 3), depth."""
+
+    residuals: Array
+    H_pose: Array
+    H_point: Array
+    depth_m: Array
+
+
 class Innovations(NamedTuple):
     """Whitened residuals (L, 3) of the state's landmarks with Jacobians (L, 3, k) to clones and landmarks."""
 
@@ -35,33 +44,32 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     if not len(joint.landmark_ids):
         return
-    said = innovations(joint, frame, at, rig)
-    nis, accepted = gated(joint, said)
-    innovation.add(nis, np.full(len(nis), 3), accepted)
+    said = spread(joint, look(joint, frame, at, rig))
+    accepted = admitted(joint, said, innovation)
     if accepted.any():
         H, residuals = said.H[accepted], said.residuals[accepted]
         joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
 
 
-def innovations(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> Innovations:
+def look(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> Seen:
     """Return what the frame says of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
     rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    seen = Sightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
+    sightings = Sightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
     newest = joint.clones[-1:]
-    now = multiview.linearise(seen, joint.points, newest, newest, rig)
-    there = multiview.linearise(seen, at.points(joint), newest, at.clones(joint)[-1:], rig)
-    return Innovations(now.residuals[:, 0], _over_columns(joint, there.H_pose[:, 0], there.H_point[:, 0]))
+    now = multiview.linearise(sightings, joint.points, newest, newest, rig)
+    there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)
+    return Seen(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0])
 
 
-def _over_columns(joint: JointBelief, H_pose: Array, H_point: Array) -> Array:
+def spread(joint: JointBelief, seen: Seen) -> Innovations:
     """Spread Jacobians to the newest clone and to each landmark over the columns of all clones and landmarks."""
-    clones, count = 6 * len(joint.clones), len(H_pose)
+    clones, count = 6 * len(joint.clones), len(seen.H_pose)
     H = np.zeros((count, 3, clones + 3 * count))
-    H[:, :, clones - 6 : clones] = H_pose
+    H[:, :, clones - 6 : clones] = seen.H_pose
     own = H[:, :, clones:].reshape(count, 3, count, 3)
-    own[np.arange(count), :, np.arange(count), :] = H_point
-    return H
+    own[np.arange(count), :, np.arange(count), :] = seen.H_point
+    return Innovations(seen.residuals, H)
 
 
 def columns(joint: JointBelief) -> slice:
@@ -69,12 +77,14 @@ def columns(joint: JointBelief) -> slice:
     return slice(joint.clone_columns.start, joint.cov.shape[0])
 
 
-def gated(joint: JointBelief, said: Innovations) -> tuple[Array, BoolArray]:
-    """Return the NIS (L,) of each landmark's residual and whether it passes the gate."""
+def admitted(joint: JointBelief, said: Innovations, innovation: Innovation) -> BoolArray:
+    """Return which landmarks' residuals (L,) pass the gate, and count them."""
     part = columns(joint)
-    spread = said.H @ joint.cov[part, part] @ np.swapaxes(said.H, 1, 2)
-    nis = mahalanobis_squared(said.residuals, spread + np.eye(3))
-    return nis, np.asarray(nis < STEREO_GATE)
+    predicted = said.H @ joint.cov[part, part] @ np.swapaxes(said.H, 1, 2)
+    nis = mahalanobis_squared(said.residuals, predicted + np.eye(3))
+    accepted = np.asarray(nis < STEREO_GATE)
+    innovation.add(nis, np.full(len(nis), 3), accepted)
+    return accepted
 
 
 def keep(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:

@@ -1,0 +1,87 @@
+"""A joint belief whose error is right-invariant: pose, velocity and landmarks are one element of a Lie group.
+
+With X = (R, p, v, l_1 ... l_L) in SE_{2+L}(3), the velocity only where it is part of the state, the error is the xi of
+``X = exp(xi) X_estimated``: one rotation theta of the whole world and a displacement rho of each of its vectors. In the
+errors of the other filters it is, to first order, ``theta = R phi``, ``rho_p = R delta_p + p x theta``, likewise for
+the velocity, and ``rho_l = delta_l + l x theta``. A shift of the world and a turn of it are then the same vectors
+xi whatever the estimate, so that Jacobians taken at ever new estimates agree on what nothing measures. The
+biases stay outside the group and are added (the "imperfect" invariant filter).
+
+Sources: Barrau & Bonnabel 2015, "An EKF-SLAM algorithm with consistency properties", sections III-IV; Barrau &
+Bonnabel 2017, "The invariant extended Kalman filter as a stable observer".
+"""
+
+from copy import copy
+
+import numpy as np
+
+from filters.kalman.belief import POSE, ROTATION
+from filters.kalman.joint import JointBelief
+from toolkit.geometry import Array, se3_adjoint, se3_inverse, se3_right_jacobian, skew, so3_left_jacobian
+
+
+class InvariantBelief(JointBelief):
+    """A joint belief that is corrected on the group.
+
+    The covariance stands in the coordinates of every joint belief: it can be read, propagated and given new landmarks
+    without conversion, for two errors that are functions of each other propagate alike. They differ only where an
+    estimate moves. What an update leaves is the covariance of the right-invariant error, so that is what
+    stays the same while the estimate moves, and the covariance kept here changes by the change of coordinates.
+    """
+
+    def move(self, delta: Array) -> None:
+        """Move every estimate by ``exp(xi)`` on the left, xi being the error ``delta`` (n,) at the estimate now."""
+        before = copy(self)
+        self._displace(delta)
+        carried = self._carried(before, self._carried(before, self._cov).T)
+        self._cov = 0.5 * (carried + carried.T)
+
+    def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
+        """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.
+
+        In the right-invariant error a sighting is blind to what turns or shifts the whole world: its Jacobian A to the
+        landmark's rho is minus that to the position's, and that to theta is zero. So only ``rho_l - rho_p`` counts,
+        and the left Jacobian of SE(3) at (theta, rho_l - rho_p) leads from there to the error before the move.
+        """
+        old, newest = self.clones[-1], delta[self.clone_columns][-6:]
+        turn, away = old[:3, :3], self.points - old[:3, 3]
+        theta, shift = turn @ newest[:3], turn @ newest[3:]
+        relative = delta[self.landmark_columns].reshape(-1, 3) - shift + np.cross(away, theta)
+        left = se3_right_jacobian(-np.column_stack([np.tile(theta, (len(away), 1)), relative]))
+        to_theta, to_rho = H_point @ left[:, 3:, :3], H_point @ left[:, 3:, 3:]
+        return np.concatenate([(to_theta + to_rho @ skew(away)) @ turn, -to_rho @ turn], axis=2), to_rho
+
+    def _displace(self, delta: Array) -> None:
+        super()._displace(self._on_the_group(delta))
+
+    def _on_the_group(self, delta: Array) -> Array:
+        """Return the error by which adding moves velocity and landmarks as the group's exponential map does.
+
+        ``exp(theta) l + J(theta) (delta_l + l x theta) = l + J(theta) delta_l``: a vector turns while it grows, as the
+        position does in the exponential map of a pose.
+        """
+        result, layout, phi = delta.copy(), self._core.layout, delta[ROTATION]
+        own = delta[self.landmark_columns].reshape(-1, 3)
+        turning = so3_left_jacobian(self._core.T_world_imu[:3, :3] @ phi)
+        result[self.landmark_columns] = (own @ turning.T).reshape(-1)
+        if layout.velocity is not None:
+            result[layout.velocity] = so3_left_jacobian(phi) @ delta[layout.velocity]
+        return result
+
+    def _carried(self, before: JointBelief, rows: Array) -> Array:
+        """Return errors (n, m) at the estimates before as errors at the estimates now, xi being the same.
+
+        Only differences of positions enter, so nothing is lost far from the origin.
+        """
+        result, old, new = rows.copy(), before.core, self._core
+        theta = old.T_world_imu[:3, :3] @ rows[ROTATION]
+        result[POSE] = se3_adjoint(se3_inverse(new.T_world_imu) @ old.T_world_imu) @ rows[POSE]
+        velocity = old.layout.velocity
+        if velocity is not None:
+            in_world = old.T_world_imu[:3, :3] @ rows[velocity] - skew(new.v_world - old.v_world) @ theta
+            result[velocity] = new.T_world_imu[:3, :3].T @ in_world
+        turns = se3_adjoint(se3_inverse(self.clones) @ before.clones)
+        of_clones = turns @ rows[self.clone_columns].reshape(len(turns), 6, rows.shape[1])
+        result[self.clone_columns] = of_clones.reshape(-1, rows.shape[1])
+        result[self.landmark_columns] -= (skew(self.points - before.points) @ theta).reshape(-1, rows.shape[1])
+        return result

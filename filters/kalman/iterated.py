@@ -1,0 +1,129 @@
+"""The iterated update: Gauss-Newton to the most probable state given the prediction and one frame.
+
+An EKF update is the first step of that iteration; every further one linearises where the last one ended (Bell & Cathey
+1993, "The iterated Kalman filter update as a Gauss-Newton method"; on a group Bourmaud, Mégret, Giremus & Berthoumieu
+2016, "From intrinsic optimization to iterated extended Kalman filtering on Lie groups"). A correction ``delta`` is
+kept as ``P pull``: its cost under the prediction is ``delta . pull``, and the covariance P is never inverted.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from filters.kalman import joint_landmarks
+from filters.kalman.diagnostics import Innovation
+from filters.kalman.joint import JointBelief
+from filters.kalman.joint_landmarks import Seen
+from filters.kalman.linearisation import Linearisation
+from toolkit.geometry import Array, BoolArray
+from toolkit.sequence import StereoFrame, StereoRig
+
+# In standard deviations of what is known after the update.
+NEGLIGIBLE_STEP = 1e-4
+MOST_STEPS, MOST_HALVINGS = 10, 6
+
+
+class Iterate(NamedTuple):
+    """A correction (n,) with the pull (k,) that makes it, what is seen from there, and the cost of both."""
+
+    delta: Array
+    pull: Array
+    seen: Seen
+    cost: float
+
+
+class Step(NamedTuple):
+    """A change of the pull (k,), and the length of what it changes in standard deviations after the update."""
+
+    pull: Array
+    length: float
+
+
+class Outcome(NamedTuple):
+    """The best correction that was found, and whether it is the most probable one."""
+
+    best: Iterate
+    converged: bool
+
+
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation) -> None:
+    """Correct everything by the landmarks of the state, every one of which the frame must show.
+
+    The gate is asked once, at the prediction. The covariance is reduced by Jacobians at the corrected estimate. An
+    iteration that does not converge ends at the lowest cost it has reached; where not even the first step
+    lowered it, the frame teaches nothing.
+    """
+    if not len(joint.landmark_ids):
+        return
+    seen = joint_landmarks.look(joint, frame, at, rig)
+    accepted = joint_landmarks.admitted(joint, joint_landmarks.spread(joint, seen), innovation)
+    measurement = Measurement(joint, frame, at, rig, accepted & (seen.depth_m > 0.0))
+    if not measurement.rows.any():
+        return
+    best, converged = most_probable(measurement)
+    innovation.unconverged += not converged
+    if converged or best.pull.any():
+        joint.move(best.delta)
+        H, _ = measurement.stacked(best.seen)
+        joint.learn(H, joint_landmarks.columns(joint))
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A prediction and some landmarks (L,) of a frame that are to correct it."""
+
+    prediction: JointBelief
+    frame: StereoFrame
+    at: Linearisation
+    rig: StereoRig
+    rows: BoolArray
+
+    def after(self, pull: Array) -> Iterate:
+        """Return the correction of a pull (k,)."""
+        delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
+        seen = joint_landmarks.look(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        prior = delta[joint_landmarks.columns(self.prediction)] @ pull
+        in_front = (seen.depth_m[self.rows] > 0.0).all()
+        cost = float(prior + np.square(seen.residuals[self.rows]).sum()) if in_front else np.inf
+        return Iterate(delta, pull, seen, cost)
+
+    def step(self, now: Iterate) -> Step:
+        """Return the step to the minimum of the cost linearised at a correction."""
+        part = joint_landmarks.columns(self.prediction)
+        P = self.prediction.cov[part, part]
+        H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
+        H, residuals = self.stacked(now.seen._replace(H_pose=H_pose, H_point=H_point))
+        carried = H @ P
+        innovation_cov = carried @ H.T + np.eye(len(H))
+        pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[part]) - now.pull
+        # |step|^2 in the metric P^-1 + H^T H
+        return Step(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
+
+    def stacked(self, seen: Seen) -> tuple[Array, Array]:
+        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
+        said = joint_landmarks.spread(self.prediction, seen)
+        return said.H[self.rows].reshape(-1, said.H.shape[2]), said.residuals[self.rows].reshape(-1)
+
+
+def most_probable(measurement: Measurement) -> Outcome:
+    """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
+    part = joint_landmarks.columns(measurement.prediction)
+    now = measurement.after(np.zeros(part.stop - part.start))
+    for _ in range(MOST_STEPS):
+        step = measurement.step(now)
+        if step.length < NEGLIGIBLE_STEP:
+            return Outcome(measurement.after(now.pull + step.pull), converged=True)
+        lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
+        if lower is None:
+            return Outcome(now, converged=False)
+        now = lower
+    return Outcome(now, converged=False)
+
+
+def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:
+    """Yield the correction after a step, after half of it, and so on."""
+    for halvings in range(MOST_HALVINGS + 1):
+        yield measurement.after(now.pull + 0.5**halvings * pull)

@@ -1,0 +1,309 @@
+"""The iterated update is the converged Gauss-Newton of a smoother with no lag, over the predicted Gaussian.
+
+The smoother is GTSAM's: the predicted joint belief as one factor on pose and landmarks, and the stereo factors that the
+graph estimators use.
+"""
+
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.kalman import iterated, joint_landmarks
+from filters.kalman.anchored import AnchoredBelief, inverse_depth, inverse_depth_jacobian
+from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.invariant import InvariantBelief
+from filters.kalman.joint import JointBelief
+from filters.kalman.joint_ekf import JointEkf
+from filters.kalman.linearisation import AtLatestEstimates, propagate
+from filters.kalman.prediction import predictor
+from toolkit.estimator import Setup
+from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
+from toolkit.models.factors import L, StereoFactors, X
+from toolkit.sequence import Sequence, StereoFrame, StereoRig
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+AT = AtLatestEstimates()
+both_kinds = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
+
+
+def recording(scenario, duration_s: float, tracks: int, seed: int = 3) -> Sequence:
+    return simulate(replace(scenario, duration_s=duration_s, camera=replace(scenario.camera, max_tracks=tracks)), seed)
+
+
+def setup_of(sequence: Sequence) -> Setup:
+    assert sequence.prior is not None
+    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+
+
+def anchored(rig: StereoRig):
+    return partial(AnchoredBelief, T_imu_cam=rig.T_imu_cam)
+
+
+class Scene(NamedTuple):
+    """A joint belief carried to a frame, the pose cloned, and that frame, showing the state's landmarks only."""
+
+    joint: JointBelief
+    frame: StereoFrame
+    rig: StereoRig
+
+    def measurement(self) -> iterated.Measurement:
+        return iterated.Measurement(self.joint, self.frame, AT, self.rig, np.ones(len(self.joint.points), dtype=bool))
+
+
+def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) -> Scene:
+    """Return a belief some standard deviations away from where it would have been."""
+    sequence = recording(scenario, 1.0, tracks=12)
+    ekf = JointEkf(setup_of(sequence), AT, belief(sequence.rig))
+    packets = list(sequence.packets())
+    for packet in packets[:frames]:
+        ekf.step(packet)
+    joint, frame = ekf.joint, packets[frames].frame
+    propagate(joint, predictor(setup_of(sequence)), AT, packets[frames].motion)
+    joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
+    rows = np.isin(frame.track_ids, joint.landmark_ids)
+    drawn = np.random.default_rng(8).standard_normal(joint.cov.shape[0])
+    joint.move(disturbed * np.linalg.cholesky(joint.cov) @ drawn)
+    joint.clone(frames)
+    assert len(joint.points) > 5
+    return Scene(joint, StereoFrame(frame.t_ns, frame.track_ids[rows], frame.uvs_px[rows]), sequence.rig)
+
+
+def numerical(function, size: int, step: float = 1e-3) -> Array:
+    """Five-point central differences."""
+    columns = []
+    for unit in step * np.eye(size):
+        near, far = function(unit) - function(-unit), function(2.0 * unit) - function(-2.0 * unit)
+        columns.append((8.0 * near - far) / (12.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+@both_kinds
+@pytest.mark.parametrize("belief", [lambda _: JointBelief, lambda _: InvariantBelief, anchored])
+def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario, belief) -> None:
+    joint, frame, rig = scene(scenario, belief)
+    n, part = joint.cov.shape[0], joint_landmarks.columns(joint)
+    delta = 0.02 * np.random.default_rng(3).standard_normal(n)
+    delta[part][:6] = delta[:6]
+    measurement = Scene(joint, frame, rig).measurement()
+
+    def residuals(change: Array) -> Array:
+        """The clone is the pose: they move together."""
+        moved = joint.displaced(delta + np.r_[change[:6], np.zeros(part.start - 6), change])
+        return measurement.stacked(joint_landmarks.look(moved, frame, AT, rig))[1]
+
+    seen = joint_landmarks.look(joint.displaced(delta), frame, AT, rig)
+    H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
+    H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
+    expected = -numerical(residuals, part.stop - part.start)
+    assert np.abs(H - expected).max() < 1e-7 * np.abs(H).max()
+    plain, _ = measurement.stacked(seen)
+    assert np.abs(plain - expected).max() > 1e-4 * np.abs(H).max(), "the move was too small to tell"
+
+
+@both_kinds
+def test_the_covariance_keeps_relative_inverse_depths_and_the_pose_while_the_estimate_moves(scenario) -> None:
+    """The anchored error by its definition, differentiated before and after a move: what the move must carry over."""
+    joint, *_ = scene(scenario)
+    joint.forget_clones(np.ones(1, dtype=bool))
+    assert isinstance(joint, AnchoredBelief)
+    before, P = numerical(partial(anchored_error, joint), joint.cov.shape[0]), joint.cov
+    drawn = np.random.default_rng(4).standard_normal(joint.cov.shape[0])
+    joint.move(np.linalg.cholesky(joint.cov) @ drawn)
+    after = numerical(partial(anchored_error, joint), joint.cov.shape[0])
+    carry = np.linalg.solve(after, before)
+    sigma = np.sqrt(np.diag(joint.cov))
+    assert np.abs((joint.cov - carry @ P @ carry.T) / np.outer(sigma, sigma)).max() < 1e-8
+    assert np.abs((joint.cov - P) / np.outer(sigma, sigma)).max() > 1e-3, "the move was too small to tell"
+
+
+def anchored_error(joint: AnchoredBelief, delta: Array) -> Array:
+    """Return the error of a state off by ``delta``: of the pose in the world, of vectors turned with it, of depths."""
+    plain = JointBelief(joint.core)
+    plain.landmark_ids, plain.points = joint.landmark_ids, joint.points
+    plain._cov = joint.cov
+    off, here, core = plain.displaced(delta), joint.core, joint.core.layout
+    moved = off.core.T_world_imu @ se3_inverse(here.T_world_imu)
+    parts = [se3_log(moved)]
+    if core.velocity is not None:
+        parts.append(off.core.v_world - moved[:3, :3] @ here.v_world)
+    anchors_now, anchors = moved @ joint.anchors, joint.anchors
+    now = inverse_depth(transform(se3_inverse(anchors_now), off.points))
+    parts.append((now - inverse_depth(transform(se3_inverse(anchors), joint.points))).reshape(-1))
+    kept = slice(0 if core.accel_bias is not None else 3, 6)
+    return np.concatenate([*parts, off.core.bias[kept] - here.bias[kept]])
+
+
+def test_inverse_depth_is_its_own_inverse_and_has_that_jacobian() -> None:
+    points = np.array([[1.0, -2.0, 5.0], [0.1, 0.2, 0.7], [-3.0, 1.0, -4.0]])
+    np.testing.assert_allclose(inverse_depth(inverse_depth(points)), points, rtol=1e-14)
+    for point in points:
+        expected = numerical(lambda d, at=point: inverse_depth(at + d), 3)
+        np.testing.assert_allclose(inverse_depth_jacobian(point), expected, rtol=0.0, atol=1e-9)
+
+
+class LagZero:
+    """A graph of one pose and the landmarks: the prediction as a Gaussian, and the sightings of one frame."""
+
+    def __init__(self, given: Scene) -> None:
+        assert isinstance(given.joint, AnchoredBelief)
+        self._joint, part = given.joint, joint_landmarks.columns(given.joint)
+        self._keys = [X(0), *(L(i) for i in given.joint.landmark_ids.tolist())]
+        noise = gtsam.noiseModel.Gaussian.Covariance(given.joint.cov[part, part])
+        self._sightings = list(StereoFactors(given.rig).of(given.frame, 0))
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._graph.add(gtsam.CustomFactor(noise, self._keys, self._residual))
+        for factor in self._sightings:
+            self._graph.add(factor)
+
+    def solved(self) -> gtsam.Values:
+        """Return the minimum, by GTSAM's Gauss-Newton from the prediction."""
+        values = self.values(self._joint.core.T_world_imu, self._joint.points)
+        params = gtsam.GaussNewtonParams()
+        params.setMaxIterations(50)
+        params.setRelativeErrorTol(1e-15)
+        params.setAbsoluteErrorTol(1e-15)
+        return gtsam.GaussNewtonOptimizer(self._graph, values, params).optimize()
+
+    def values(self, T_world_imu: Array, points: Array) -> gtsam.Values:
+        values = gtsam.Values()
+        values.insert(X(0), gtsam.Pose3(T_world_imu))
+        for key, point in zip(self._keys[1:], points, strict=True):
+            values.insert(key, point)
+        return values
+
+    def sightings_information(self, T_world_imu: Array, points: Array) -> Array:
+        """Return H^T H of GTSAM's own linearisation of the sightings, pose first."""
+        graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
+        for factor in self._sightings:
+            graph.add(factor)
+        for key in self._keys:
+            ordering.push_back(key)
+        return np.asarray(graph.linearize(self.values(T_world_imu, points)).hessian(ordering)[0])
+
+    def _residual(self, this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        T, points = values.atPose3(X(0)).matrix(), np.array([values.atPoint3(k) for k in self._keys[1:]])
+        error = self._error(T, points)
+        if jacobians is not None:
+            jacobians[0] = numerical(lambda d: self._error(T @ se3_exp(d), points), 6)
+            for i in range(len(points)):
+                jacobians[i + 1] = numerical(
+                    lambda d, i=i: self._error(T, points + np.eye(len(points))[i][:, None] * d), 3
+                )
+        return error
+
+    def _error(self, T: Array, points: Array) -> Array:
+        """Return the move (k,) that leads here from the prediction: a pose, and relative inverse depths."""
+        T_imu_world, turn = se3_inverse(self._joint.core.T_world_imu), self._joint.core.T_world_imu[:3, :3]
+        predicted, anchors = self._joint.points, self._joint.anchors
+        pose = se3_log(T_imu_world @ T)
+        at_first = transform(se3_inverse(anchors), predicted)
+        now = transform(se3_inverse(T @ T_imu_world @ anchors), points)
+        change = (inverse_depth(now) - inverse_depth(at_first))[..., None]
+        relative = anchors[:, :3, :3] @ np.linalg.solve(inverse_depth_jacobian(at_first), change)
+        with_pose = turn @ pose[3:] - skew(predicted - self._joint.core.T_world_imu[:3, 3]) @ (turn @ pose[:3])
+        return np.concatenate([pose, (relative[..., 0] + with_pose).reshape(-1)])
+
+
+def open_the_gate(monkeypatch) -> None:
+    monkeypatch.setattr(joint_landmarks, "STEREO_GATE", np.inf)
+
+
+@both_kinds
+def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario, monkeypatch) -> None:
+    open_the_gate(monkeypatch)
+    joint, frame, rig = given = scene(scenario)
+    smoothed = LagZero(given).solved()
+    pose = smoothed.atPose3(X(0)).matrix()
+    points = np.array([smoothed.atPoint3(L(i)) for i in joint.landmark_ids.tolist()])
+    measurement = given.measurement()
+    nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.clone_columns.start))
+    single = joint.displaced(measurement.after(measurement.step(nothing).pull).delta)
+    innovation = Innovation()
+    iterated.correct(joint, frame, AT, rig, innovation)
+
+    assert innovation.unconverged == 0
+    assert np.abs(joint.points - points).max() < 1e-6
+    assert np.abs(se3_log(se3_inverse(pose) @ joint.core.T_world_imu)).max() < 1e-6
+    np.testing.assert_allclose(joint.clones[-1], joint.core.T_world_imu, rtol=0.0, atol=1e-12)
+    assert np.abs(single.points - points).max() > 1e-4, "one update is not enough"
+
+
+@both_kinds
+def test_its_covariance_is_the_moved_predictions_and_the_sightings_at_convergence(scenario, monkeypatch) -> None:
+    """``(P^-1 + H^T H)^-1`` with GTSAM's Jacobians at the corrected estimate."""
+    open_the_gate(monkeypatch)
+    joint, frame, rig = given = scene(scenario)
+    graph, measurement, part = LagZero(given), given.measurement(), joint_landmarks.columns(joint)
+    best, _ = iterated.most_probable(measurement)
+    moved = copy(joint)
+    moved.move(best.delta)
+    information = graph.sightings_information(moved.core.T_world_imu, moved.points)
+    expected = np.linalg.inv(np.linalg.inv(moved.cov[part, part]) + information)
+    iterated.correct(joint, frame, AT, rig, Innovation())
+    sigma = np.sqrt(np.diag(expected))
+    assert np.abs((joint.cov[part, part] - expected) / np.outer(sigma, sigma)).max() < 1e-6
+    assert (sigma < 0.99 * np.sqrt(np.diag(moved.cov[part, part]))).any()
+
+
+def test_where_no_step_lowers_the_cost_the_frame_teaches_nothing(monkeypatch) -> None:
+    monkeypatch.setattr(iterated, "_shortened", lambda *_: iter([]))
+    joint, frame, rig = scene(FLIGHT, disturbed=0.3)
+    before, innovation = copy(joint), Innovation()
+    iterated.correct(joint, frame, AT, rig, innovation)
+    assert innovation.accepted > 0
+    assert innovation.info()["unconverged"] == 1
+    np.testing.assert_array_equal(joint.cov, before.cov)
+    np.testing.assert_array_equal(joint.points, before.points)
+    np.testing.assert_array_equal(joint.core.T_world_imu, before.core.T_world_imu)
+
+
+def test_an_iteration_that_is_broken_off_ends_at_its_lowest_cost(monkeypatch) -> None:
+    monkeypatch.setattr(iterated, "MOST_STEPS", 1)
+    measurement = scene(FLIGHT).measurement()
+    start = measurement.after(np.zeros(measurement.prediction.cov.shape[0] - 15))
+    best, converged = iterated.most_probable(measurement)
+    assert not converged
+    assert best.cost < start.cost
+    assert best.cost == measurement.after(best.pull).cost
+
+
+@both_kinds
+def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(scenario, monkeypatch) -> None:
+    """The gate is open and every frame shows each landmark where another one is."""
+    open_the_gate(monkeypatch)
+    sequence = recording(scenario, 1.0, tracks=12)
+    setup, rng, unconverged = setup_of(sequence), np.random.default_rng(0), 0.0
+    ekf = JointEkf(setup, AT, anchored(sequence.rig), iterated.correct)
+    for packet in sequence.packets():
+        frame = packet.frame
+        said = ekf.step(replace(packet, frame=replace(frame, uvs_px=rng.permutation(frame.uvs_px))))
+        assert np.isfinite(said.T_world_imu).all()
+        sigma = np.sqrt(np.diag(said.cov))
+        assert np.linalg.eigvalsh(said.cov / np.outer(sigma, sigma)).min() > 0.0
+        unconverged += said.info["unconverged"]
+    assert unconverged > 0
+
+
+def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
+    """Why landmarks move along their inverse depth: in metres their stereo depth is not Gaussian."""
+
+    def nees(belief, seed: int) -> float:
+        """Return the mean normalised error squared of the pose over a run."""
+        sequence = recording(FLIGHT, 3.0, tracks=25, seed=seed)
+        ekf, errors = JointEkf(setup_of(sequence), AT, belief(sequence.rig), iterated.correct), []
+        assert sequence.truth is not None
+        for packet in sequence.packets():
+            said = ekf.step(packet)
+            error = se3_log(se3_inverse(said.T_world_imu) @ sequence.truth.T_world_imu[packet.index])
+            errors.append(error @ np.linalg.solve(said.cov[:6, :6], error) / 6)
+        return float(np.mean(errors))
+
+    in_metres = np.mean([nees(lambda _: InvariantBelief, seed) for seed in range(2)])
+    in_inverse_depth = np.mean([nees(anchored, seed) for seed in range(2)])
+    assert in_inverse_depth < 1.6
+    assert in_metres > 1.5 * in_inverse_depth
