@@ -137,12 +137,18 @@ class Constraints(NamedTuple):
 def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
     """Project the measurements onto the left null space of the landmark's Jacobian (MSCKF, eqs. 23-24)."""
     tracks, window = seen.shape
-    q, _ = np.linalg.qr(linearised.H_point.reshape(tracks, 3 * window, 3), mode="complete")
-    null_space = np.swapaxes(q[:, :, 3:], 1, 2)
-    residuals = (null_space @ linearised.residuals.reshape(tracks, 3 * window, 1))[..., 0]
-    blocks = null_space.reshape(tracks, 3 * window - 3, window, 3)
+    basis = null_space(linearised)
+    residuals = (basis @ linearised.residuals.reshape(tracks, 3 * window, 1))[..., 0]
+    blocks = basis.reshape(tracks, 3 * window - 3, window, 3)
     H = np.einsum("frwi,fwij->frwj", blocks, linearised.H_pose).reshape(tracks, 3 * window - 3, 6 * window)
     return Constraints(residuals, H, 3 * seen.sum(axis=1) - 3)
+
+
+def null_space(linearised: Linearised) -> Array:
+    """Return rows (F, 3W - 3, 3W) that span what the landmark's Jacobian does not reach."""
+    tracks, window = linearised.residuals.shape[:2]
+    q, _ = np.linalg.qr(linearised.H_point.reshape(tracks, 3 * window, 3), mode="complete")
+    return np.asarray(np.swapaxes(q[:, :, 3:], 1, 2))
 
 
 def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:

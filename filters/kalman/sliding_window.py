@@ -13,15 +13,15 @@ import numpy as np
 from filters.kalman import joint_landmarks, multiview
 from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
-from filters.kalman.gate import gate_at, mahalanobis_squared
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.multiview import Constraints, Linearised, Sightings
+from filters.kalman.multiview import Constraints, Sightings
 from filters.kalman.prediction import predictor
+from filters.kalman.track_gate import FEWEST_SIGHTINGS, TrackGate
 from filters.kalman.tracks import WindowTracks
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array
 from toolkit.sequence import Packet, StereoFrame
 
 # An IMU ties poses over a second so well that tracks may take as long to speak. A measured twist is a
@@ -68,39 +68,24 @@ class SlidingWindowFilter:
 
     def _correct_by_tracks(self, innovation: Innovation) -> None:
         """Let the tracks that ended speak, and those that span a full window before its oldest pose leaves."""
-        ended = self._tracks.take(self._tracks.ended())
-        self._speak(ended.select(ended.seen.sum(axis=1) >= 2), 0, innovation)
+        self._speak(self._tracks.take(self._tracks.ended()), innovation, room=0)
         if len(self._joint.clones) > self._size.clones:
-            spanning = self._tracks.take(self._tracks.spanning())
-            self._speak(spanning, self._size.landmarks - len(self._joint.landmark_ids), innovation)
+            room = self._size.landmarks - len(self._joint.landmark_ids)
+            self._speak(self._tracks.take(self._tracks.spanning()), innovation, room)
 
-    def _speak(self, sightings: Sightings, room: int, innovation: Innovation) -> None:
+    def _speak(self, sightings: Sightings, innovation: Innovation, room: int) -> None:
         """Correct the window by tracks and keep as many of them as landmarks as there is room for."""
         joint = self._joint
-        points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
-        sightings, points = sightings.select(reliable), points[reliable]
-        if not len(points):
+        sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+        heard = TrackGate(joint, self._at, self._rig).passed(sightings, innovation)
+        if not len(heard.points):
             return
-        linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
-        said = multiview.without_landmark(linearised, sightings.seen)
-        accepted = self._gated(said, innovation)
-        if not accepted.any():
-            return
-        self._memory.remember(sightings.track_ids[accepted], points[accepted])
-        kept = np.flatnonzero(accepted)[: max(room, 0)]
-        if len(kept):
-            of_kept = Linearised(*[array[kept] for array in linearised])
-            joint_landmarks.keep(joint, sightings.track_ids[kept], points[kept], of_kept)
-        H, residuals = multiview.compressed(*_stacked(said, accepted))
+        self._memory.remember(heard.track_ids, heard.points)
+        kept = heard.select(np.arange(max(min(room, len(heard.points)), 0)))
+        if len(kept.points):
+            joint_landmarks.keep(joint, kept.track_ids, kept.points, kept.linearised)
+        H, residuals = multiview.compressed(*_stacked(heard.said))
         joint.update(H, residuals, joint.clone_columns)
-
-    def _gated(self, said: Constraints, innovation: Innovation) -> BoolArray:
-        P = self._joint.cov[self._joint.clone_columns, self._joint.clone_columns]
-        spread = said.H @ P @ np.swapaxes(said.H, 1, 2)
-        nis = mahalanobis_squared(said.residuals, spread + np.eye(spread.shape[1]))
-        accepted = np.asarray(nis < gate_at(said.dof))
-        innovation.add(nis, said.dof, accepted)
-        return accepted
 
     def _forget_oldest_clone(self) -> None:
         self._joint.forget_clones(np.arange(len(self._joint.clones)) == 0)
@@ -113,8 +98,8 @@ def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     return StereoFrame(frame.t_ns, frame.track_ids[rows], frame.uvs_px[rows])
 
 
-def _stacked(said: Constraints, accepted: BoolArray) -> tuple[Array, Array]:
-    """Return the rows of the accepted tracks that say anything, under each other."""
-    H = said.H[accepted].reshape(-1, said.H.shape[2])
+def _stacked(said: Constraints) -> tuple[Array, Array]:
+    """Return the rows of all tracks that say anything, under each other."""
+    H = said.H.reshape(-1, said.H.shape[2])
     speaks = H.any(axis=1)
-    return H[speaks], said.residuals[accepted].reshape(-1)[speaks]
+    return H[speaks], said.residuals.reshape(-1)[speaks]

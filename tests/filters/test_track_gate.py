@@ -1,0 +1,108 @@
+"""A slipped sighting costs a track that sighting, not its voice."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman import multiview
+from filters.kalman.belief import initial_belief
+from filters.kalman.diagnostics import Innovation
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.multiview import Sightings
+from filters.kalman.prediction import predictor
+from filters.kalman.track_gate import TrackGate
+from toolkit.estimator import Setup
+from toolkit.models import stereo
+from toolkit.simulation import DRIVE, simulate
+
+WINDOW, TRACKS = 6, 12
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A window of exact clones and tracks of exact points seen from all of them, with ordinary noise."""
+    sequence = simulate(replace(DRIVE, duration_s=1.5), 2)
+    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    joint, carry = JointBelief(initial_belief(setup.prior, "twist")), predictor(setup)
+    for packet in list(sequence.packets())[:WINDOW]:
+        if packet.motion is not None:
+            step = carry.step(joint.core, packet.motion)
+            joint.propagate(step, step.transition)
+        joint.clone(packet.index)
+    rng = np.random.default_rng(0)
+    ahead = np.stack([rng.uniform(14, 25, TRACKS), rng.uniform(-6, 6, TRACKS), rng.uniform(-2, 2, TRACKS)], axis=1)
+    points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]
+    uvs_px = np.stack([stereo.predict(points, T, sequence.rig).uv_px for T in joint.clones], axis=1)
+    uvs_px += rng.normal(size=uvs_px.shape) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T * 0.5
+    return joint, sequence.rig, Sightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool))
+
+
+def slipped(sightings: Sightings, slips: dict[int, list[int]]) -> Sightings:
+    uvs_px = sightings.uvs_px.copy()
+    for track, views in slips.items():
+        for n, view in enumerate(views):
+            uvs_px[track, view] += [[40.0, 40.0, -30.0], [-35.0, -30.0, 25.0], [20.0, 60.0, 45.0]][n]
+    return sightings._replace(uvs_px=uvs_px)
+
+
+def ask(scene, sightings: Sightings):
+    joint, rig, _ = scene
+    innovation = Innovation()
+    heard = TrackGate(joint, AtLatestEstimates(), rig).passed(sightings, innovation)
+    return heard, innovation
+
+
+def test_sound_tracks_all_pass_as_they_are(scene):
+    heard, innovation = ask(scene, scene[2])
+    assert sorted(heard.track_ids) == list(range(TRACKS))
+    assert innovation.tested == innovation.accepted == TRACKS
+    assert (heard.said.dof == 3 * WINDOW - 3).all()
+
+
+@pytest.mark.parametrize("view", [0, 2, WINDOW - 1])
+def test_the_slipped_sighting_is_the_one_given_up(scene, view):
+    heard, innovation = ask(scene, slipped(scene[2], {4: [view]}))
+    row = heard.track_ids.tolist().index(4)
+    assert heard.said.dof[row] == 3 * (WINDOW - 1) - 3
+    assert not heard.linearised.H_pose[row, view].any()
+    assert (innovation.tested, innovation.accepted) == (TRACKS + 1, TRACKS)
+
+
+def test_two_slips_cost_the_track(scene):
+    heard, innovation = ask(scene, slipped(scene[2], {7: [0, 3]}))
+    assert 7 not in heard.track_ids
+    assert (innovation.tested, innovation.accepted) == (TRACKS + 1, TRACKS - 1)
+
+
+def test_the_fall_foretold_is_what_leaving_the_sighting_out_brings(scene):
+    """The NIS without a sighting, from the precision of all, equals that of the track linearised without it."""
+    joint, rig, sightings = scene
+    bad = slipped(sightings, {4: [2]})
+    gate = TrackGate(joint, AtLatestEstimates(), rig)
+    without = bad.select(np.array([4]))._replace(seen=(np.arange(WINDOW) != 2)[None])
+    points, _ = multiview.triangulate(without, joint.clones, rig)
+    with_it = multiview.linearise(bad.select(np.array([4])), points, joint.clones, joint.clones, rig)
+    alone = multiview.linearise(without, points, joint.clones, joint.clones, rig)
+
+    def nis(linearised, seen):
+        said = multiview.without_landmark(linearised, seen)
+        return float(said.residuals[0] @ gate._precision(said)[0] @ said.residuals[0])
+
+    assert nis(with_it, np.ones((1, WINDOW), dtype=bool)) > 50.0 * nis(alone, without.seen)
+    heard, _ = ask(scene, bad)
+    assert heard.points[heard.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
+
+
+def test_a_track_seen_twice_that_disagrees_is_not_heard(scene):
+    twice = scene[2]._replace(seen=np.tile(np.arange(WINDOW) < 2, (TRACKS, 1)))
+    heard, _ = ask(scene, slipped(twice, {3: [1]}))
+    assert 3 not in heard.track_ids
+    assert len(heard.track_ids) == TRACKS - 1
+
+
+def test_no_track_at_all_is_heard_in_silence(scene):
+    heard, innovation = ask(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
+    assert len(heard.points) == 0
+    assert innovation.tested == 0
