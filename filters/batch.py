@@ -8,9 +8,10 @@ filter, for a dead-reckoned start ends in poor minima.
 import gtsam
 import numpy as np
 
+from filters.graph.covariance_recovery import with_covariances
 from filters.graph.landmarks import restricted, worth_smoothing
 from filters.graph.motion import motion_graph
-from filters.graph.robust import solve_in_stages
+from filters.graph.robust import seen_ids, solve_in_stages
 from filters.kalman.belief import initial_belief
 from filters.kalman.decoupled import DecoupledEkf
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
@@ -47,14 +48,20 @@ class Batch:
         self._frames.append(restricted(packet.frame, passed))
 
     def finish(self) -> Finished:
-        """Solve for every state and landmark."""
+        """Solve for every state and landmark, and for the covariance of every state."""
         known = self._causal_pass.landmarks()
         track_ids = worth_smoothing(self._frames, known)
         frames = [restricted(f, np.isin(f.track_ids, track_ids)) for f in self._frames]
-        solution = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
-        states = [self._motion.read(solution.values, p.index, p.frame.t_ns) for p in self._packets]
-        points = np.array([solution.values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
-        return Finished(Trajectory.of(states), Landmarks(track_ids, points), solution.converged)
+        smoothed = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
+        values = smoothed.solution.values
+        states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
+        seen = seen_ids(smoothed.frames)
+        landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen})
+        keys = [self._motion.keys(packet.index) for packet in self._packets]
+        trajectory, log = with_covariances(
+            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], keys
+        )
+        return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""

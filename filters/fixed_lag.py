@@ -1,13 +1,16 @@
 """Incremental smoother over the last two seconds; older states are marginalised (Kaess et al. 2012, iSAM2).
 
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
-causal answer is the newest state, its final answer each state as it left the window. Where the window's system
-becomes indeterminate it starts afresh from its newest state, and says so in its log.
+causal answer is the newest state, its final answer each state as it left the window. A variable that makes the
+window's system indeterminate, such as a landmark that fell behind the camera, is held where it is, and the log says so.
 """
+
+from dataclasses import replace
 
 import gtsam
 
-from filters.graph.growth import Grown, Growth
+from filters.graph.growth import Growth
+from filters.graph.lag_window import LagWindow
 from toolkit.cutting import NS_PER_S
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -29,7 +32,7 @@ class FixedLag:
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_s = lag_s
-        self._smoother = _smoother(lag_s)
+        self._window = LagWindow(lag_s)
         self._growth = Growth(setup)
         self._first_in_window = 0
         self._states: list[Estimate] = []
@@ -40,33 +43,15 @@ class FixedLag:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         grown = self._growth.by(packet)
-        try:
-            values = self._updated(grown, packet.frame.t_ns)
-        except RuntimeError as refusal:
-            if "Indeterminate" not in str(refusal):
-                raise
-            grown = self._restarted(packet)
-            values = self._updated(grown, packet.frame.t_ns)
+        recovered = self._window.add(grown, packet.frame.t_ns / NS_PER_S)
+        self._log += [f"frame {packet.index}: {line}" for line in recovered]
         self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, packet.frame.t_ns))
-        self._read(values, packet)
+        self._read(self._window.values(), packet)
         return self._states[-1]
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
         return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
-
-    def _updated(self, grown: Grown, t_ns: int) -> gtsam.Values:
-        keys = grown.state_keys + [L(i) for i in grown.landmark_ids]
-        self._smoother.update(grown.factors, grown.values, dict.fromkeys(keys, t_ns / NS_PER_S))
-        return self._smoother.calculateEstimate()
-
-    def _restarted(self, packet: Packet) -> Grown:
-        """Begin a new window at this packet, from the state predicted for it, and return what it begins with."""
-        self._log.append(f"frame {packet.index}: the window's system was indeterminate; started afresh from here")
-        self._smoother = _smoother(self._lag_s)
-        self._first_in_window = packet.index
-        self._last_seen_ns.clear()
-        return self._growth.afresh(packet)
 
     def _read(self, values: gtsam.Values, packet: Packet) -> None:
         """Take over every state and landmark of the window; what leaves it stays as last read."""
@@ -76,17 +61,11 @@ class FixedLag:
             self._first_in_window += 1
         motion, window = self._growth.motion, range(self._first_in_window, packet.index + 1)
         self._states[self._first_in_window :] = [motion.read(values, k, stamps_ns[k]) for k in window]
+        cov = self._window.state_cov(motion.keys(packet.index), self._states[-1].T_world_imu[:3, :3])
+        self._states[-1] = replace(self._states[-1], cov=cov)
         left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < oldest_ns}
         self._growth.forget(left)
         self._last_seen_ns = {i: t_ns for i, t_ns in self._last_seen_ns.items() if i not in left}
         for track_id in self._last_seen_ns:
             self._points[track_id] = values.atPoint3(L(track_id))
         self._growth.belief = self._growth.belief.at(self._states[-1])
-
-
-def _smoother(lag_s: float) -> gtsam.IncrementalFixedLagSmoother:
-    params = gtsam.ISAM2Params()
-    params.setRelinearizeThreshold(0.01)
-    params.relinearizeSkip = 1
-    params.findUnusedFactorSlots = True
-    return gtsam.IncrementalFixedLagSmoother(lag_s, params)

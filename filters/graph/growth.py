@@ -54,20 +54,6 @@ class Growth:
         self._add_sightings(self._passed(packet), packet.index, grown)
         return grown
 
-    def afresh(self, packet: Packet) -> Grown:
-        """Return a new graph that begins with the packet last taken in, held by what the causal pass knows.
-
-        The mean stays ``belief``; the covariance is that of the causal pass, for the old graph's is lost.
-        """
-        grown = Grown()
-        self._in_graph.clear()
-        held = self._causal_pass.belief.at(self.belief.estimate(packet.frame.t_ns))
-        for factor in self.motion.hold(held, packet.index):
-            grown.factors.add(factor)
-        self._add_values(packet, grown)
-        self._add_sightings(self._passed(packet), packet.index, grown)
-        return grown
-
     def forget(self, landmark_ids: set[int]) -> None:
         """Take note that landmarks have left the graph; seen again, they start anew."""
         self._in_graph -= landmark_ids

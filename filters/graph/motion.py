@@ -29,6 +29,9 @@ class MotionGraph(Protocol):
     def step(self, motion: Motion, bias: Array, k: int) -> Iterator[gtsam.NonlinearFactor]:
         """Yield what ties state k - 1 to state k, integrated about a bias (6,)."""
 
+    def keys(self, k: int) -> list[int]:
+        """Return the keys of state k in the order of an Estimate's covariance: pose, (velocity,) bias."""
+
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""
 
@@ -60,6 +63,9 @@ class _TwistGraph:
         yield factors.twist_factor(step, bias[3:], k)
         yield factors.gyro_bias_walk_factor(self._noise, step.dt_s, k)
 
+    def keys(self, k: int) -> list[int]:
+        return [X(k), B(k)]
+
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         assert estimate.bias is not None
         values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
@@ -87,6 +93,9 @@ class _ImuGraph:
     def step(self, motion: Motion, bias: Array, k: int) -> Iterator[gtsam.NonlinearFactor]:
         assert isinstance(motion, ImuMotion)
         yield factors.imu_factor(imu.preintegrate(motion, bias, self._params), k)
+
+    def keys(self, k: int) -> list[int]:
+        return [X(k), V(k), B(k)]
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         assert estimate.bias is not None and estimate.v_world is not None

@@ -1,11 +1,22 @@
-"""The robust schedule of a batch solve: a convex loss to get near, a redescending one to settle."""
+"""The robust schedule of a batch solve: a convex loss to get near, a redescending one to settle, then the rest alone.
 
+The last solve takes the sightings that pass the filters' gate at the solution, and these at their full weight: a
+redescending loss weighs good sightings down as well, and what it returns is neither efficient nor does its
+curvature tell a covariance.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
+from filters.graph.landmarks import restricted
 from filters.graph.levenberg_marquardt import Solution, Stopping, solve
-from toolkit.models.factors import StereoFactors
+from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
+from toolkit.geometry import Array
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors, X
 from toolkit.sequence import StereoFrame, StereoRig
 
 
@@ -20,24 +31,77 @@ class Stage:
 # Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go.
 SCHEDULE = (
     Stage(gtsam.noiseModel.mEstimator.Huber.Create(1.5), Stopping(1e-2, 20)),
-    Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-4, 60)),
+    Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-3, 60)),
 )
+_LAST = Stopping(1e-4, 60)
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """The last solution, the graph it solves, and the frames (K,) with the sightings that are in it."""
+
+    solution: Solution
+    graph: gtsam.NonlinearFactorGraph
+    frames: list[StereoFrame]
 
 
 def solve_in_stages(
     motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame], rig: StereoRig, start: gtsam.Values
-) -> Solution:
-    """Solve the motion factors together with the frames' sightings, once for each stage of the schedule.
+) -> Smoothed:
+    """Solve the motion factors together with the frames' sightings, as the schedule says.
 
-    Frame k observes from pose X(k). The solution is that of the last stage; it converged when that stage did.
+    Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
+    it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
     """
     values = start
     for stage in SCHEDULE:
-        graph = gtsam.NonlinearFactorGraph(motion)
-        maker = StereoFactors(rig, stage.loss)
-        for k, frame in enumerate(frames):
-            for factor in maker.of(frame, k):
-                graph.add(factor)
-        solution = solve(graph, values, stage.stopping)
-        values = solution.values
-    return solution
+        graph = _with_sightings(motion, frames, StereoFactors(rig, stage.loss))
+        values = solve(graph, _only_seen(values, frames), stage.stopping).values
+        frames = _without_those_behind(frames, values, rig)
+    frames = [
+        restricted(frame, distance_squared < STEREO_GATE)
+        for frame, distance_squared, _ in _residuals(frames, values, rig)
+    ]
+    graph = _with_sightings(motion, frames, StereoFactors(rig))
+    solution = solve(graph, _only_seen(values, frames), _LAST)
+    return Smoothed(solution, graph, frames)
+
+
+def seen_ids(frames: list[StereoFrame]) -> list[int]:
+    """Return the ids of all tracks in some frames, ascending."""
+    return [int(i) for i in np.unique(np.concatenate([frame.track_ids for frame in frames]))]
+
+
+def _with_sightings(
+    motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame], maker: StereoFactors
+) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph(motion)
+    for k, frame in enumerate(frames):
+        for factor in maker.of(frame, k):
+            graph.add(factor)
+    return graph
+
+
+def _only_seen(values: gtsam.Values, frames: list[StereoFrame]) -> gtsam.Values:
+    """Return the values of all states and of the landmarks that some frame sees."""
+    landmarks = {L(i) for i in seen_ids(frames)}
+    kind = gtsam.Symbol(L(0)).chr()
+    return values.extract([key for key in values.keys() if gtsam.Symbol(key).chr() != kind or key in landmarks])  # noqa: SIM118 - not a mapping
+
+
+def _residuals(
+    frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig
+) -> Iterator[tuple[StereoFrame, Array, Array]]:
+    """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
+    for k, frame in enumerate(frames):
+        points = np.array([values.atPoint3(L(i)) for i in frame.track_ids.tolist()]).reshape(-1, 3)
+        predicted = stereo.predict(points, values.atPose3(X(k)).matrix(), rig)
+        residuals_px = frame.uvs_px - predicted.uv_px
+        covs_px2 = np.broadcast_to(rig.cov_uv_px2, (len(points), 3, 3))
+        yield frame, mahalanobis_squared(residuals_px, covs_px2), predicted.depth_m
+
+
+def _without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:
+    behind = [frame.track_ids[depth_m <= 0.0] for frame, _, depth_m in _residuals(frames, values, rig)]
+    dropped = np.concatenate(behind)
+    return [restricted(frame, ~np.isin(frame.track_ids, dropped)) for frame in frames]

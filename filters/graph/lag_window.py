@@ -1,0 +1,127 @@
+"""The window of a fixed-lag smoother on GTSAM's Bayes tree, which goes on when its system becomes indeterminate.
+
+GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
+state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
+then the landmarks, then the states in the order of time. The newest state is in the root, its marginal is nearly
+free, and the update is no dearer.
+"""
+
+from collections.abc import Iterable
+
+import gtsam
+
+from filters.graph.growth import Grown
+from filters.graph.indeterminate import variable_named, weak_hold, without_gaps
+from filters.graph.marginals import state_cov
+from toolkit.errors import EstimatorError
+from toolkit.geometry import Array
+from toolkit.models.factors import L
+
+MOST_RECOVERIES = 20
+RELINEARISE_BEYOND = 0.01
+
+
+class LagWindow:
+    """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
+
+    def __init__(self, lag_s: float) -> None:
+        self._lag_s = lag_s
+        self._by_qr_from_s: float | None = None
+        self._isam = self._empty_tree()
+        self._state_stamps_s: dict[int, float] = {}
+        self._landmark_stamps_s: dict[int, float] = {}
+
+    def add(self, grown: Grown, t_s: float) -> list[str]:
+        """Take in what a packet at a time adds, and solve; return what had to be recovered, a line each.
+
+        Raises EstimatorError where the system stays indeterminate whatever is held.
+        """
+        self._state_stamps_s |= dict.fromkeys(grown.state_keys, t_s)
+        self._landmark_stamps_s |= dict.fromkeys(map(L, grown.landmark_ids), t_s)
+        factors, values = grown.factors, grown.values
+        if self._by_qr_from_s is not None and grown.landmark_ids and t_s > self._by_qr_from_s + self._lag_s:
+            self._by_qr_from_s = None
+            factors, values = self._emptied(factors, values)
+        log: list[str] = []
+        for _ in range(MOST_RECOVERIES):
+            try:
+                self._update(factors, values, t_s - self._lag_s)
+            except RuntimeError as refusal:
+                # What was new is in the tree by now, but the tree is not to be used any more.
+                key, name = variable_named(refusal), gtsam.Symbol(variable_named(refusal)).string()
+                rounding = gtsam.Symbol(key).chr() != gtsam.Symbol(L(0)).chr() and self._by_qr_from_s is None
+                if rounding:
+                    self._by_qr_from_s = t_s
+                    log.append(f"{name} was indeterminate to rounding: solved by QR for some frames")
+                factors, values = self._emptied(gtsam.NonlinearFactorGraph(), gtsam.Values())
+                if not rounding:
+                    factors.add(weak_hold(key, values))
+                    log.append(f"{name} was indeterminate and is held weakly where it was")
+            else:
+                return log
+        raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+
+    def values(self) -> gtsam.Values:
+        """Return the latest values of the window."""
+        return self._isam.calculateEstimate()
+
+    def state_cov(self, keys: list[int], R_world_imu: Array) -> Array:
+        """Return the covariance of one state, in the order and on the side of an Estimate."""
+        return state_cov(self._isam, keys, R_world_imu)
+
+    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, oldest_s: float) -> None:
+        old_states = [key for key, t_s in self._state_stamps_s.items() if t_s < oldest_s]
+        old_landmarks = [key for key, t_s in self._landmark_stamps_s.items() if t_s < oldest_s]
+        # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it. The
+        # states are at every step: CCOLAMD takes no place beyond the number of variables it orders.
+        moved = [*(self._landmark_stamps_s if old_states else old_landmarks), *self._state_stamps_s]
+        known = [key for key in moved if self._isam.valueExists(key)]
+        self._isam.update(factors, values, [], self._order(oldest_s), gtsam.KeyList(), _key_list(known))
+        leaving = old_landmarks + old_states
+        if leaving:
+            self._isam.marginalizeLeaves(_key_list(leaving))
+        for stamps_s in (self._state_stamps_s, self._landmark_stamps_s):
+            for key in stamps_s.keys() & leaving:
+                del stamps_s[key]
+
+    def _emptied(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Begin a new tree; return all that was in the old one, and what is given, to be taken in."""
+        everything, everywhere = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
+        everything.push_back(factors)
+        everywhere.insert(values)
+        self._isam = self._empty_tree()
+        return everything, everywhere
+
+    def _empty_tree(self) -> gtsam.ISAM2:
+        params = gtsam.ISAM2Params()
+        params.setRelinearizeThreshold(RELINEARISE_BEYOND)
+        params.relinearizeSkip = 1
+        params.findUnusedFactorSlots = True
+        params.setFactorization("CHOLESKY" if self._by_qr_from_s is None else "QR")
+        return gtsam.ISAM2(params)
+
+    def _order(self, oldest_s: float) -> gtsam.KeyGroupMap:
+        """Return the place of every variable in the elimination; those to leave have none, which is the first.
+
+        Places must be consecutive: CCOLAMD, unchecked, wants fewer of them than variables.
+        """
+        landmarks = [key for key, t_s in self._landmark_stamps_s.items() if t_s >= oldest_s]
+        states = [(key, t_s) for key, t_s in self._state_stamps_s.items() if t_s >= oldest_s]
+        some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_s) + len(self._state_stamps_s)
+        groups, place = gtsam.KeyGroupMap(), int(some_leave)
+        for key in landmarks:
+            groups.insert2(key, place)
+        place += bool(landmarks)
+        place_of = {t_s: place + i for i, t_s in enumerate(dict.fromkeys(t_s for _, t_s in states))}
+        for key, t_s in states:
+            groups.insert2(key, place_of[t_s])
+        return groups
+
+
+def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
+    listed = gtsam.KeyList()
+    for key in keys:
+        listed.push_back(key)
+    return listed
