@@ -1,0 +1,57 @@
+"""Python factors in an incremental graph: linearised here, held as linear containers, renewed as their states move.
+
+GTSAM's Python binding hands a CustomFactor a copy of *all* values at each call, which grows with the graph until it
+is most of the time. Such a factor is therefore linearised at the values of its own keys, and the graph holds that
+linearisation, which follows its states to first order (LinearContainerFactor). Once a state has moved further than
+a threshold it is replaced by a new one at the states' values: what iSAM2 does to every other factor (Kaess et al.
+2012, algorithm 5), with the same residual and the same noise.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+Read = Callable[[list[int]], gtsam.Values]
+
+# The first order errs by half the square of this times the step's length: far below the step's noise.
+MOVED = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A Python factor and the values (of its keys) it was last linearised at."""
+
+    factor: gtsam.CustomFactor
+    linearised_at: gtsam.Values
+
+    def container(self) -> gtsam.LinearContainerFactor:
+        """Return the linearisation as a factor of its own."""
+        return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
+
+    def moved(self, values: gtsam.Values) -> bool:
+        """Say whether a state is no longer where the factor was linearised."""
+        delta = self.linearised_at.localCoordinates(values)
+        keys: list[int] = self.factor.keys()
+        return any(np.abs(delta.at(key)).max() > MOVED for key in keys)
+
+
+def held_of(factors: gtsam.NonlinearFactorGraph, read: Read) -> dict[int, Held]:
+    """Linearise the Python factors of a graph at the values ``read`` gives; return them by their place in it."""
+    places = ((i, factors.at(i)) for i in range(factors.size()))
+    return {i: Held(f, read(f.keys())) for i, f in places if isinstance(f, gtsam.CustomFactor)}
+
+
+def contained(factors: gtsam.NonlinearFactorGraph, held: dict[int, Held]) -> gtsam.NonlinearFactorGraph:
+    """Return a copy of the graph with the held factors' linearisations in their places."""
+    graph = gtsam.NonlinearFactorGraph(factors)
+    for place, factor in held.items():
+        graph.replace(place, factor.container())
+    return graph
+
+
+def renewed(held: Iterable[tuple[int, Held]], read: Read) -> dict[int, Held]:
+    """Return, by slot, new linearisations of those factors whose states have moved."""
+    now = ((slot, old, read(old.factor.keys())) for slot, old in held)
+    return {slot: Held(old.factor, values) for slot, old, values in now if old.moved(values)}

@@ -1,0 +1,128 @@
+"""Fixed-lag smoother over the last two seconds whose landmarks are eliminated: smart stereo factors.
+
+What it approximates: a track says all it knows about the poses that saw it, at every iteration anew, and its landmark
+is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
+marginalised with it as they were linearised then; one that lives on starts anew, so no landmark is remembered beyond
+the window. Its causal answer is the newest state, its final answer each state as it left the window.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from filters.graph.landmarks import restricted
+from filters.graph.marginals import in_estimate_order
+from filters.graph.motion import motion_graph
+from filters.graph.structureless import Sightings
+from filters.graph.window import Prior, Window, solved, without_oldest
+from filters.graph.window_tracks import Tracked
+from filters.kalman.belief import Belief, initial_belief
+from filters.kalman.decoupled import DecoupledEkf
+from filters.kalman.prediction import predicted, predictor
+from toolkit.cutting import NS_PER_S
+from toolkit.errors import EstimatorError
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array
+from toolkit.sequence import Packet
+
+RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration"
+LAG_S = 2.0
+
+
+def build(setup: Setup) -> Estimator:
+    """Return the estimator for one sequence."""
+    return Smart(setup, LAG_S)
+
+
+class Smart:
+    """Adds a packet to the window, solves it, lets the oldest states go."""
+
+    def __init__(self, setup: Setup, lag_s: float) -> None:
+        self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
+        self._motion, self._predictor = motion_graph(setup), predictor(setup)
+        self._causal_pass = DecoupledEkf(setup)
+        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._tracked = _nothing()
+        self._states: list[Estimate] = []
+        self._points: dict[int, Array] = {}
+        self._log: list[str] = []
+
+    def step(self, packet: Packet) -> Estimate:
+        """Take in one packet and say where the IMU is."""
+        self._causal_pass.step(packet)
+        tracked = self._grown(packet)
+        try:
+            window, cov = solved(tracked.window, self._rig)
+        except EstimatorError as refusal:
+            self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
+            tracked = self._afresh(packet)
+            window, cov = solved(tracked.window, self._rig)
+        self._tracked = replace(tracked, window=window)
+        self._read(packet, cov)
+        self._shorten(packet)
+        return self._states[-1]
+
+    def finish(self) -> Finished:
+        """Return each state as it left the window, and every landmark as last known."""
+        states = [replace(state, cov=None) for state in self._states]
+        return Finished(Trajectory.of(states), Landmarks.of(self._points), log=tuple(self._log))
+
+    def _grown(self, packet: Packet) -> Tracked:
+        """Return the window with the packet's state, predicted, and its sightings."""
+        if packet.motion is None:
+            return self._begun(self._belief, packet)
+        factors = self._motion.step(packet.motion, self._belief.bias, packet.index)
+        self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
+        return self._with_state(self._tracked, packet, _graph(factors))
+
+    def _afresh(self, packet: Packet) -> Tracked:
+        """Return a window that begins here: the mean as predicted, the covariance that of the causal pass."""
+        return self._begun(self._causal_pass.belief.at(self._belief.estimate(packet.frame.t_ns)), packet)
+
+    def _begun(self, belief: Belief, packet: Packet) -> Tracked:
+        hold = self._motion.hold(belief, packet.index)
+        return self._with_state(_nothing(), packet, _graph(hold))
+
+    def _with_state(self, tracked: Tracked, packet: Packet, factors: gtsam.NonlinearFactorGraph) -> Tracked:
+        window, estimate = tracked.window, self._belief.estimate(packet.frame.t_ns)
+        new = gtsam.Values()
+        self._motion.insert(new, estimate, packet.index)
+        keys = tuple(self._motion.keys(packet.index))
+        values = gtsam.Values(window.values)
+        values.insert(new)
+        longer = replace(window, keys=(*window.keys, keys), values=values, motion=(*window.motion, factors))
+        passed = restricted(packet.frame, ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched))
+        return replace(tracked, window=longer).seeing(passed, estimate.T_world_imu, self._rig)
+
+    def _read(self, packet: Packet, cov: Array) -> None:
+        """Take over every state and landmark of the window; drop the landmarks that fell behind a camera."""
+        self._tracked, behind = self._tracked.in_front(self._rig)
+        self._log += [f"frame {packet.index}: landmark {i} fell behind a camera and was dropped" for i in behind]
+        window, first = self._tracked.window, packet.index + 1 - len(self._tracked.window.keys)
+        stamps_ns = [s.t_ns for s in self._states[first:]] + [packet.frame.t_ns]
+        read = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
+        self._states[first:] = [*read[:-1], replace(read[-1], cov=in_estimate_order(cov, read[-1].T_world_imu[:3, :3]))]
+        self._points |= dict(zip(self._tracked.track_ids.tolist(), window.points, strict=True))
+        self._belief = self._belief.at(read[-1])
+
+    def _shorten(self, packet: Packet) -> None:
+        oldest_ns = packet.frame.t_ns - self._lag_ns
+        while self._states[packet.index + 1 - len(self._tracked.window.keys)].t_ns < oldest_ns:
+            window, _ = without_oldest(self._tracked.window, self._rig)
+            self._tracked = replace(self._tracked, window=window).compacted()
+
+
+def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def _nothing() -> Tracked:
+    none = np.empty(0, dtype=np.int64)
+    window = Window((), gtsam.Values(), (), Prior.nothing(), Sightings(none, none, np.empty((0, 3))), np.empty((0, 3)))
+    return Tracked(window, none)

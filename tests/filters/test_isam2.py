@@ -1,0 +1,166 @@
+"""iSAM2: the incremental answer is that of the whole problem, and the tree survives what would end GTSAM's."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.graph.held_linear import MOVED, Held, contained, held_of, renewed
+from filters.graph.incremental import MOST_RECOVERIES, IncrementalTree
+from filters.graph.levenberg_marquardt import Stopping, solve
+from filters.isam2 import Isam2
+from toolkit.errors import EstimatorError
+from toolkit.estimator import Setup
+from toolkit.geometry import se3_inverse, se3_log
+from toolkit.models import twist
+from toolkit.models.factors import B, L, V, X, twist_factor
+from toolkit.sequence import TwistMotion
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+STEP_BIAS = np.array([0.01, -0.02, 0.005])
+
+
+def step_factor(k: int = 1) -> gtsam.CustomFactor:
+    motion = TwistMotion(np.array([0.1]), np.array([[8.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.3]]))
+    return twist_factor(twist.integrate(motion, STEP_BIAS, DRIVE.motion.noise), STEP_BIAS, k)
+
+
+def values_of(start: gtsam.Pose3, end: gtsam.Pose3, bias: np.ndarray) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(X(0), start)
+    values.insert(X(1), end)
+    values.insert(B(0), bias)
+    return values
+
+
+@pytest.fixture
+def values() -> gtsam.Values:
+    rng = np.random.default_rng(0)
+    start, off = gtsam.Pose3.Expmap(rng.standard_normal(6)), gtsam.Pose3.Expmap(0.01 * rng.standard_normal(6))
+    return values_of(start, start.compose(gtsam.Pose3(gtsam.Rot3(), [0.8, 0.0, 0.0])).compose(off), STEP_BIAS + 0.01)
+
+
+def normal_equations(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> np.ndarray:
+    graph, ordering = gtsam.NonlinearFactorGraph(), gtsam.Ordering()
+    graph.add(factor)
+    keys = factor.keys()
+    for key in keys:
+        ordering.push_back(key)
+    information, vector = graph.linearize(values).hessian(ordering)
+    return np.column_stack([information, vector])
+
+
+def test_a_held_factor_says_what_the_python_factor_says_where_it_was_linearised(values):
+    factor = step_factor()
+    np.testing.assert_allclose(
+        normal_equations(Held(factor, values).container(), values), normal_equations(factor, values), rtol=1e-9
+    )
+
+
+def test_python_factors_only_are_replaced_and_keep_their_place(values):
+    graph = gtsam.NonlinearFactorGraph()
+    graph.addPriorPose3(X(0), values.atPose3(X(0)), gtsam.noiseModel.Unit.Create(6))
+    graph.add(step_factor())
+    held = held_of(graph, values.extract)
+    assert list(held) == [1]
+    replaced = contained(graph, held)
+    assert isinstance(replaced.at(0), gtsam.PriorFactorPose3)
+    assert isinstance(replaced.at(1), gtsam.LinearContainerFactor)
+    assert isinstance(graph.at(1), gtsam.CustomFactor), "the graph given stays as it was"
+
+
+@pytest.mark.parametrize(("far", "expected"), [(0.5, []), (2.0, [7])])
+def test_a_held_factor_is_renewed_once_its_states_have_moved(values, far, expected):
+    pose = values.atPose3(X(1)).retract(np.array([0.0, 0.0, far * MOVED, 0.0, 0.0, 0.0]))
+    now = values_of(values.atPose3(X(0)), pose, values.atVector(B(0)))
+    new = renewed([(7, Held(step_factor(), values))], now.extract)
+    assert list(new) == expected
+    assert all(held.linearised_at.equals(now, 1e-12) for held in new.values())
+
+
+def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` say nothing."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(V(0), np.zeros(3))
+    values.insert(B(0), gtsam.imuBias.ConstantBias())
+    graph.addPriorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1))
+    graph.addPriorVector(V(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))
+    graph.addPriorConstantBias(B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1))
+    calibration = gtsam.Cal3_S2Stereo(400.0, 400.0, 0.0, 300.0, 200.0, 0.1)
+    for i in range(landmarks):
+        depth_m = 4.0 if i < landmarks - unseen else -4.0
+        values.insert(L(i), np.array([0.1 * i, 0.0, depth_m]))
+        measured = gtsam.StereoPoint2(300.0 + 10.0 * i, 290.0 + 10.0 * i, 200.0)
+        graph.add(gtsam.GenericStereoFactor3D(measured, gtsam.noiseModel.Unit.Create(3), X(0), L(i), calibration))
+    return graph, values
+
+
+def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named():
+    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    log = tree.add(*pose_and_landmarks(landmarks=4, unseen=2), [X(0), V(0), B(0)])
+    assert len(log) == 2
+    assert all("indeterminate and was dropped" in line for line in log)
+    assert sorted(tree.landmarks()) == [L(0), L(1)]
+    assert np.isfinite(tree.points([L(0), L(1)])).all()
+
+
+def test_after_a_recovery_the_tree_grows_and_drops_as_before():
+    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    tree.add(*pose_and_landmarks(landmarks=4, unseen=1), [X(0), V(0), B(0)])
+    assert tree.drop([L(1)]) == []
+    assert not tree.has(L(1))
+    assert sorted(tree.landmarks()) == [L(0), L(2)]
+
+
+def test_a_state_that_nothing_holds_is_held_weakly_and_named():
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k in (0, 1):
+        values.insert(X(k), gtsam.Pose3())
+    graph.add(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
+    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    log = tree.add(graph, values, [X(1)])
+    assert "solved by QR" in log[0]
+    assert "held weakly" in log[-1]
+    assert tree.read([X(0), X(1)]).size() == 2
+
+
+def test_a_system_beyond_recovery_ends_with_an_error_and_not_with_an_answer():
+    with pytest.raises(EstimatorError, match="stays indeterminate"):
+        tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+        tree.add(*pose_and_landmarks(landmarks=MOST_RECOVERIES + 2, unseen=MOST_RECOVERIES + 1), [X(0), V(0), B(0)])
+
+
+def test_without_vision_it_solves_by_qr_and_returns_to_cholesky_with_vision(run_estimator):
+    """An IMU alone loses more digits over two seconds than normal equations have."""
+    sequence = simulate(replace(FLIGHT, duration_s=4.0), 1)
+    hidden = sequence.observations.frame < 50
+    run = run_estimator("isam2", replace(sequence, observations=sequence.observations.select(~hidden)))
+    assert run.status == "ok", run.log
+    assert sum("solved by QR" in line for line in run.log) == 1
+
+
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
+def test_its_latest_states_are_the_optimum_of_the_whole_problem(scenario):
+    """Up to its thresholds: a state is off the optimum by a fraction of its standard deviation at most."""
+    sequence = simulate(replace(scenario, duration_s=3.0), 1)
+    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    estimator, said = Isam2(setup), []
+    for packet in sequence.packets():
+        said.append(estimator.step(packet))
+    final = estimator.finish().trajectory
+    tree = estimator._tree.isam
+    best = solve(tree.getFactorsUnsafe(), tree.calculateBestEstimate(), Stopping(1e-9)).values
+    off = [se3_log(se3_inverse(best.atPose3(X(k)).matrix()) @ final.T_world_imu[k]) for k in range(len(final))]
+    sigma = np.sqrt(np.diagonal(said[-1].cov)[:6])
+    assert (np.abs(off) < 0.3 * sigma).all()
+    assert not np.allclose(final.positions[:-1], [e.T_world_imu[:3, 3] for e in said[:-1]], atol=1e-6)
+
+
+def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
+    sequence = simulate(replace(DRIVE, duration_s=6.0), 1)
+    hidden = (sequence.observations.frame >= 15) & (sequence.observations.frame < 45)
+    run = run_estimator("isam2", replace(sequence, observations=sequence.observations.select(~hidden)))
+    assert run.status == "ok", run.log
+    assert np.isfinite(run.causal.cov).all()

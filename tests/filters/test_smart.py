@@ -1,0 +1,157 @@
+"""Smart factors: eliminating landmarks loses nothing, and the window goes on whatever happens in it."""
+
+from dataclasses import replace
+
+import gtsam
+import gtsam_unstable
+import numpy as np
+import pytest
+
+from filters.graph import structureless
+from filters.graph.structureless import Sightings
+from filters.smart import Smart
+from toolkit import runner
+from toolkit.geometry import se3_exp, transform
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors, X
+from toolkit.sequence import StereoFrame
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+RIG = FLIGHT.rig
+POSES, POINTS = 4, 7
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Return poses, points and what each pose sees of each point, half a pixel off."""
+    rng = np.random.default_rng(0)
+    poses = se3_exp(0.05 * rng.standard_normal((POSES, 6)))
+    points_cam = np.column_stack([rng.uniform(-1.0, 1.0, (POINTS, 2)), rng.uniform(3.0, 6.0, POINTS)])
+    points = transform(RIG.T_imu_cam, points_cam)
+    pose, point = (a.ravel() for a in np.meshgrid(np.arange(POSES), np.arange(POINTS), indexing="ij"))
+    exact = stereo.predict(points[point], poses[pose], RIG).uv_px
+    return poses, points, Sightings(pose, point, exact + 0.5 * rng.standard_normal(exact.shape))
+
+
+def gtsam_values(poses, points):
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(X(k), gtsam.Pose3(pose))
+    for i, point in enumerate(points):
+        values.insert(L(i), point)
+    return values
+
+
+def ordering(*kinds_and_counts):
+    result = gtsam.Ordering()
+    for kind, count in kinds_and_counts:
+        for i in range(count):
+            result.push_back(kind(i))
+    return result
+
+
+def projection_factors(seen, huber=structureless.HUBER_THRESHOLD):
+    graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, gtsam.noiseModel.mEstimator.Huber.Create(huber))
+    for k in range(POSES):
+        rows = seen.pose == k
+        for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows]), k):
+            graph.add(factor)
+    return graph
+
+
+def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landmarks_are_eliminated(scene):
+    poses, points, seen = scene
+    outlying = replace(seen, uv_px=seen.uv_px + np.where(np.arange(len(seen.pose)) == 3, 8.0, 0.0)[:, None])
+    linear = projection_factors(outlying).linearize(gtsam_values(poses, points))
+    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
+    n = 6 * POSES
+    across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
+    reduced = structureless.reduced(poses, points, outlying, RIG)
+    # Rounding, relative to the largest entry.
+    scale = np.abs(reduced.information).max()
+    np.testing.assert_allclose(
+        reduced.information, information[:n, :n] - across @ information[n:, :n], atol=1e-9 * scale
+    )
+    np.testing.assert_allclose(reduced.vector, vector[:n].ravel() - across @ vector[n:].ravel(), atol=1e-9 * scale)
+
+
+def test_its_loss_is_that_of_gtsam_projection_factors(scene):
+    poses, points, seen = scene
+    expected = projection_factors(seen).error(gtsam_values(poses, points))
+    assert structureless.loss(poses, points, seen, RIG) == pytest.approx(expected, rel=1e-9)
+
+
+def test_point_steps_complete_the_step_of_the_whole_system(scene):
+    poses, points, seen = scene
+    linear = projection_factors(seen).linearize(gtsam_values(poses, points))
+    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
+    held = information + np.eye(len(information)) * np.repeat([1.0, 0.0], [6 * POSES, 3 * POINTS])
+    step = np.linalg.solve(held, vector.ravel())
+    reduced = structureless.reduced(poses, points, seen, RIG)
+    np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
+
+
+def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
+    """The one noise GTSAM's factor takes; on exact measurements both linearise at the same point."""
+    poses, points, seen = scene
+    rig = replace(RIG, cov_uv_px2=np.eye(3) * 0.7**2)
+    exact = stereo.predict(points[seen.point], poses[seen.pose], rig).uv_px
+    calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
+    graph = gtsam.NonlinearFactorGraph()
+    for i in range(POINTS):
+        factor = gtsam_unstable.SmartStereoProjectionPoseFactor(
+            gtsam.noiseModel.Isotropic.Sigma(3, 0.7), gtsam.SmartProjectionParams(), gtsam.Pose3(rig.T_imu_cam)
+        )
+        for row in np.flatnonzero(seen.point == i):
+            factor.add(gtsam.StereoPoint2(*exact[row]), X(int(seen.pose[row])), calibration)
+        graph.add(factor)
+    expected = graph.linearize(gtsam_values(poses, [])).hessian(ordering((X, POSES)))[0]
+    reduced = structureless.reduced(poses, points, replace(seen, uv_px=exact), rig)
+    # GTSAM triangulates linearly: the point is exact to rounding times the condition of that problem.
+    np.testing.assert_allclose(reduced.information, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_global_position_and_rotation_gain_no_information(scene):
+    poses, points, seen = scene
+    information = structureless.reduced(poses, points, seen, RIG).information
+    rigid = np.concatenate([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
+    assert np.abs(information @ rigid).max() < 1e-9 * np.abs(information).max()
+
+
+def test_a_sighting_from_behind_says_nothing_but_costs(scene):
+    poses, points, seen = scene
+    behind = points.copy()
+    behind[0] = transform(RIG.T_imu_cam, np.array([0.0, 0.0, -4.0]))
+    others = seen.of_points(np.arange(1, POINTS))
+    one, other = (structureless.reduced(poses, behind, s, RIG) for s in (seen, others))
+    np.testing.assert_allclose(one.information, other.information, atol=1e-9)
+    assert structureless.loss(poses, behind, seen, RIG) > structureless.loss(poses, behind, others, RIG)
+
+
+def blacked_out(sequence):
+    """Return a recording whose vision is gone for three seconds."""
+    hidden = (sequence.observations.frame >= 20) & (sequence.observations.frame < 50)
+    return replace(sequence, observations=sequence.observations.select(~hidden))
+
+
+def test_a_blackout_longer_than_the_window_does_not_end_it(run_estimator):
+    run = run_estimator("smart", blacked_out(simulate(replace(DRIVE, duration_s=7.0), 1)))
+    assert run.status == "ok", run.log
+    assert np.isfinite(run.causal.cov).all()
+
+
+class Unheard:
+    def advance(self, done: int, total: int) -> None:
+        """Take no note."""
+
+
+def test_the_window_bounds_what_is_kept_of_the_past(run_estimator):
+    """The final answer is each state as it left the window: a longer window corrects it longer."""
+    sequence = simulate(replace(DRIVE, duration_s=6.0), 2)
+
+    def error_m(lag_s):
+        run = runner.run("smart", lambda setup: Smart(setup, lag_s), sequence, sequence.prior, Unheard())
+        assert run.status == "ok"
+        return np.linalg.norm(run.final.positions - run.causal.positions, axis=1).mean()
+
+    assert error_m(0.05) < error_m(0.5) < error_m(2.0)
