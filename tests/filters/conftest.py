@@ -1,0 +1,135 @@
+"""The oracle of the filters' proofs: every state and every landmark of a recording in one graph, solved by GTSAM.
+
+The graph is made of the smoothers' own factors and linearised at the truth. A recording whose realised errors are
+a tiny share of the stated ones is linear in effect: what a filter linearises at is the truth to that share.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from types import SimpleNamespace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.graph.landmarks import restricted
+from filters.graph.motion import motion_graph
+from filters.kalman.belief import Belief, initial_belief
+from toolkit.estimate import Estimate
+from toolkit.estimator import Setup
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
+from toolkit.models.factors import B, L, StereoFactors, V, X
+from toolkit.models.stereo import triangulate_world
+from toolkit.sequence import Sequence
+from toolkit.simulation import Scenario, simulate
+
+SEED = 11
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A simulated sequence with its truth at every frame, and the exact points (M, 3) of its tracks (M,)."""
+
+    sequence: Sequence
+    track_ids: IntArray
+    points: Array
+
+    @property
+    def setup(self) -> Setup:
+        s = self.sequence
+        assert s.prior is not None
+        return Setup(s.rig, s.noise, s.prior, s.gravity_world, s.motion_kind)
+
+    def truth_at(self, k: int) -> Estimate:
+        truth = self.sequence.truth
+        assert truth is not None and truth.v_world is not None and truth.bias is not None
+        return Estimate(int(truth.t_ns[k]), truth.T_world_imu[k], v_world=truth.v_world[k], bias=truth.bias[k])
+
+    def error_of(self, estimate: Estimate, k: int) -> Array:
+        """Return the error (d,) of an estimate of state k, in the order of its covariance."""
+        truth = self.truth_at(k)
+        assert estimate.bias is not None and truth.bias is not None
+        pose = se3_log(se3_inverse(truth.T_world_imu) @ estimate.T_world_imu)
+        bias = estimate.bias - truth.bias
+        if self.sequence.motion_kind == "twist":
+            return np.concatenate([pose, bias[3:]])
+        return np.concatenate([pose, truth.T_world_imu[:3, :3].T @ (estimate.v_world - truth.v_world), bias])
+
+
+@cache
+def recorded(scenario: Scenario, noise_scale: float, seed: int = SEED) -> Recording:
+    """Record a scenario with its errors scaled and its stated noise as it is."""
+    unrounded = replace(scenario, camera=replace(scenario.camera, step_px=0.0))
+    sequence = simulate(replace(unrounded, noise_scale=noise_scale), seed)
+    exact = simulate(replace(unrounded, noise_scale=0.0), seed)
+    np.testing.assert_array_equal(exact.visible.track_id, sequence.visible.track_id)
+    track_ids, first = np.unique(exact.visible.track_id, return_index=True)
+    assert exact.truth is not None
+    poses = exact.truth.T_world_imu[exact.visible.frame[first]]
+    return Recording(sequence, track_ids, triangulate_world(exact.visible.uv_px[first], poses, exact.rig))
+
+
+class BatchAtTruth:
+    """One Gauss-Newton step from the truth over everything, and its marginals."""
+
+    def __init__(self, recording: Recording, speaking: IntArray) -> None:
+        """Take in the prior, every motion, and every sighting of the tracks that speak (M,)."""
+        self._recording = recording
+        graph, values = self._motion()
+        camera = StereoFactors(recording.sequence.rig)
+        seen = set[int]()
+        for packet in recording.sequence.packets():
+            frame = restricted(packet.frame, np.isin(packet.frame.track_ids, speaking))
+            seen.update(frame.track_ids.tolist())
+            for factor in camera.of(frame, packet.index):
+                graph.add(factor)
+        for track_id, point in zip(recording.track_ids.tolist(), recording.points, strict=True):
+            if track_id in seen:
+                values.insert(L(track_id), point)
+        self._delta = graph.linearize(values).optimize()
+        self._marginals = gtsam.Marginals(graph, values)
+
+    def _motion(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        recording, graph, values = self._recording, gtsam.NonlinearFactorGraph(), gtsam.Values()
+        maker = motion_graph(recording.setup)
+        for factor in maker.hold(first_belief(recording), 0):
+            graph.add(factor)
+        for packet in recording.sequence.packets():
+            maker.insert(values, recording.truth_at(packet.index), packet.index)
+            if packet.motion is not None:
+                bias = recording.truth_at(packet.index - 1).bias
+                for factor in maker.step(packet.motion, bias, packet.index):
+                    graph.add(factor)
+        return graph, values
+
+    def state(self, k: int) -> tuple[Array, Array]:
+        """Return the error (d,) of state k and its covariance (d, d), in the filters' order and frames."""
+        keys = [X(k), B(k)] if self._recording.sequence.motion_kind == "twist" else [X(k), V(k), B(k)]
+        joint = self._marginals.jointMarginalCovariance(keys)
+        error = np.concatenate([self._delta.at(key) for key in keys])
+        cov = np.block([[joint.at(one, other) for other in keys] for one in keys])
+        to_body = np.eye(len(error))
+        if len(keys) == 3:
+            to_body[6:9, 6:9] = self._recording.truth_at(k).T_world_imu[:3, :3].T
+        return to_body @ error, to_body @ cov @ to_body.T
+
+
+def first_belief(recording: Recording) -> Belief:
+    return initial_belief(recording.setup.prior, recording.setup.motion_kind)
+
+
+def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:
+    """Compare two covariances (d, d) in units of the standard deviations: their entries span many orders."""
+    sigma = np.sqrt(np.diag(other))
+    assert np.abs((one - other) / np.outer(sigma, sigma)).max() < relative
+
+
+@pytest.fixture(scope="session")
+def oracle() -> SimpleNamespace:
+    """Return the tools of this file: what is not a fixture cannot be imported from here."""
+    return SimpleNamespace(
+        recorded=recorded,
+        batch=BatchAtTruth,
+        first_belief=first_belief,
+        assert_covariances_agree=assert_covariances_agree,
+    )

@@ -1,0 +1,133 @@
+"""No filter with first-estimate Jacobians learns where it is in the world or which way is north: nothing measures it.
+
+Moving and turning everything about gravity changes no measurement. Where the filter is linearised so that this
+holds for its Jacobians too, (1) the information along these four directions never exceeds the prior's, and (2) a
+prior made looser along them gives the same estimates, looser by exactly as much at every step. Sources: Huang,
+Mourikis & Roumeliotis 2010; Li & Mourikis 2013, section 4. The standard MSCKF on the same run fails both, in yaw.
+"""
+
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from filters.kalman.belief import TWIST_LAYOUT, Belief, initial_belief
+from filters.kalman.joint_ekf import JointEkf
+from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
+from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from toolkit.geometry import Array, skew
+from toolkit.sequence import Prior
+from toolkit.simulation import DRIVE, FLIGHT
+
+# Half a metre and six degrees: beside them, the prior of a centimetre and a tenth of a degree is nothing.
+LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1])
+YAW = 3
+
+SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=2.0)}
+SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
+FILTERS = {
+    "ekf-slam": JointEkf,
+    "msckf": lambda setup, at: SlidingWindowFilter(setup, at, WindowSize(CLONES[setup.motion_kind])),
+    "msckf-slam": lambda setup, at: SlidingWindowFilter(setup, at, WindowSize(CLONES[setup.motion_kind], landmarks=15)),
+}
+
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
+every_filter = pytest.mark.parametrize("name", FILTERS)
+
+
+def gauge_directions(belief: Belief) -> Array:
+    """Return the errors (d, 4) of a state when the world is moved along x, y, z and turned about z."""
+    to_body, position = belief.T_world_imu[:3, :3].T, belief.T_world_imu[:3, 3]
+    up = np.array([0.0, 0.0, 1.0])
+    directions = np.zeros((belief.layout.size, 4))
+    directions[3:6, :3] = to_body
+    directions[:3, YAW], directions[3:6, YAW] = to_body @ up, to_body @ skew(up) @ position
+    if belief.layout.velocity is not None:
+        directions[belief.layout.velocity, YAW] = to_body @ skew(up) @ belief.v_world
+    return directions
+
+
+class Watched:
+    """A linearisation that remembers the joint belief it serves."""
+
+    def __init__(self, at) -> None:
+        self._at = at
+        self.joint = None
+
+    def transition(self, predictor, joint, step, motion):
+        self.joint = joint
+        return self._at.transition(predictor, joint, step, motion)
+
+    def clones(self, joint):
+        return self._at.clones(joint)
+
+    def points(self, joint):
+        return self._at.points(joint)
+
+
+class Said(NamedTuple):
+    """What a filter said at every step: means (K, 4, 4), covariances (K, d, d), and the gauge (K, d, 4) it kept."""
+
+    poses: Array
+    covs: Array
+    gauge: Array
+
+    def information(self) -> Array:
+        """Return the information (K, 4, 4) along the gauge."""
+        return np.swapaxes(self.gauge, 1, 2) @ np.linalg.solve(self.covs, self.gauge)
+
+
+@cache
+def run(name: str, scenario: str, at: type, recorded, *, loose: bool) -> Said:
+    recording = recorded(SCENARIOS[scenario], 1.0)
+    setup = recording.setup
+    first = initial_belief(setup.prior, setup.motion_kind)
+    if loose:
+        setup = replace(setup, prior=loosened(setup.prior, first))
+    watched = Watched(at())
+    under_test = FILTERS[name](setup, watched)
+    poses, covs, gauge = [], [], []
+    for packet in recording.sequence.packets():
+        estimate = under_test.step(packet)
+        poses.append(estimate.T_world_imu)
+        covs.append(estimate.cov)
+        gauge.append(gauge_directions(watched.joint.first_core if watched.joint else first))
+    return Said(np.array(poses), np.array(covs), np.array(gauge))
+
+
+def loosened(prior: Prior, first: Belief) -> Prior:
+    """Return the prior with independent errors along the gauge added."""
+    rows = np.r_[0:6, 12:15] if first.layout is TWIST_LAYOUT else np.arange(15)
+    directions = np.zeros((15, 4))
+    directions[rows] = gauge_directions(first)
+    return replace(prior, cov=prior.cov + (directions * LOOSENESS**2) @ directions.T)
+
+
+@every_scenario
+@every_filter
+def test_no_information_about_global_position_and_yaw_is_gained(name, scenario, oracle):
+    """From a loose start, so that a gain would not hide behind what the motion's noise takes away."""
+    information = run(name, scenario, AtFirstEstimates, oracle.recorded, loose=True).information()
+    root = np.linalg.cholesky(np.linalg.inv(information[0]))
+    assert np.linalg.eigvalsh(root.T @ information @ root).max() < 1.0 + 1e-6
+
+
+@every_scenario
+@every_filter
+def test_a_looser_start_stays_looser_by_exactly_as_much(name, scenario, oracle):
+    """Then no correction depends on the gauge: same estimates, and covariances that differ by what was added."""
+    tight, loose = (run(name, scenario, AtFirstEstimates, oracle.recorded, loose=loose) for loose in (False, True))
+    np.testing.assert_allclose(loose.poses, tight.poses, rtol=0.0, atol=1e-6)
+    added = (tight.gauge * LOOSENESS**2) @ np.swapaxes(tight.gauge, 1, 2)
+    sigmas = np.sqrt(np.diagonal(loose.covs, axis1=1, axis2=2))
+    assert np.abs((loose.covs - tight.covs - added) / (sigmas[:, :, None] * sigmas[:, None, :])).max() < 1e-6
+
+
+@every_scenario
+@every_filter
+def test_jacobians_at_the_latest_estimates_invent_yaw(name, scenario, oracle):
+    """The contrast that shows the two tests above can fail: half as much again as the prior knew, or more."""
+    information = run(name, scenario, AtLatestEstimates, oracle.recorded, loose=True).information()
+    assert information[:, YAW, YAW].max() > 1.5 * information[0, YAW, YAW]

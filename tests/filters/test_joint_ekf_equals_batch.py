@@ -1,0 +1,71 @@
+"""On a problem that is linear in effect, forgetting what is out of view loses nothing: the joint EKF is the batch.
+
+The models are not linear, but over errors that are small enough they are. The stated noise stays as it is and the
+drawn errors are scaled down, so every gate is open and every Jacobian is that at the truth but for that share. The
+batch keeps all poses and landmarks; the filter marginalises both as it goes.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman.joint_ekf import JointEkf
+from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT
+
+# Exact IMU samples integrate to the truth only in the limit of their rate: 1 kHz errs by 1e-8 m a frame.
+SCENARIOS = [
+    replace(DRIVE, duration_s=2.0),
+    replace(DRIVE_IMU, duration_s=2.0, motion=replace(DRIVE_IMU.motion, rate_hz=1000.0)),
+    replace(FLIGHT, duration_s=1.0, motion=replace(FLIGHT.motion, rate_hz=1000.0)),
+]
+SCENARIOS = [replace(s, camera=replace(s.camera, max_tracks=30)) for s in SCENARIOS]
+
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+both_linearisations = pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
+
+
+def last_answer(recording, at):
+    """Return the filter's last answer, the frame it is of, and how many landmarks it had to forget on the way."""
+    ekf = JointEkf(recording.setup, at)
+    for packet in recording.sequence.packets():
+        estimate = ekf.step(packet)
+        assert estimate.info["gate_accepted"] == estimate.info["gate_tested"]
+    assert len(ekf.landmarks()) == len(recording.track_ids)
+    assert len(ekf.joint.clones) == 0
+    return estimate, packet.index, len(recording.track_ids) - len(ekf.joint.landmark_ids)
+
+
+@every_scenario
+@both_linearisations
+def test_its_last_mean_is_that_of_the_batch(scenario, at, oracle):
+    """Errors of 1e-4 of the stated noise: both correct by micrometres and agree to a hundredth of that or better."""
+    recording = oracle.recorded(scenario, 1e-4)
+    estimate, last, forgotten = last_answer(recording, at)
+    mean, _ = oracle.batch(recording, recording.track_ids).state(last)
+    assert forgotten > 10, "tracks must have come and gone"
+    # The second order is the square of a relative error of 1e-4 in positions of centimetres.
+    assert np.abs(recording.error_of(estimate, last) - mean).max() < 1e-8
+    assert np.abs(mean).max() > 1e-6, "there was something to agree on"
+
+
+@every_scenario
+@both_linearisations
+def test_its_last_covariance_is_that_of_the_batch(scenario, at, oracle):
+    """Errors of 1e-7 of the stated noise: depths, and with them Jacobians, are off by 1e-8 of themselves."""
+    recording = oracle.recorded(scenario, 1e-7)
+    estimate, last, forgotten = last_answer(recording, at)
+    _, cov = oracle.batch(recording, recording.track_ids).state(last)
+    assert forgotten > 10, "tracks must have come and gone"
+    oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
+
+
+@every_scenario
+def test_a_landmark_left_out_would_show(scenario, oracle):
+    """The two tests above can fail: a batch without one track in twenty is another problem."""
+    recording = oracle.recorded(scenario, 1e-7)
+    estimate, last, _ = last_answer(recording, AtFirstEstimates())
+    _, cov = oracle.batch(recording, np.delete(recording.track_ids, np.s_[::20])).state(last)
+    with pytest.raises(AssertionError):
+        oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
