@@ -1,26 +1,27 @@
 """Says when a trajectory contradicts the motion that was measured: the sign of a diverged estimator, without truth.
 
-In the steady state of a consistent filter the correction at each frame has the covariance of the motion noise
-(what a frame adds to the covariance is what a correction takes away), so the step between two estimates,
-compared with the measured motion, is chi-square distributed. Steps far outside that are rare in a filter that
-works and common in one that has lost its way.
+The correction a consistent filter makes at a frame has the covariance it takes away: what it had before, less what
+it has after. In a steady state that is what the motion noise adds in a frame; a filter that learns its heading or a
+bias after a long drive may take away, and so jump by, much more, if its own covariances say so. Steps far outside
+that are rare in a filter that works and common in one that has lost its way.
 """
 
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.geometry import Array, se3_adjoint, se3_inverse, se3_log
 from toolkit.models import imu, twist
 from toolkit.sequence import ImuNoise, Packet, Sequence, TwistMotion, TwistNoise
 
-# A windowed filter puts corrections off and then makes several frames' worth at once: five times the covariance.
+# A windowed filter puts corrections off and then makes several frames' worth at once: five times the motion noise.
 _LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
-FAR_STEP = _LUMP_FRAMES * float(chdtri(6, 1e-6))
+FAR_STEP = float(chdtri(6, 1e-6))
 # Mismatches and poor noise figures make some steps far in healthy runs too; a tenth of all is no accident.
 MOST_FAR_STEPS = 0.10
 # What a correction may do beyond the noise of an IMU, whose velocity and biases it corrects as well:
@@ -55,27 +56,51 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Iterator[floa
 
 def _deviation(trajectory: Trajectory, start: int, end: int, packet: Packet, sequence: Sequence) -> tuple[Array, Array]:
     """Return the step's deviation (6,) from the measured motion, in the tangent of its end, and its covariance."""
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[start]
-    T_world_start = trajectory.T_world_imu[start]
     if isinstance(packet.motion, TwistMotion) and isinstance(sequence.noise, TwistNoise):
-        step = twist.integrate(packet.motion, bias[3:], sequence.noise)
-        predicted, cov = T_world_start @ step.T_start_end, step.cov
+        predicted = _twist_prediction(trajectory, start, packet.motion, sequence.noise)
     else:
-        predicted, cov = _imu_prediction(trajectory, start, packet, sequence)
-    return se3_log(se3_inverse(predicted) @ trajectory.T_world_imu[end]), cov
+        predicted = _imu_prediction(trajectory, start, packet, sequence)
+    cov = _LUMP_FRAMES * predicted.cov
+    if trajectory.cov is not None:
+        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], predicted)
+    return se3_log(se3_inverse(predicted.T_world_imu) @ trajectory.T_world_imu[end]), cov
 
 
-def _imu_prediction(trajectory: Trajectory, start: int, packet: Packet, sequence: Sequence) -> tuple[Array, Array]:
+class _Predicted(NamedTuple):
+    """Where the measured motion leads, what of the state's error (d,) reaches the pose (6, d), and its own noise."""
+
+    T_world_imu: Array
+    transition: Array
+    cov: Array
+
+
+def _taken_away(cov_start: Array, cov_end: Array, predicted: _Predicted) -> Array:
+    """Return the pose covariance (6, 6) that the correction at the end of a step took away, where it took any."""
+    if cov_start.shape[0] != predicted.transition.shape[1]:
+        return np.zeros((6, 6))
+    taken = predicted.transition @ cov_start @ predicted.transition.T + predicted.cov - cov_end[:6, :6]
+    if not np.isfinite(taken).all():
+        return np.zeros((6, 6))
+    size, axes = np.linalg.eigh(taken)
+    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+
+
+def _twist_prediction(trajectory: Trajectory, start: int, motion: TwistMotion, noise: TwistNoise) -> _Predicted:
+    bias = np.zeros(3) if trajectory.bias is None else trajectory.bias[start, 3:]
+    step = twist.integrate(motion, bias, noise)
+    transition = np.hstack([se3_adjoint(se3_inverse(step.T_start_end)), step.d_step_d_bias])
+    return _Predicted(trajectory.T_world_imu[start] @ step.T_start_end, transition, step.cov)
+
+
+def _imu_prediction(trajectory: Trajectory, start: int, packet: Packet, sequence: Sequence) -> _Predicted:
     assert packet.motion is not None and not isinstance(packet.motion, TwistMotion)
     assert isinstance(sequence.noise, ImuNoise)
     bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[start]
     params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
     preintegration = imu.preintegrate(packet.motion, bias, params)
-    cov = np.asarray(preintegration.residualCovariance())[:6, :6]
-    dt_s = float(packet.motion.dt_s.sum())
-    slack = np.diag((_IMU_SLACK * dt_s) ** 2)
+    slack = (_IMU_SLACK * float(packet.motion.dt_s.sum())) ** 2
     if trajectory.v_world is None:  # without a velocity only the rotation can be compared
-        slack[3:, 3:] = np.eye(3) * 1e12
+        slack[3:] = 1e12
     v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[start]
     step = imu.predict(preintegration, trajectory.T_world_imu[start], v_world, bias)
-    return step.T_world_imu, cov + slack
+    return _Predicted(step.T_world_imu, step.transition[:6], step.cov[:6, :6] + np.diag(slack))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
@@ -52,9 +53,15 @@ def _peak_rss_mb() -> float:
 def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
     """Run an estimator over a sequence from a prior.
 
-    An error inside the estimator ends its run, not the comparison: the run's status is ``failed`` and its log
-    says why. Raises DataError where the sequence itself cannot be run.
+    Linear algebra runs on one thread meanwhile, so that the same bits and comparable times come out wherever it
+    runs. An error inside the estimator ends its run, not the comparison: the run's status is ``failed`` and its
+    log says why. Raises DataError where the sequence itself cannot be run.
     """
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _run(name, build, sequence, prior, progress)
+
+
+def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
     packets = list(sequence.packets())
     setup = Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind)
     clock, said = _Clock(), list[Estimate]()
