@@ -14,6 +14,7 @@ DATA = PROJECT / os.environ.get("VISLAM_DATA", "../shared/data")
 REAL = (
     *("ucsd/03.npz", "ucsd/0027.npz", "ucsd/10_imu_only.npz", "utias/dataset3.mat"),
     *("utias/2011_09_26_drive_0035_sync_KLT.mat", "openvins_sim/udel_gore_rect_s0"),
+    *("euroc/V1_01_easy", "euroc/V2_01_easy"),
 )
 SEED = 3
 

@@ -2,17 +2,19 @@
 
 import copy
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from toolkit.datasets import is_drawn_from_a_seed
 from toolkit.metrics import describe
 from toolkit.metrics.common.consistency import nees_band
 from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.metrics_json import to_text
 from toolkit.report.seeds_md import seeds_report, seeds_text
-from toolkit.sweep.over_seeds import is_drawn_from_a_seed, mean_nees, spread_of
+from toolkit.sweep.over_seeds import mean_nees, spread_of
 
 
 def test_spread_is_numpys():
@@ -124,6 +126,6 @@ def test_both_figures_are_drawn(over, tmp_path):
         figure.figure.savefig(tmp_path / f"{figure.name}.png")
 
 
-def test_simulated_sequences_are_drawn_from_a_seed_and_files_are_not(tmp_path):
+def test_simulated_sequences_are_drawn_from_a_seed_and_recordings_are_not():
     assert is_drawn_from_a_seed("drive")
-    assert not is_drawn_from_a_seed(str(tmp_path))
+    assert not is_drawn_from_a_seed(str(Path(__file__).parents[2] / "data" / "drive_small"))

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults, names
+from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults, named_file, names
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,6 +44,15 @@ def add_to(subcommands: Subcommands) -> None:
         help=f"what to compare, see 'vislam list'; 'ladder' is every rung (default: {','.join(ESTIMATORS)})",
     )
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
+    parser.add_argument(
+        "--trajectory",
+        metavar="NAME=FILE",
+        type=named_file,
+        action="append",
+        default=[],
+        help="another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the "
+        "estimators; may be repeated; with exactly one SEQUENCE",
+    )
     parser.add_argument("--out", metavar="DIR", type=Path, help="run directory (default: runs/<date and time>)")
     parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
     add_repair_arguments(parser)
@@ -83,6 +92,7 @@ def command(options: argparse.Namespace) -> int:
         estimators=options.estimators,
         out=options.out if options.out is not None else _new_run(),
         truth=options.truth,
+        trajectories=_trajectories(options),
         max_frames=options.max_frames,
         keep=kept_faults(options, faults()),
         start=options.start,
@@ -95,6 +105,28 @@ def command(options: argparse.Namespace) -> int:
         print(text, f"\nresults: {directory}\n", sep="\n", flush=True)
         all_ok = all_ok and ok
     return 0 if all_ok else 1
+
+
+def _trajectories(options: argparse.Namespace) -> dict[str, Path]:
+    """Return the trajectory files by name; a name that stands for something else is a UsageError."""
+    if not options.trajectory:
+        return {}
+    from toolkit.cli.arguments import UsageError
+    from toolkit.estimator import find_all
+    from toolkit.report.comparison import plain_name
+    from toolkit.report.export import TRUTH
+
+    if len(options.sequences) != 1:
+        raise UsageError("--trajectory goes with exactly one SEQUENCE (see vislam compare --help)")
+    # What a name becomes as that of a file must differ, too.
+    taken = {plain_name(name): name for name in (TRUTH, *find_all(options.estimators))}
+    for name, _ in options.trajectory:
+        plain = plain_name(name)
+        if not plain or plain in taken:
+            why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
+            raise UsageError(f"--trajectory: the name {name} {why}; choose another")
+        taken[plain] = f"another trajectory, {name}"
+    return dict(options.trajectory)
 
 
 def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
@@ -110,16 +142,18 @@ def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
 def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple[str, Path, bool]]:
     """Yield the same for each comparison over seeds; what cannot be repeated over seeds is a UsageError."""
     from toolkit.cli.arguments import UsageError
+    from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.report.progress import progress_on
     from toolkit.report.seeds_md import seeds_text
     from toolkit.report.seeds_session import OverSeedsRequest, compare_over_seeds
-    from toolkit.sweep.over_seeds import is_drawn_from_a_seed
     from toolkit.sweep.processes import usable_cpus
 
     if options.seeds == 1:
         raise UsageError("--workers goes with --seeds of 2 and more (see vislam compare --help)")
     if options.truth is not None:
         raise UsageError("--truth and --seeds exclude each other: every seed has the truth of its own simulation")
+    if options.trajectory:
+        raise UsageError("--trajectory and --seeds exclude each other: a file is of one recording, not of every seed's")
     for source in request.sources:
         if not is_drawn_from_a_seed(source):
             raise UsageError(f"--seeds repeats simulated sequences, and {source} is the same under every seed")

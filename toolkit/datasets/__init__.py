@@ -1,8 +1,9 @@
 """Recordings: one module a source. A file dropped into this package is a new format or a new built-in sequence.
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
-estimates of other systems is :class:`BringsReferences` too. It imports nothing heavy at its
-top, because all modules are imported to recognise a path. Parts they share live in the sub-package ``parts``.
+estimates of other systems is :class:`BringsReferences` too, and one that simulates a part of them is
+:class:`DrawnFromASeed`. It imports nothing heavy at its top, because all modules are imported to recognise a path.
+Parts they share live in the sub-package ``parts``.
 """
 
 import importlib
@@ -46,6 +47,14 @@ class BringsReferences(Protocol):
 
 
 @runtime_checkable
+class DrawnFromASeed(Protocol):
+    """A format that completes its recordings by simulation, another under every seed."""
+
+    def load_with_seed(self, path: Path, seed: int) -> Sequence:
+        """Read the recording and draw the simulated part from the seed; ``load`` does so with seed 0."""
+
+
+@runtime_checkable
 class BuiltIns(Protocol):
     """A module whose sequences need no path: name -> maker, which takes a seed (real data ignore it)."""
 
@@ -82,12 +91,25 @@ def built_in_names() -> tuple[str, ...]:
 def load_sequence(source: str, seed: int = 0) -> Sequence:
     """Load a built-in sequence by its name, made with the seed, or a recording by its path.
 
-    Raises DataError where the source is neither, no format recognises it, or it cannot be read.
+    The seed is also that of what a format simulates; whatever was recorded is the same under every seed. Raises
+    DataError where the source is neither, no format recognises it, or it cannot be read.
     """
     if source in built_ins():
         return built_ins()[source](seed)
     path = Path(source).expanduser()
-    return _reader_of(path, source).load(path)
+    reader = _reader_of(path, source)
+    return reader.load_with_seed(path, seed) if isinstance(reader, DrawnFromASeed) else reader.load(path)
+
+
+def is_drawn_from_a_seed(source: str) -> bool:
+    """Say whether a source is another recording under another seed, as simulations are.
+
+    Raises DataError where it is no source at all.
+    """
+    if source in built_ins():
+        make = built_ins()[source]
+        return make(0).content_hash() != make(1).content_hash()
+    return isinstance(_reader_of(Path(source).expanduser(), source), DrawnFromASeed)
 
 
 def load_references(source: str) -> dict[str, Trajectory]:

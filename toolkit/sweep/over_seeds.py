@@ -11,7 +11,6 @@ from functools import cached_property
 
 import numpy as np
 
-from toolkit.datasets import built_ins
 from toolkit.estimate import Output, Status
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.common.consistency import POSE_DOF, nees_band
@@ -159,12 +158,6 @@ def mean_nees(nees: Array) -> MeanNees:
     bands = {n: nees_band(POSE_DOF, n) if n else (np.nan, np.nan) for n in np.unique(runs).tolist()}
     low, high = (np.array([bands[n][side] for n in runs.tolist()]) for side in (0, 1))
     return MeanNees(np.where(runs > 0, mean, np.nan), runs, low, high)
-
-
-def is_drawn_from_a_seed(source: str) -> bool:
-    """Say whether a source is another recording under another seed, as the built-in simulations are."""
-    make = built_ins().get(source)
-    return make is not None and make(0).content_hash() != make(1).content_hash()
 
 
 def in_order(outcomes: Iterable[Outcome], estimators: Sequence[str], seeds: Sequence[int]) -> tuple[Outcome, ...]:

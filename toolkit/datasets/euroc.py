@@ -1,0 +1,142 @@
+"""EuRoC (ASL) recordings: the real IMU, with stereo tracks simulated along the true trajectory.
+
+A folder with ``mav0/`` (or ``mav0`` itself), or a lean one: imu.csv, cam_timestamps_ns.txt and a truth table. No front
+end undistorts its images here, so what the pair would see is simulated at the real camera stamps: a rectified pair
+with the left camera's intrinsics and extrinsic and the real baseline, in a room around the trajectory. The sequence's
+name and provenance say so, and with them every report.
+
+Errors of the truth reach the estimators as disagreement of tracks and IMU; ``parts/euroc_calibration`` says what the
+noise makes of it.
+The body is the IMU; quaternions are Hamilton, w first.
+Source: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.cutting import NS_PER_S
+from toolkit.datasets.parts.asl_table import columns_of, read_stamps, read_table
+from toolkit.datasets.parts.euroc_calibration import (
+    ACCEL_FACTOR,
+    GYRO_FACTOR,
+    PIXEL_SIGMA_PX,
+    Calibration,
+    published,
+    read_calibration,
+)
+from toolkit.datasets.parts.euroc_truth import choose_truth
+from toolkit.datasets.parts.fields import check_frame_count
+from toolkit.datasets.parts.tracks_along import tracks_in_a_room
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray, interpolate_poses
+from toolkit.sequence import ImuSamples, Provenance, Sequence, Truth
+from toolkit.simulation.world import Camera
+
+SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
+_STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
+_GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
+_MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
+# Up to 14 m the disparity stays five standard deviations above zero.
+_DEPTH_M = (0.5, 14.0)
+# Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
+_LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where a recording keeps its parts; ``mav0`` is None in a lean one."""
+
+    root: Path
+    mav0: Path | None
+
+    @property
+    def imu(self) -> Path:
+        return self.root / _LEAN_IMU if self.mav0 is None else self.mav0 / "imu0" / "data.csv"
+
+    @property
+    def stamps(self) -> Path:
+        beside = self.root / _STAMPS
+        return beside if self.mav0 is None or beside.is_file() else self.mav0 / "cam0" / "data.csv"
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is laid out as an ASL folder, whole or lean."""
+    return _layout(path) is not None
+
+
+def load(path: Path) -> Sequence:
+    """Read a recording with the noise of seed 0; see :func:`load_with_seed`."""
+    return load_with_seed(path, 0)
+
+
+def load_with_seed(path: Path, seed: int) -> Sequence:
+    """Read IMU, calibration, stamps and truth, and simulate the tracks at the stamps both IMU and truth reach.
+
+    The seed draws the pixel noise and the ends of tracks; the landmarks are the same under every seed. Raises
+    DataError where a part is missing or damaged, or there is no truth to simulate along.
+    """
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(f"{path}: neither mav0/imu0 nor {_LEAN_IMU} beside {_STAMPS}; give the folder of the recording")
+    table = read_table(layout.imu, _ACCEL + _GYRO)
+    imu = ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
+    calibration = published() if layout.mav0 is None else read_calibration(layout.mav0)
+    choice = choose_truth(layout.root, layout.mav0, imu)
+    stamps = read_stamps(layout.stamps)
+    frames_t_ns = _within(stamps, imu.t_ns, choice.truth.t_ns)
+    check_frame_count(layout.root, frames_t_ns.size)
+    truth = _at(choice.truth, frames_t_ns)
+    camera = Camera(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
+    return Sequence(
+        name=f"{layout.root.name} (simulated stereo)",
+        rig=calibration.rig,
+        noise=calibration.noise,
+        frames_t_ns=frames_t_ns,
+        observations=tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
+        motion=imu,
+        provenance=Provenance("euroc", f"{path}: {SIMULATED}, seed {seed}", _facts(choice.reason, calibration)),
+        truth=truth,
+    )
+
+
+def _layout(path: Path) -> _Layout | None:
+    path = path.resolve()
+    mav0 = next((p for p in (path / "mav0", path) if (p / "imu0").is_dir() or (p / "cam0").is_dir()), None)
+    if mav0 is not None:
+        return _Layout(mav0.parent if mav0.name == "mav0" else mav0, mav0)
+    lean = (path / _STAMPS).is_file() or columns_of(path / _LEAN_IMU).keys() >= set(_GYRO)
+    return _Layout(path, None) if lean else None
+
+
+def _facts(truth_reason: str, calibration: Calibration) -> tuple[str, ...]:
+    tracks = f"{_MAX_TRACKS} a frame, {PIXEL_SIGMA_PX:g} px of noise, landmarks in a room around the trajectory"
+    return (
+        f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU",
+        truth_reason,
+        calibration.source,
+        f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
+        "one, as measured in flight against the truth",
+    )
+
+
+def _within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
+    """Return the stamps (K,) that lie within the IMU's time and between truths close enough to interpolate."""
+    first, last = max(imu_t_ns.min(), truth_t_ns[0]), min(imu_t_ns.max(), truth_t_ns[-1])
+    inside = stamps[(stamps >= first) & (stamps <= last)]
+    after = np.clip(np.searchsorted(truth_t_ns, inside), 1, truth_t_ns.size - 1)
+    return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= _LONGEST_TRUTH_GAP_NS])
+
+
+def _at(truth: Truth, t_ns: IntArray) -> Truth:
+    """Return the truth at stamps (K,) within it: poses on the geodesic, velocities and biases on straight lines."""
+    poses = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns)
+    return Truth(t_ns, poses, _linear(truth.v_world, truth.t_ns, t_ns), _linear(truth.bias, truth.t_ns, t_ns))
+
+
+def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | None:
+    if values is None:
+        return None
+    t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
+    return np.stack([np.interp(at_s, t_s, column) for column in values.T], axis=1)
