@@ -1,0 +1,127 @@
+"""Neutral pairs and planted regressions for the benchmark of the gate's power.
+
+A *neutral pair* is one estimator run twice on one simulated recording, each time with an independent dither on
+everything it reads: Gaussian, 5 % of the standard deviation that the recording states for its pixels and its motion.
+The two sides are exchangeable, so that neither is better than the other in expectation; what differs between them
+is what any harmless change of an implementation does: other roundings, other tracks at the gates' edges, other stops.
+
+A *planted regression* of p percent multiplies the error of every pose of a side, as a twist in the body frame, by
+1 + p u / 100 with u uniform in 0 ... 2, drawn anew for each run: p percent in expectation, with a spread of its own of
+0.58 p percent, and seen by ATE and NEES only.
+"""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from toolkit import runner
+from toolkit.audit import audit
+from toolkit.estimate import Run, Trajectory
+from toolkit.estimator import find
+from toolkit.geometry import se3_exp, se3_inverse, se3_log
+from toolkit.metrics import Judged, ate, held_out, nees
+from toolkit.metrics.common.scores import Unavailable
+from toolkit.regression.reference import reference_s
+from toolkit.sequence import ImuSamples, Observations, Sequence, TwistNoise, TwistSamples
+from toolkit.simulation import SCENARIOS, simulate
+from toolkit.start import start_from_measurements
+
+DITHER = 0.05
+LEVELS_PERCENT = (0.0, 2.0, 5.0, 10.0)
+SIDES = (0, 1)
+
+
+class _Unheard:
+    def advance(self, done: int, total: int) -> None:
+        """Take no note."""
+
+
+def dithered(sequence: Sequence, rng: np.random.Generator) -> Sequence:
+    """Return the sequence with the neutral dither on its sightings and motion samples."""
+    seen, motion, noise = sequence.observations, sequence.motion, sequence.noise
+    sigma_px = np.sqrt(np.diag(sequence.rig.cov_uv_px2))
+    uv_px = seen.uv_px + DITHER * sigma_px * rng.standard_normal(seen.uv_px.shape)
+    root_dt = np.sqrt(float(np.median(np.diff(motion.t_ns))) * 1e-9)
+    first, second = (DITHER / root_dt * rng.standard_normal((motion.t_ns.size, 3)) for _ in range(2))
+    samples: TwistSamples | ImuSamples
+    if isinstance(motion, TwistSamples):
+        assert isinstance(noise, TwistNoise)
+        v_mps = motion.v_mps + noise.velocity_noise_density * first
+        samples = replace(motion, v_mps=v_mps, w_radps=motion.w_radps + noise.gyro_noise_density * second)
+    else:
+        assert not isinstance(noise, TwistNoise)
+        accel_mps2 = motion.accel_mps2 + noise.accel_noise_density * first
+        gyro_radps = motion.gyro_radps + noise.gyro_noise_density * second
+        samples = replace(motion, accel_mps2=accel_mps2, gyro_radps=gyro_radps)
+    return replace(sequence, observations=Observations(seen.frame, seen.track_id, uv_px), motion=samples)
+
+
+def worsened(trajectory: Trajectory | None, sequence: Sequence, factor: float) -> Trajectory | None:
+    """Return the trajectory with every pose's error multiplied; simulated truth has the frames' own stamps."""
+    assert sequence.truth is not None
+    if trajectory is None or factor == 1.0:
+        return trajectory
+    true = sequence.truth.T_world_imu[np.searchsorted(sequence.truth.t_ns, trajectory.t_ns)]
+    return replace(trajectory, T_world_imu=true @ se3_exp(factor * se3_log(se3_inverse(true) @ trajectory.T_world_imu)))
+
+
+def scores(run: Run, sequence: Sequence, percent: float) -> dict[str, dict[str, float | None]]:
+    """Return the metrics the gate judges on a simulated sequence, by kind of output; held-out only without a plant."""
+    files = (ate, nees, held_out) if percent == 0.0 else (ate, nees)
+    found: dict[str, dict[str, float | None]] = {}
+    for output in ("causal",) if run.final_is_causal else ("causal", "final"):
+        if run.trajectory(output) is not None:
+            found[output] = {}
+            for file in files:
+                with suppress(Unavailable):
+                    found[output] |= file.score(Judged(run, output, sequence)).values
+    return found
+
+
+def one_seed(source: str, duration_s: float, seed: int, estimators: tuple[str, ...]) -> dict[str, object]:
+    """Run every estimator on both sides; return metrics by estimator, side and level, and its time by side."""
+    sequence = audit(simulate(replace(SCENARIOS[source], duration_s=duration_s), seed)).sequence
+    prior = start_from_measurements(sequence)
+    found: dict[str, object] = {"source": source, "duration_s": duration_s, "seed": seed}
+    reference_s()
+    for side in SIDES:
+        read = dithered(sequence, np.random.default_rng([seed, side]))
+        planted = np.random.default_rng([seed, side, 1])
+        for name in estimators:
+            before_s = reference_s()
+            run = runner.run(name, find(name).load(), read, prior, _Unheard())
+            assert run.timings is not None
+            speed = 2.0 * run.timings.cpu_s / (before_s + reference_s())
+            u = planted.uniform(0.0, 2.0, len(LEVELS_PERCENT))
+            levels = {}
+            for percent, factor in zip(LEVELS_PERCENT, 1.0 + np.array(LEVELS_PERCENT) * u / 100.0, strict=True):
+                moved = [worsened(t, sequence, float(factor)) for t in (run.causal, run.final)]
+                levels[f"{percent:g}"] = scores(replace(run, causal=moved[0], final=moved[1]), sequence, percent)
+            found[f"{name}/{side}"] = {"status": run.status, "speed": speed, "levels": levels}
+    return found
+
+
+def _one(given: tuple[str, float, int, tuple[str, ...]]) -> dict[str, object]:
+    return one_seed(*given)
+
+
+def fill(pool: Path, cases: dict[str, float], seeds: range, estimators: tuple[str, ...]) -> None:
+    """Append a line of JSON for each seed of each case to the pool, from two processes; may be interrupted."""
+    from multiprocessing import get_context
+
+    work = [(source, duration_s, seed, estimators) for seed in seeds for source, duration_s in cases.items()]
+    with get_context("spawn").Pool(2) as processes, pool.open("a", encoding="utf-8") as lines:
+        for found in processes.imap_unordered(_one, work):
+            lines.write(json.dumps(found) + os.linesep)
+            lines.flush()
+
+
+def read(pool: Path) -> Iterator[dict[str, object]]:
+    """Yield what a pool holds."""
+    for line in pool.read_text(encoding="utf-8").splitlines():
+        yield json.loads(line)

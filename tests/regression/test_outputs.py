@@ -1,0 +1,111 @@
+"""What a check writes is well-formed, complete and says the same everywhere."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from toolkit.errors import OutputError
+from toolkit.report.gate_files import check_writable, write_check
+from toolkit.report.gate_words import gate_markdown, gate_text
+from toolkit.report.metrics_json import to_text
+
+
+@pytest.fixture
+def failed(baseline, gate):
+    """A check with a regression, a missing estimator whose reason would break a table, and an improvement."""
+    simulated, recorded = gate.as_measured(baseline)
+    worse = gate.edited(simulated, gate.planted(8.0, 1))
+    runs = {name: one for name, one in recorded.runs.items() if name != "three"}
+    slower = replace(worse.runs["one"], speed=tuple(0.5 * s for s in worse.runs["one"].speed))
+    now = [
+        replace(worse, runs=worse.runs | {"one": slower}),
+        replace(recorded, runs=runs, absent={"three": "it needs <a | b> &\nmore"}),
+    ]
+    return gate.judged(baseline, now)
+
+
+@pytest.fixture
+def passed(baseline, gate):
+    return gate.judged(baseline, gate.as_measured(baseline))
+
+
+@pytest.fixture(params=["failed", "passed"])
+def check(request):
+    return request.getfixturevalue(request.param)
+
+
+def test_junit_parses_and_counts_right(check, tmp_path):
+    write_check(check, {"junit": tmp_path / "gate.xml"})
+    root = ElementTree.parse(tmp_path / "gate.xml").getroot()
+    cases = root.findall("./testsuite/testcase")
+    assert int(root.get("tests")) == len(cases) == len(check.verdicts)
+    assert int(root.get("failures")) == len(root.findall(".//failure")) == len(check.failures)
+    for suite in root:
+        assert int(suite.get("tests")) == len(suite.findall("testcase"))
+        assert int(suite.get("failures")) == len(suite.findall("testcase/failure"))
+    names = [(case.get("classname"), case.get("name")) for case in cases]
+    assert len(set(names)) == len(names)
+
+
+def test_json_has_every_verdict_and_no_number_that_is_none(check, tmp_path):
+    write_check(check, {"json": tmp_path / "deep" / "gate.json"})
+    document = json.loads((tmp_path / "deep" / "gate.json").read_text(), parse_constant=pytest.fail)
+    assert document["schema"] == "vislam.check/1"
+    assert document["passed"] is check.passed
+    assert document["failures"] == len(check.failures)
+    assert [v["fails"] for v in document["verdicts"]] == [v.fails for v in check.verdicts]
+    assert document["tests"] == sum(v["p"] is not None for v in document["verdicts"])
+
+
+def test_markdown_tables_are_well_formed(check):
+    text = gate_markdown(check)
+    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
+    assert len(tables) == (1 if check.passed else 2)
+    for table in tables:
+        assert len({line.count("|") for line in table}) == 1
+        assert all(set(cell.strip()) <= set(":-") for cell in table[1].strip("|").split("|"))
+    assert len(tables[-1]) == 2 + len(check.verdicts)
+    assert text.count("<details>") == text.count("</details>") == 1
+
+
+def test_markdown_puts_what_failed_on_top(failed):
+    top = gate_markdown(failed).partition("<details>")[0]
+    assert "ate_se3_m" in top
+    assert "needs <a / b> & more" in top
+    assert "❌" in top
+
+
+def test_the_text_says_what_got_worse_by_how_much_and_how_sure(failed):
+    text = " ".join(gate_text(failed).split())
+    assert "flight, two causal: position error (ATE, SE(3)) got worse: +" in text
+    assert "over 24 seeds, and chance explains that with p = " in text
+    assert "data/drive_small, three: estimator is missing: it needs" in text
+    assert text.endswith("the gate fails: of 33 comparisons with made-up.json, 1 got worse, 1 missing")
+
+
+def test_the_text_of_a_check_that_passes_says_so_last(passed):
+    assert gate_text(passed).splitlines()[-1].startswith("the gate passes: nothing got worse")
+
+
+def test_a_file_is_replaced_at_once_or_not_at_all(passed, tmp_path, monkeypatch):
+    target = tmp_path / "gate.json"
+    target.write_text("before")
+    monkeypatch.setattr(Path, "write_text", _full)
+    with pytest.raises(OutputError, match=r"gate\.json cannot be written"):
+        write_check(passed, {"json": target})
+    assert target.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [target]
+    assert to_text({}) == "{}\n"
+
+
+def test_a_folder_in_the_place_of_a_file_is_told_before_anything_runs(tmp_path):
+    with pytest.raises(OutputError, match="is a directory"):
+        check_writable(tmp_path)
+
+
+def _full(self, *_given, **_named):
+    self.touch()
+    raise OSError(28, "No space left on device")

@@ -1,0 +1,143 @@
+"""``vislam baseline``: measure what ``vislam check`` compares with."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import UsageError, at_least, epilog, names, positive_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from toolkit.cli.arguments import Subcommands
+    from toolkit.regression.baseline import Baseline, Case
+
+ESTIMATORS = ("dead-reckoning", "ekf", "batch")
+SEEDS, FEWEST_SEEDS = 24, 5
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "baseline",
+        help="measure the baseline that vislam check compares with",
+        description="Measure estimators on sequences and write what vislam check compares with: simulated sequences "
+        "over many seeds, recorded ones once. See docs/gate.md.",
+        epilog=epilog(
+            "vislam baseline drive --estimators dead-reckoning,ekf --seeds 5 --duration 2 --out baseline.json"
+        ),
+    )
+    parser.add_argument(
+        "sequences",
+        metavar="SEQUENCE",
+        nargs="+",
+        help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
+    )
+    parser.add_argument(
+        "--estimators",
+        metavar="NAME,...",
+        type=names,
+        default=ESTIMATORS,
+        help=f"what to measure, see 'vislam list' (default: {','.join(ESTIMATORS)})",
+    )
+    parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
+    parser.add_argument(
+        "--seeds",
+        metavar="N",
+        type=at_least(FEWEST_SEEDS),
+        default=SEEDS,
+        help=f"seeds of each simulated sequence, from 0 (default: {SEEDS})",
+    )
+    parser.add_argument(
+        "--repeats", metavar="N", type=at_least(1), default=1, help="runs of each recorded sequence (default: 1)"
+    )
+    parser.add_argument(
+        "--duration",
+        metavar="S",
+        type=positive_seconds,
+        help="seconds of every sequence without its own (default: all of it)",
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="SEQUENCE=FILE.tum",
+        action="append",
+        default=[],
+        help="ground truth of a recorded sequence, from the same places; may be given several times",
+    )
+    parser.add_argument("--workers", metavar="N", type=at_least(1), help="processes side by side (default: one a CPU)")
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Measure, write and return 1 where an estimator diverged or failed; the baseline is written then, too."""
+    from toolkit.regression.baseline_json import to_text
+    from toolkit.regression.checking import new_baseline
+    from toolkit.regression.releases import label
+    from toolkit.report.gate_files import check_writable, made_here, write_text
+    from toolkit.report.progress import progress_on
+    from toolkit.sweep.processes import usable_cpus
+
+    cases = _cases(options)
+    out = options.out or Path(f"baseline_{label()}.json")
+    check_writable(out)
+    workers = options.workers or usable_cpus()
+    made = new_baseline(
+        cases, workers, made_here(shlex.join(options.command_line)), lambda told: progress_on(sys.stderr, told)
+    )
+    write_text(out, to_text(made))
+    ends = list(_bad_ends(made))
+    print("\n".join([*ends, f"baseline: {out}"]))
+    return 1 if ends else 0
+
+
+def _cases(options: argparse.Namespace) -> list[Case]:
+    """Return the cases the command line asks for."""
+    from toolkit.datasets import is_drawn_from_a_seed
+    from toolkit.estimator import find_all
+    from toolkit.regression.baseline import Case
+    from toolkit.regression.case_work import located
+
+    estimators = tuple(find_all(options.estimators))
+    truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
+    cases = []
+    for given in options.sequences:
+        source, seconds = _with_duration(given)
+        simulated = is_drawn_from_a_seed(located(source))
+        seeds = tuple(range(options.seeds if simulated else options.repeats))
+        cases.append(Case(source, simulated, seeds, estimators, seconds or options.duration, truths.pop(source, None)))
+    if len({case.source for case in cases}) != len(cases):
+        raise UsageError("a sequence is named twice (see vislam baseline --help)")
+    if truths:
+        raise UsageError(f"--truth is for {next(iter(truths))}, which is none of the sequences")
+    if any(case.simulated and case.truth for case in cases):
+        raise UsageError("--truth is for recorded sequences; a simulated one has its own")
+    return cases
+
+
+def _split(text: str, separator: str, otherwise: str) -> tuple[str, str]:
+    name, found, value = text.partition(separator)
+    if not found or not name or not value:
+        raise UsageError(f"{otherwise}, not {text}")
+    return name, value
+
+
+def _with_duration(given: str) -> tuple[str, float | None]:
+    """Split ``drive:5`` into the sequence and its seconds; a colon before anything but a number is the path's own."""
+    source, _, seconds = given.rpartition(":")
+    try:
+        return (source, positive_seconds(seconds)) if source else (given, None)
+    except argparse.ArgumentTypeError:
+        return given, None
+
+
+def _bad_ends(baseline: Baseline) -> Iterator[str]:
+    """Yield every estimator that did not end well somewhere."""
+    for case, measured in baseline.cases:
+        for name, series in measured.runs.items():
+            bad = sum(status != "ok" for status in series.status)
+            if bad:
+                yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {series.why}"

@@ -1,0 +1,68 @@
+"""``vislam check``: has anything got worse than a baseline?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import at_least, epilog
+
+if TYPE_CHECKING:
+    from toolkit.cli.arguments import Subcommands
+
+_FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json": "JSON"}
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "check",
+        help="fail if accuracy, consistency or speed got worse than a baseline",
+        description="Run again what a baseline lists, on the same measurements, and fail where accuracy, "
+        "consistency, held-out reprojection or speed got worse, or anything is missing. See docs/gate.md.",
+        epilog=epilog(
+            "vislam baseline drive --estimators dead-reckoning --seeds 5 --duration 2 --out baseline.json",
+            "vislam check --baseline baseline.json --skip-speed",
+        ),
+    )
+    parser.add_argument(
+        "--baseline",
+        metavar="FILE",
+        type=Path,
+        required=True,
+        help="what vislam baseline wrote; of a folder, the one for the releases installed here",
+    )
+    parser.add_argument("--workers", metavar="N", type=at_least(1), help="processes side by side (default: one a CPU)")
+    for name, what in _FILES.items():
+        parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
+    parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")
+    parser.add_argument(
+        "--allow-other-releases",
+        action="store_true",
+        help="compare although GTSAM or NumPy is another release than the baseline's",
+    )
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Check, print and return 1 where anything got worse or is missing."""
+    from toolkit.regression.baseline_reader import check_releases, load_baseline
+    from toolkit.regression.checking import How, check
+    from toolkit.report.gate_files import check_writable, write_check
+    from toolkit.report.gate_words import gate_text
+    from toolkit.report.progress import progress_on
+    from toolkit.sweep.processes import usable_cpus
+
+    files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
+    for path in files.values():
+        check_writable(path)
+    baseline = load_baseline(options.baseline)
+    if not options.allow_other_releases:
+        check_releases(baseline, str(options.baseline))
+    how = How(options.workers or usable_cpus(), speed=not options.skip_speed)
+    checked = check(baseline, str(options.baseline), how, lambda label: progress_on(sys.stderr, label))
+    write_check(checked, files)
+    print(gate_text(checked))
+    return 0 if checked.passed else 1

@@ -1,0 +1,123 @@
+"""What a baseline keeps: what was run, on which measurements, what came of it, and what counts as worse."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+from toolkit.errors import VislamError
+from toolkit.estimate import Output, Status
+
+Worse = Literal["larger", "away from 1"]
+Values = tuple[float | None, ...]
+
+
+class BaselineError(VislamError):
+    """A baseline that cannot be used, here or at all."""
+
+    exit_status: ClassVar[int] = 3
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When a metric is worse, and by how many percent it may be.
+
+    On simulated sequences ``percent`` is a margin: the mean worsening that nobody minds. On recorded ones it is the
+    bound a single value must keep. For ``away from 1`` it is in percent of the ratio to 1.
+    """
+
+    worse: Worse
+    percent: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What counts as worse: criteria by metric, for simulated and for recorded sequences, and the limits of all.
+
+    ``coverage_points`` (percent of the frames) may be lost under any seed; ``speed_ratio`` times slower, against the
+    reference workload, may a run become.
+    """
+
+    simulated: Mapping[str, Criterion]
+    recorded: Mapping[str, Criterion]
+    coverage_points: float
+    speed_ratio: float
+
+
+# How the numbers were chosen: docs/gate.md.
+DEFAULT_BOUNDS = Bounds(
+    simulated={
+        "ate_se3_m": Criterion("larger", 0.5),
+        "ate_yaw_m": Criterion("larger", 0.5),
+        "nees_pose_mean": Criterion("away from 1", 1.0),
+        "heldout_reproj_median_px": Criterion("larger", 0.5),
+    },
+    recorded={
+        "ate_se3_m": Criterion("larger", 5.0),
+        "ate_yaw_m": Criterion("larger", 5.0),
+        "rpe_100m_percent": Criterion("larger", 5.0),
+        "nees_pose_mean": Criterion("away from 1", 10.0),
+        "nis_mean": Criterion("away from 1", 10.0),
+        "heldout_reproj_median_px": Criterion("larger", 2.0),
+    },
+    coverage_points=1.0,
+    speed_ratio=1.3,
+)
+COVERAGE = "coverage_percent"
+FALSE_ALARM_RATE = 0.05
+
+
+@dataclass(frozen=True)
+class Case:
+    """One sequence and what runs on it.
+
+    A ``simulated`` sequence is drawn anew from each of ``seeds``; a recorded one is the same under each, and is run
+    once for each. ``duration_s`` is how long to simulate, or where to cut. ``truth`` is a file beside the recording.
+    """
+
+    source: str
+    simulated: bool
+    seeds: tuple[int, ...]
+    estimators: tuple[str, ...]
+    duration_s: float | None = None
+    truth: str | None = None
+
+
+@dataclass(frozen=True)
+class Series:
+    """One estimator on one case, by seed: how it ended, its time over the reference's, metrics by kind of output.
+
+    ``why`` says what the first run that did not end well had to say.
+    """
+
+    status: tuple[Status, ...]
+    speed: Values
+    outputs: Mapping[Output, Mapping[str, Values]]
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What came of a case: hash and fingerprint of what the estimators read by seed, and the series by estimator.
+
+    ``absent`` says why an estimator has no series, ``unreadable`` why the sequence itself could not be had.
+    """
+
+    hashes: tuple[str, ...]
+    fingerprints: tuple[str, ...]
+    runs: Mapping[str, Series]
+    absent: Mapping[str, str] = field(default_factory=dict)
+    unreadable: str = ""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Cases with what was measured on them, the releases it was measured with, and what counts as worse.
+
+    ``false_alarm_rate`` is that of all statistical tests of one check together.
+    """
+
+    releases: Mapping[str, str]
+    cases: tuple[tuple[Case, Measured], ...]
+    bounds: Bounds = DEFAULT_BOUNDS
+    false_alarm_rate: float = FALSE_ALARM_RATE
+    made_by: Mapping[str, str] = field(default_factory=dict)

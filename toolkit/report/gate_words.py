@@ -1,0 +1,91 @@
+"""What a check of the gate says, in plain words: the verdict in one line, what failed and why, and what to know."""
+
+import textwrap
+from collections.abc import Iterable, Iterator
+
+from toolkit.regression.verdict import Check, Verdict
+from toolkit.report.gate_table import failures_table, gate_table
+from toolkit.report.table import as_markdown, as_text
+
+_WIDTH = 118
+_PLAIN = {
+    "ate_se3_m": "position error (ATE, SE(3))",
+    "ate_yaw_m": "position error (ATE, yaw)",
+    "rpe_100m_percent": "drift over 100 m",
+    "nees_pose_mean": "consistency (NEES)",
+    "nis_mean": "consistency (NIS)",
+    "heldout_reproj_median_px": "held-out reprojection",
+    "coverage_percent": "coverage",
+}
+
+
+def headline(check: Check) -> str:
+    """Return the verdict in one line."""
+    judged = len(check.verdicts)
+    if check.passed:
+        return f"the gate passes: nothing got worse than {check.baseline} ({judged} comparisons)"
+    missing = sum(verdict.finding == "missing" for verdict in check.failures)
+    parts = [(len(check.failures) - missing, "got worse"), (missing, "missing")]
+    told = ", ".join(f"{count} {what}" for count, what in parts if count)
+    return f"the gate fails: of {judged} comparisons with {check.baseline}, {told}"
+
+
+def failure_lines(check: Check) -> Iterator[str]:
+    """Yield what the check fails for, a line each."""
+    for verdict in check.failures:
+        yield f"{about(verdict)}: {verdict.words}"
+
+
+def about(verdict: Verdict) -> str:
+    """Return what a verdict is about, in words."""
+    who = f"{verdict.estimator} {verdict.output}".strip()
+    what = _PLAIN.get(verdict.metric, verdict.metric)
+    on = f"{verdict.sequence}, {who}" if who else verdict.sequence
+    if verdict.finding == "missing":
+        return f"{on}: {what} is missing"
+    return f"{on}: {what} got worse" if verdict.finding == "regressed" else f"{on}: {what}"
+
+
+def note_lines(check: Check) -> Iterator[str]:
+    """Yield what a reader must know beside the verdicts."""
+    yield from check.notes
+    if check.tests:
+        blind = [v for v in check.verdicts if v.seen_percent is not None and v.seen_percent > 10.0 and not v.fails]
+        yield (
+            f"{check.tests} paired tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
+            "'sees' is the worsening each of them finds with 95 % power, from how much the change scatters"
+        )
+        if blind:
+            yield f"{len(blind)} of them would not have seen 10 %: the change scatters too much for so few seeds"
+    releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
+    yield f"{releases}; {check.seconds:.0f} s"
+
+
+def gate_text(check: Check) -> str:
+    """Return a check as plain text: the table of everything, the notes, and last what it comes to."""
+    lines = [as_text(gate_table(check)), ""]
+    lines += _section("notes", note_lines(check))
+    lines += _section("fails", failure_lines(check))
+    return "\n".join([*lines, "", headline(check)])
+
+
+def gate_markdown(check: Check) -> str:
+    """Return a check as Markdown fit for a pull request: what failed on top, everything folded below."""
+    mark = "✅" if check.passed else "❌"
+    parts = [f"## {mark} Accuracy gate", _sentence(headline(check))]
+    if check.failures:
+        parts.append(as_markdown(failures_table(check)))
+    parts.append("\n".join(f"- {line}" for line in note_lines(check)))
+    everything = as_markdown(gate_table(check))
+    parts.append(f"<details>\n<summary>All {len(check.verdicts)} comparisons</summary>\n\n{everything}\n\n</details>")
+    return "\n\n".join(parts) + "\n"
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:] + "."
+
+
+def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
+    for i, entry in enumerate(entries):
+        label = f"{title}:" if i == 0 else ""
+        yield textwrap.fill(entry, _WIDTH, initial_indent=f"{label:<7}", subsequent_indent=" " * 9)
