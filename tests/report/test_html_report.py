@@ -1,0 +1,248 @@
+"""The page shows the run directory's numbers, needs nothing but itself, and takes no text of a recording for code."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit.errors import DataError, OutputError
+from toolkit.report.comparison import Comparison
+from toolkit.report.html import write_html
+from toolkit.report.html.highlights import highlights
+from toolkit.report.html.page import SCRIPTS, json_in_html, page_text
+from toolkit.report.html.payload import payload_of
+from toolkit.report.html.run_files import read_run
+from toolkit.report.html.thinning import evenly, running_median, with_peaks
+from toolkit.report.run_directory import write_run
+
+Json = dict[str, Any]
+HOSTILE = "</script><script>window.broken = 1</script><!-- <img src=x onerror=alert(1)> {{ script }} \u2028"
+
+
+@pytest.fixture(scope="module")
+def case(run_directory: Path) -> Json:
+    one: Json = payload_of([read_run(run_directory)])["cases"][0]
+    return one
+
+
+@pytest.fixture(scope="module")
+def page(run_directory: Path) -> str:
+    return page_text(payload_of([read_run(run_directory)]))
+
+
+def written(comparison: Comparison, target: Path) -> Path:
+    write_run(comparison, target, command="vislam compare", seed=0)
+    return target
+
+
+def embedded(page: str) -> Json:
+    (text,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', page, flags=re.S)
+    payload: Json = json.loads(text)
+    return payload
+
+
+def row(case: Json, estimator: str) -> Json:
+    (found,) = [one for one in case["rows"] if one["estimator"] == estimator]
+    assert isinstance(found, dict)
+    return found
+
+
+def test_every_number_is_that_of_metrics_json(page: str, run_directory: Path) -> None:
+    told = json.loads((run_directory / "metrics.json").read_text())
+    (case,) = embedded(page)["cases"]
+    by_line = {(run["estimator"], run["output"]): run for run in told["runs"]}
+    for one in case["rows"]:
+        run = by_line[one["estimator"], "causal" if one["output"] == "both" else one["output"]]
+        assert one["metrics"] == run["metrics"]
+        assert one["notes"] == run["notes"]
+        assert one["status"] == run["status"]
+    assert case["sequence"] == told["sequence"]
+    shown = {column["key"] for column in embedded(page)["columns"]}
+    assert {key for run in told["runs"] for key in run["metrics"]} <= shown
+
+
+def test_outputs_that_agree_have_one_line(case: Json) -> None:
+    assert [(one["estimator"], one["output"]) for one in case["rows"]] == [
+        ("steady", "both"),
+        ("astray", "both"),
+        ("late", "final"),
+        ("broken", "final"),
+    ]
+
+
+@pytest.mark.parametrize("estimator", ["steady", "late"])
+def test_tracks_are_aligned_as_the_metric_says(case: Json, estimator: str) -> None:
+    one = row(case, estimator)
+    truth, track = case["truth"], one["track"]
+    assert np.allclose(truth["t_s"], track["t_s"], atol=1e-3)
+    offsets = [np.array(track[axis]) - np.array(truth[axis]) for axis in "xyz"]
+    rmse_m = np.sqrt(np.mean(np.sum(np.square(offsets), axis=0)))
+    assert rmse_m == pytest.approx(one["metrics"]["ate_se3_m"], abs=2e-3)  # drawn to the millimetre
+
+
+def test_every_axis_unit_is_known(page: str) -> None:
+    for column in embedded(page)["columns"]:
+        assert column["unit"] or column["key"] == "pairs"
+        assert column["meaning"]
+
+
+def test_a_failed_run_is_shown_without_a_track_and_with_reasons(case: Json) -> None:
+    one = row(case, "broken")
+    assert one["status"] == "failed"
+    assert one["track"] is None
+    assert all(one["notes"][key] for key, value in one["metrics"].items() if value is None)
+
+
+def test_the_same_estimator_has_one_colour_in_every_run(run_directory: Path, comparison: Comparison) -> None:
+    runs = [read_run(run_directory)] * 2
+    first, second = payload_of(runs)["cases"]
+    assert [one["colour"] for one in first["rows"]] == [one["colour"] for one in second["rows"]] == [0, 1, 2, 3]
+    assert not {one["id"] for one in first["rows"]} & {one["id"] for one in second["rows"]}
+
+
+def test_without_truth_there_is_a_page_too(without_truth: Comparison, tmp_path: Path) -> None:
+    (case,) = payload_of([read_run(written(without_truth, tmp_path / "run"))])["cases"]
+    assert case["truth"] is None
+    assert case["error"]["what"].startswith("difference from")
+
+
+def test_it_works_on_another_machine(run_directory: Path, tmp_path: Path, page: str) -> None:
+    shutil.copytree(run_directory, tmp_path / "moved" / "made-up")
+    write_html([tmp_path / "moved" / "made-up"], tmp_path / "out.html")
+    assert (tmp_path / "out.html").read_text() == page
+
+
+def test_the_same_run_gives_the_same_bytes(run_directory: Path, tmp_path: Path) -> None:
+    for name in ("one.html", "two.html"):
+        write_html([run_directory], tmp_path / name)
+    assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
+
+
+def test_nothing_is_fetched(page: str) -> None:
+    markup = re.sub(r"<script.*?</script>", "", page, flags=re.S)
+    assert not re.search(r"\b(src|href)\s*=\s*(?![\"']?#)", markup)
+    assert "@import" not in page
+    assert "url(" not in page
+    assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|sendBeacon)\s*\(", page)
+    assert "default-src 'none'" in page
+
+
+def test_every_script_is_part_of_the_page() -> None:
+    import toolkit.report.html as package
+
+    (folder,) = package.__path__
+    assert {path.stem for path in (Path(folder) / "scripts").iterdir()} == set(SCRIPTS)
+
+
+def test_a_hostile_name_stays_text(run_directory: Path, tmp_path: Path, page: str) -> None:
+    shutil.copytree(run_directory, tmp_path / "run")
+    for name in ("metrics.json", "report.json", "manifest.json"):
+        path = tmp_path / "run" / name
+        path.write_text(
+            path.read_text().replace('"steady"', json.dumps(HOSTILE)).replace('"drive"', json.dumps(HOSTILE))
+        )
+    text = page_text(payload_of([read_run(tmp_path / "run")]))
+    for mark in ("<script", "</script", "<!--", "<img"):
+        assert text.count(mark) == page.count(mark)
+    assert embedded(text)["cases"][0]["title"] == HOSTILE
+
+
+@pytest.mark.parametrize("text", ["</script>", "<!--", "<![CDATA[ ]]>", "a & b", "\u2028\u2029", '"\\', "ℝ³ · 10⁵"])
+def test_json_in_html_is_safe_and_the_same(text: str) -> None:
+    inside = json_in_html({text: [text]})
+    assert not set("<>&\u2028\u2029") & set(inside)
+    assert json.loads(inside) == {text: [text]}
+
+
+def test_thinning_keeps_peaks_and_ends() -> None:
+    values = np.random.default_rng(0).normal(size=20_000)
+    values[777], values[15_000], values[5] = 50.0, -60.0, np.nan
+    kept = with_peaks(values, 1200)
+    assert kept.size <= 1200
+    assert {0, 777, 15_000, 19_999} <= set(kept.tolist())
+    assert np.all(np.diff(kept) > 0)
+    assert with_peaks(values[:100], 1200).tolist() == list(range(100))
+
+
+def test_the_running_median_ignores_a_single_spike_and_what_is_missing() -> None:
+    values: list[float | None] = [2.0] * 40
+    values[20], values[3], values[4] = 900.0, None, None
+    assert running_median(values) == [2.0] * 40
+    assert running_median([None, None]) == [None, None]
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 5), (1, 5), (5, 5), (10_000, 1500)])
+def test_evenly_spread_indices_reach_both_ends(count: int, most: int) -> None:
+    kept = evenly(count, most)
+    assert kept.size == min(count, most)
+    assert kept.tolist()[:1] == [0][:count]
+    assert kept.tolist()[-1:] == [count - 1][:count]
+
+
+def _highlighted(status: str = "ok", coverage: float = 100.0, ate: float | None = 1.0) -> Json:
+    metrics = {"ate_se3_m": ate, "coverage_percent": coverage, "heldout_reproj_median_px": None, "total_s": None}
+    return {"status": status, "output": "both", "metrics": metrics}
+
+
+def test_an_answer_comes_from_runs_that_are_ok_and_whole() -> None:
+    rows = [
+        {**_highlighted(ate=3.0), "id": "a", "estimator": "whole"},
+        {**_highlighted(ate=0.1, coverage=40.0), "id": "b", "estimator": "half"},
+        {**_highlighted(ate=0.2, status="diverged"), "id": "c", "estimator": "astray"},
+        {**_highlighted(ate=4.0), "id": "d", "estimator": "other"},
+    ]
+    first = highlights(rows, "twist")[0]
+    assert (first["answer"], first["row"]) == ("whole", "a")
+    assert first["next"] == "next: other, 4 m"
+    assert highlights([{**_highlighted(ate=None), "id": "a", "estimator": "mute"}], "twist") == []
+
+
+def test_the_earlier_page_is_replaced_or_kept_whole(run_directory: Path, tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "report.html"
+    write_html([run_directory], target)
+    before = target.read_bytes()
+    with pytest.raises(DataError):
+        write_html([run_directory, tmp_path / "nowhere"], target)
+    assert target.read_bytes() == before
+    assert [path.name for path in target.parent.iterdir()] == ["report.html"]
+
+
+def test_a_directory_in_the_way_is_refused(run_directory: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="is a directory"):
+        write_html([run_directory], tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_html([run_directory], tmp_path / "file" / "report.html")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("report.json", None, "earlier version"),
+        ("manifest.json", None, "missing"),
+        ("metrics.json", "{", "cannot be read"),
+        ("metrics.json", "{}", "not what this version writes"),
+        ("trajectories/late_final.tum", None, "late_final.tum"),
+        ("trajectories/late_final.tum", "1 2 3\n", "columns"),
+        ("landmarks/late.csv", "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
+    ],
+)
+def test_a_damaged_run_directory_is_told_in_one_line(
+    run_directory: Path, tmp_path: Path, name: str, text: str | None, told: str
+) -> None:
+    shutil.copytree(run_directory, tmp_path / "run")
+    (tmp_path / "run" / name).unlink()
+    if text is not None:
+        (tmp_path / "run" / name).write_text(text)
+    with pytest.raises(DataError, match=re.escape(told)):
+        read_run(tmp_path / "run")
+
+
+def test_what_is_no_run_directory_is_told(tmp_path: Path) -> None:
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(DataError, match=path.name):
+            read_run(path)

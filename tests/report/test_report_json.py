@@ -1,0 +1,100 @@
+"""report.json holds what a report draws: the same series the metrics were computed from, at every frame."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.estimate import Run
+from toolkit.metrics import score_run
+from toolkit.report.comparison import Comparison, Row
+from toolkit.report.metrics_json import Json
+from toolkit.report.report_json import build, violations
+
+
+@pytest.fixture(scope="module")
+def scored(run_estimator: Callable[..., Run]) -> Comparison:
+    """A filter that states covariances and innovations, and one that does not, on a short simulated drive."""
+    sequence = load_sequence("drive").truncated(40)
+    runs = tuple(run_estimator(name, sequence) for name in ("ekf", "dead-reckoning"))
+    rows = tuple(Row(run, "causal", score_run(run, "causal", sequence)) for run in runs)
+    assert sequence.prior is not None
+    return Comparison(sequence, (), sequence.prior, runs, rows)
+
+
+def of(document: Json, estimator: str, output: str = "causal") -> Json:
+    runs = document["runs"]
+    assert isinstance(runs, list)
+    return next(run for run in runs if (run["estimator"], run["output"]) == (estimator, output))
+
+
+def test_what_is_written_keeps_the_contract(run_directory: Path) -> None:
+    assert violations(json.loads((run_directory / "report.json").read_text())) == []
+
+
+def test_a_broken_document_is_told(comparison: Comparison) -> None:
+    document = build(comparison)
+    broken = {key: value for key, value in document.items() if key != "runs"} | {"schema": "vislam.report/9"}
+    assert len(violations(broken)) == 2
+    assert violations([]) == ["the document is not an object"]
+    assert "runs[0]" in violations({**document, "runs": [{"estimator": 3}]})[0]
+
+
+def test_nees_and_nis_series_average_to_their_metrics(scored: Comparison) -> None:
+    run, scores = of(build(scored), "ekf"), scored.rows[0].scores.values
+    # Six digits of each value are kept.
+    for part, key in (("pose", "nees_pose_mean"), ("orientation", "nees_ori_mean"), ("position", "nees_pos_mean")):
+        assert np.mean(run["nees"][part]) == pytest.approx(scores[key], rel=1e-5)
+    info = scored.runs[0].info
+    dof = info["nis_dof"][np.isfinite(info["nis"]) & (info["nis_dof"] > 0)]
+    assert np.average(run["nis"]["per_dof"], weights=dof) == pytest.approx(scores["nis_mean"], rel=1e-5)
+
+
+def test_the_nis_band_narrows_with_the_degrees_of_freedom(scored: Comparison) -> None:
+    nis = of(build(scored), "ekf")["nis"]
+    assert all(low < 1.0 < high for low, high in zip(nis["low"], nis["high"], strict=True))
+    assert max(nis["high"]) < 2.0  # dozens of sightings a frame
+
+
+def test_a_series_that_is_not_there_says_why(scored: Comparison) -> None:
+    assert of(build(scored), "dead-reckoning")["nis"] == "the estimator reports no innovations"
+
+
+def test_errors_are_those_of_the_metric(comparison: Comparison) -> None:
+    run, row = of(build(comparison), "late", "final"), comparison.rows[-2]
+    assert row.estimator == "late"
+    rmse_m = np.sqrt(np.mean(np.square(run["errors"]["position_m"])))
+    assert rmse_m == pytest.approx(row.scores.values["ate_se3_m"], rel=1e-5)
+    path_m = run["errors"]["path_m"]
+    assert np.all(np.diff(path_m) >= 0.0)
+    assert path_m[0] == 0.0
+
+
+def test_errors_of_outputs_that_agree_stand_once(comparison: Comparison) -> None:
+    document = build(comparison)
+    assert of(document, "steady")["errors"] is not None
+    assert of(document, "steady", "final")["errors"] is None
+    assert of(document, "steady", "final")["repeats_causal"]
+
+
+def test_without_truth_the_difference_is_named(without_truth: Comparison) -> None:
+    document = build(without_truth)
+    assert document["truth"] is None
+    assert document["error"]["what"] == "difference from late final"
+    assert np.allclose(of(document, "steady")["rotation"], np.eye(3))
+
+
+def test_a_run_that_flew_off_is_still_json(comparison: Comparison) -> None:
+    text = json.dumps(build(comparison), allow_nan=False)
+    assert of(json.loads(text), "broken", "final")["trajectory"] is None
+
+
+def test_truth_and_trajectories_are_where_the_document_says(run_directory: Path) -> None:
+    document = json.loads((run_directory / "report.json").read_text())
+    files = [document["truth"], *(run["trajectory"] for run in document["runs"] if run["trajectory"])]
+    files += [one["landmarks"] for one in document["maps"]]
+    assert len(files) == len(set(files)) > 5
+    assert all((run_directory / name).is_file() for name in files)

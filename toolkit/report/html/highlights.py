@@ -1,0 +1,90 @@
+"""The answers a reader looks for first: who was most accurate, who knew how sure to be, who was fastest."""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+# An error over half a recording is not half an error: rows that answered less than the best by more are left out.
+_COVERAGE_MARGIN_PERCENT = 5.0
+
+Row = dict[str, Any]
+
+
+class _Question(NamedTuple):
+    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and how it is told."""
+
+    asks: str
+    outputs: tuple[str, ...]
+    keys: tuple[str, ...]
+    unit: str
+    tells: Callable[[str, float], str]
+    distance: Callable[[float], float] = abs
+
+
+def _from_one(value: float) -> float:
+    return abs(math.log(value)) if value > 0.0 else math.inf
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}" if abs(value) < 1e6 else f"{value:.0e}"
+
+
+def _error(key: str, value: float) -> str:
+    return f"{_short(value)} m ATE, {'yaw and position' if key == 'ate_yaw_m' else 'SE(3)'} aligned"
+
+
+def _held_out(_: str, value: float) -> str:
+    return f"{_short(value)} px off the median withheld sighting"
+
+
+def _honesty(key: str, value: float) -> str:
+    what = "pose NEES" if key == "nees_pose_mean" else "NIS"
+    return f"mean {what} {_short(value)}; 1 is honest, more is too sure"
+
+
+def _time(_: str, value: float) -> str:
+    return f"{_short(value)} s for the whole recording"
+
+
+def highlights(rows: list[Row], motion: str) -> list[dict[str, str]]:
+    """Return question, answer (the estimator), its figure and the runner-up, for what the rows have figures for.
+
+    Only runs that ended well and answered for as much of the recording as the best one can be an answer.
+    """
+    ate = ("ate_yaw_m",) if motion == "imu" else ("ate_se3_m",)
+    everyone = ("causal", "both", "final")
+    questions = (
+        _Question("Most accurate at the time (causal)", ("causal", "both"), ate, " m", _error),
+        _Question("Most accurate in the end (final)", ("final", "both"), ate, " m", _error),
+        _Question("Best on withheld tracks", everyone, ("heldout_reproj_median_px",), " px", _held_out),
+        _Question("Most honest uncertainty", everyone, ("nees_pose_mean", "nis_mean"), "", _honesty, _from_one),
+        _Question("Fastest", everyone, ("total_s",), " s", _time),
+    )
+    eligible = list(_eligible(rows))
+    return [answer for question in questions if (answer := _answer(question, eligible)) is not None]
+
+
+def _eligible(rows: list[Row]) -> Iterator[Row]:
+    good = [row for row in rows if row["status"] == "ok"]
+    most = max((row["metrics"].get("coverage_percent") or 0.0 for row in good), default=0.0)
+    for row in good:
+        if (row["metrics"].get("coverage_percent") or 0.0) >= most - _COVERAGE_MARGIN_PERCENT:
+            yield row
+
+
+def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
+    asked = [row for row in rows if row["output"] in question.outputs]
+    for key in question.keys:
+        given = [(row, row["metrics"][key]) for row in asked if row["metrics"].get(key) is not None]
+        ranked = sorted(given, key=lambda pair: question.distance(pair[1]))
+        if ranked:
+            (best, value), *others = ranked
+            after = next(((row, v) for row, v in others if row["estimator"] != best["estimator"]), None)
+            return {
+                "asks": question.asks,
+                "answer": best["estimator"],
+                "row": best["id"],
+                "tells": question.tells(key, value),
+                "next": "" if after is None else f"next: {after[0]['estimator']}, {_short(after[1])}{question.unit}",
+            }
+    return None

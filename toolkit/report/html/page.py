@@ -1,0 +1,54 @@
+"""One HTML file out of the page's sources and a payload: nothing is fetched, and no text of a recording is code."""
+
+import html
+import json
+import re
+from importlib.resources import files
+from typing import Any
+
+# In the order in which they build upon each other; together they are the body of one function.
+SCRIPTS = (
+    "dom",
+    "numbers",
+    "state",
+    "hints",
+    "table",
+    "canvas",
+    "gestures",
+    "scene",
+    "top_view",
+    "orbit_view",
+    "axes",
+    "chart",
+    "charts",
+    "seeds",
+    "words",
+    "case",
+    "main",
+)
+# What could end the script element or open a comment inside it, and what older parsers take for the end of a line.
+_ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+
+
+def page_text(payload: dict[str, Any]) -> str:
+    """Return the page of a payload with its ``title``; refuses NaN and infinity, which are not JSON."""
+    parts = {
+        "title": html.escape(payload["title"]),
+        "style": _source("style.css"),
+        "payload": json_in_html(payload),
+        "script": "\n".join(_source(f"scripts/{name}.js") for name in SCRIPTS),
+    }
+    # One pass: a payload that spells out one of the places must not be taken for one.
+    return re.sub(r"{{ (\w+) }}", lambda place: parts[place[1]], _source("page.html"))
+
+
+def json_in_html(value: object) -> str:
+    """Return a value as JSON that is safe inside a script element: ``</script>`` and ``<!--`` cannot appear."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character, escape in _ESCAPES.items():
+        text = text.replace(character, escape)
+    return text
+
+
+def _source(name: str) -> str:
+    return files("toolkit.report.html").joinpath(name).read_text(encoding="utf-8")

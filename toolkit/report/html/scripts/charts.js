@@ -1,0 +1,112 @@
+/** The charts of a case: each with a sentence under it, or the reason why there is none. */
+function chartsOf(one) {
+  const cards = one.error ? [positionCard(one), headingCard(one)] : [];
+  cards.push(neesCard(one), nisCard(one), stepsCard(one));
+  return cards.filter((card) => card !== null);
+}
+
+function chartCard(one, title, describe, caption, ...controls) {
+  return el("section", { class: "card" }, el("div", { class: "bar" }, el("h3", { text: title }), controls),
+    chart(one, title, describe), el("p", { class: "fine", text: caption }));
+}
+
+function emptyCard(title, reasons) {
+  return el("section", { class: "card empty" }, el("h3", { text: title }), el("p", { class: "fine", text: "No figures for it:" }),
+    el("ul", { class: "fine" }, reasons.map((reason) => el("li", { text: reason }))));
+}
+
+/** Errors over distance or time, as the reader chose. */
+function errorLines(one, name) {
+  const overPath = state.over === "path";
+  const lines = one.rows.filter((row) => row.errors).map((row) => ({
+    row, t: row.errors.t_s, x: overPath && row.errors.path_m ? row.errors.path_m : row.errors.t_s, y: row.errors[name],
+  }));
+  return { lines, xLabel: overPath && one.kind === "run" ? "distance along the path [m]" : "time [s]" };
+}
+
+/** Say whether the largest errors of the lines lie so far apart that only a logarithmic axis shows them all. */
+function farApart(lines) {
+  const largest = lines.map((line) => rangeOf([line.y])?.[1]).filter((most) => most > 0);
+  return Math.max(...largest) > 30 * Math.min(...largest);
+}
+
+function positionCard(one) {
+  let log = farApart(errorLines(one, "position_m").lines);
+  const toggle = el("button", { type: "button", class: "quiet", text: "log", "aria-pressed": String(log),
+    "aria-label": "Logarithmic axis", onclick: () => {
+      log = !log;
+      toggle.setAttribute("aria-pressed", String(log));
+      changed();
+    } });
+  const what = one.error.what;
+  const describe = () => ({ ...errorLines(one, "position_m"), yLabel: `position ${what} [m]`, unit: "m", log, least: 1e-3 });
+  return chartCard(one, `Position ${what}`, describe, one.error.caption, toggle);
+}
+
+function headingCard(one) {
+  const what = one.error.what;
+  const describe = () => ({ ...errorLines(one, "heading_deg"), yLabel: `heading ${what} [deg]`, unit: "deg", signed: true, wraps: true, least: 1e-2 });
+  return chartCard(one, `Heading ${what}`, describe, "Positive is turned to the left of where it should be.");
+}
+
+const NEES_PARTS = [["pose", "pose"], ["orientation", "rotation"], ["position", "position"]];
+
+function neesCard(one) {
+  const title = "Is the stated uncertainty honest? NEES";
+  const rows = one.rows.filter((row) => row.nees && typeof row.nees === "object");
+  if (!rows.length) return emptyCard(title, reasonsOf(one.rows, "nees"));
+  let part = "pose";
+  const choose = dropdown("of the", NEES_PARTS, part, (value) => {
+    part = value;
+    changed();
+  });
+  const describe = () => ({
+    lines: rows.map((row) => ({ row, t: row.nees.t_s, x: row.nees.t_s, y: row.nees[part] })),
+    xLabel: "time [s]", yLabel: "NEES over its degrees of freedom [1]", unit: "", log: true, level: 1,
+    band: part === "pose" ? rows[0].nees.band : undefined,
+  });
+  return chartCard(one, title, describe, "Squared error over what the estimator stated for it: 1 is honest, above the shaded " +
+    "95 % band of one run it is too sure of itself, below it less sure than it could be." + missingWords(one.rows, "nees"), choose);
+}
+
+function nisCard(one) {
+  const title = "Do the measurements agree? NIS";
+  const rows = one.rows.filter((row) => row.nis && typeof row.nis === "object");
+  if (!rows.length) return emptyCard(title, reasonsOf(one.rows, "nis"));
+  const describe = () => {
+    const shown = rows.filter(isShown);
+    const banded = (shown.length ? shown : rows)[0].nis;
+    return {
+      lines: rows.map((row) => ({ row, t: row.nis.t_s, x: row.nis.t_s, y: row.nis.per_dof, median: row.nis.median })),
+      xLabel: "time [s]", yLabel: "NIS over its degrees of freedom [1]", unit: "", log: true, level: 1, dots: true,
+      band: { x: banded.t_s, low: banded.low, high: banded.high },
+    };
+  };
+  return chartCard(one, title, describe, "Squared innovation over what the filter expected of it at each frame (dots) and its running median (line); the shaded 95 % band is for as many " +
+    "measurements as the first line shown had at each frame. It needs no truth." + missingWords(one.rows, "nis"));
+}
+
+function stepsCard(one) {
+  if (!one.steps.length) return emptyCard("Time per frame", ["no estimator was run here"]);
+  const timed = one.steps.map((step) => ({ ...step, row: one.rows.find((row) => step.rows.includes(row.id)) })).filter((step) => step.row);
+  const describe = () => ({
+    lines: timed.map((step) => ({ row: step.row, t: step.t_s, x: step.t_s, y: step.step_ms, median: step.median })),
+    xLabel: "time in the recording [s]", yLabel: "time of a step [ms]", unit: "ms", log: true, dots: true,
+  });
+  const late = timed.filter((step) => step.finish_s * 1e3 > step.step_ms.reduce((a, b) => a + b, 0));
+  const finish = late.map((step) => ` ${step.estimator} does its work at the end: ${shortText(step.finish_s)} s.`).join("");
+  return chartCard(one, "Time per frame", describe, `Wall clock of each step (dots) and its running median (line).${finish}`);
+}
+
+/** Why rows have no series, each reason once, with whom it is about. */
+function reasonsOf(rows, name) {
+  const byReason = new Map();
+  for (const row of rows.filter((other) => typeof other[name] === "string"))
+    byReason.set(row[name], [...(byReason.get(row[name]) ?? []), labelOf(row)]);
+  return [...byReason].map(([reason, names]) => (names.length === rows.length ? reason : `${names.join(", ")}: ${reason}`));
+}
+
+function missingWords(rows, name) {
+  const reasons = reasonsOf(rows, name);
+  return reasons.length ? ` Not shown: ${reasons.join("; ")}.` : "";
+}
