@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.cli import simulate
 
-COMMANDS = ("", "compare", "check-data", "list", "simulate")
+COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "list", "simulate")
 STATUSES = ("0", "1", "2", "3", "4", "5", "130")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 

@@ -1,6 +1,7 @@
 """A made-up comparison: a simulated recording, and runs that are its truth with a known error."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from toolkit.geometry import Array, about_z, interpolate_poses, se3
 from toolkit.metrics import Scores, describe, score_run
 from toolkit.models.stereo import triangulate_world
 from toolkit.report.comparison import Comparison, Row, outputs_of
+from toolkit.report.run_directory import write_run
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, simulate
 
@@ -39,6 +41,14 @@ def without_truth(sequence: Sequence) -> Comparison:
     """The same kind of comparison on a recording nobody knows the truth of."""
     blind = replace(sequence, truth=None)
     return compared(blind, (_run("steady", sequence, turn_rad=0.02), _run("late", sequence, turn_rad=0.01)))
+
+
+@pytest.fixture(scope="session")
+def run_directory(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run directory of the comparison; it is shared and must not be changed."""
+    target = tmp_path_factory.mktemp("runs") / "made-up"
+    write_run(comparison, target, command="vislam compare made-up --seed 3", seed=3)
+    return target
 
 
 def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:

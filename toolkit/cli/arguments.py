@@ -3,6 +3,7 @@
 import argparse
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from toolkit.errors import VislamError
@@ -15,9 +16,10 @@ _EXIT_STATUSES = """\
 exit status:
   0    everything ran and ended well
   1    an estimator diverged or failed (the results are written and say so),
-       or check-data found a fault that is not repaired
+       check-data found a fault that is not repaired, or check found that
+       something got worse than the baseline or is missing
   2    the command line is wrong
-  3    a recording or a truth file cannot be used
+  3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
   130  interrupted (Ctrl-C or SIGTERM); nothing is left half-written"""
@@ -71,6 +73,14 @@ def names(text: str) -> tuple[str, ...]:
     if not found:
         raise argparse.ArgumentTypeError("expected names separated by commas")
     return found
+
+
+def named_file(text: str) -> tuple[str, Path]:
+    """Parse NAME=FILE."""
+    name, equals, file = text.partition("=")
+    if not (equals and name.strip() and file):
+        raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
+    return name.strip(), Path(file)
 
 
 def at_least(least: int) -> Callable[[str], int]:

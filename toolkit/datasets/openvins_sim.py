@@ -4,8 +4,6 @@ What OpenVINS itself made of the recording may lie beside them as est.txt.
 
 World z is up; accelerations are specific force; T_imu_cam takes the camera to the IMU, and quaternions (w first) take
 the IMU to the world: so read, the truth reprojects the next frame to 1.2 px with 1 px noise, and not to 8 px or more.
-The estimate's q_GtoI is a JPL quaternion of the opposite rotation, x y z w: the same four numbers as Hamilton's of the
-IMU to the world.
 Source: Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
@@ -21,8 +19,8 @@ from toolkit.datasets.parts.csv_table import find_table, first_line, read_column
 from toolkit.datasets.parts.fields import Fields, check_frame_count
 from toolkit.datasets.parts.stamps import stamps_ns
 from toolkit.datasets.parts.stereo_rows import observations
-from toolkit.datasets.parts.text_table import read_rows
-from toolkit.datasets.parts.truth_file import checked_poses
+from toolkit.datasets.trajectories import openvins
+from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import IntArray, se3, se3_inverse
@@ -36,9 +34,7 @@ _TRUTH_COLUMNS = (
     *("vx", "vy", "vz", "bax", "bay", "baz", "bgx", "bgy", "bgz"),
 )
 _ESTIMATE = "est.txt"
-_ESTIMATE_COLUMNS = "t qx qy qz qw px py pz vx vy vz bgx bgy bgz bax bay baz"
 _ESTIMATE_KIND = "it is OpenVINS' own estimate, one state a line: export it again, or remove it to compare without it"
-_TUM_ORDER = (0, 5, 6, 7, 1, 2, 3, 4)
 _NOISE_KEYS = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _REQUIRED = (
@@ -93,9 +89,7 @@ def references(path: Path) -> dict[str, Trajectory]:
     estimate = path / _ESTIMATE
     if not estimate.exists():
         return {}
-    line_numbers, table = read_rows(estimate, _ESTIMATE_COLUMNS, _ESTIMATE_KIND)
-    t_ns, T_world_imu = checked_poses(estimate, line_numbers, table[:, _TUM_ORDER])
-    return {f"openvins ({_ESTIMATE})": Trajectory(t_ns, T_world_imu)}
+    return {f"openvins ({_ESTIMATE})": openvins.read(estimate, _ESTIMATE_KIND)}
 
 
 def _tables(folder: Path) -> tuple[Path, Path]:
@@ -178,5 +172,6 @@ def _truth(folder: Path) -> Truth | None:
     table = read_columns(path, _TRUTH_COLUMNS)
     if not len(table):
         raise DataError(f"{path}: holds no poses; export it again, or remove it to run without truth")
-    t_ns, T_world_imu = checked_poses(path, list(range(2, len(table) + 2)), table[:, :8])
+    t_ns = stamps_ns(path, "timestamp", table[:, 0])
+    T_world_imu = checked_poses(path, list(range(2, len(table) + 2)), t_ns, table[:, 1:8])
     return Truth(t_ns, T_world_imu, table[:, 8:11], table[:, 11:17])

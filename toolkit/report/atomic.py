@@ -1,9 +1,9 @@
-"""A directory appears complete or not at all: it is written beside its place and then renamed into it."""
+"""A directory or a file appears complete or not at all: it is written beside its place and then renamed into it."""
 
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from toolkit.errors import OutputError
@@ -57,6 +57,28 @@ def replaced_directory(target: Path, is_ours: IsOurs) -> Iterator[Path]:
         raise _unwritable(target, error) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def replaced_file(target: Path) -> Iterator[Path]:
+    """Give a file to write to; on success it takes ``target``'s place, on any failure it is removed.
+
+    Raises OutputError where the place is taken by a directory or cannot be written.
+    """
+    if target.is_dir():
+        raise OutputError(f"{target} is a directory; name a file in it with --out")
+    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        partial.replace(target)
+    except OSError as error:
+        raise OutputError(
+            f"{target} cannot be written ({error.strerror or error}); choose another file with --out"
+        ) from error
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 def _swap(new: Path, target: Path) -> None:

@@ -2,42 +2,85 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from toolkit.cutting import NS_PER_S
-from toolkit.estimate import Landmarks, Run, Trajectory
-from toolkit.geometry import IntArray
+from toolkit.datasets.trajectories.belonging import (
+    check_clock,
+    check_turns,
+    in_other_order,
+    inverted,
+    of_the_camera,
+    range_s,
+)
+from toolkit.datasets.trajectories.poses import PosesFile, check_order
+from toolkit.errors import DataError
+from toolkit.estimate import Landmarks, Output, Run, Trajectory
+from toolkit.metrics.common.association import median_period_ns, poses_at
+from toolkit.report.comparison import plain_name
 from toolkit.sequence import Sequence
 
-# Stamps printed with 16 digits are off by half a microsecond, those with five decimals by 5; no motion shows in that.
-_ROUNDING_NS = 10_000
 _OTHER_TERMS = (
     "its start, its noise and its cost are its own, and it may have seen the tracks that are withheld from the others"
 )
+_AS_FINAL = "it stands as final, for a file does not tell whether its poses know of later measurements"
 
 
 def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> tuple[Run, ...]:
-    """Return a run for each reference, with what it said while the sequence's camera ran as causal output."""
-    return tuple(_run(name, trajectory, sequence.frames_t_ns) for name, trajectory in references.items())
+    """Return a run for each estimate that a recording brings, with what it says of the frames as causal output."""
+    read = "read from a file of the recording"
+    return tuple(_run(name, trajectory, sequence, "causal", read) for name, trajectory in references.items())
 
 
-def _run(name: str, whole: Trajectory, frames_t_ns: IntArray) -> Run:
-    t_ns = _on_frames(whole.t_ns, frames_t_ns)
-    during = (t_ns >= frames_t_ns[0]) & (t_ns <= frames_t_ns[-1])
-    log = [f"read from a file of the recording, not run here: {_OTHER_TERMS}"]
-    if not during.any():
-        log.append(f"none of its poses ({_range_s(whole.t_ns)}) lies within the frames ({_range_s(frames_t_ns)})")
-    causal = Trajectory(t_ns[during], whole.T_world_imu[during])
-    return Run(name, "ok", causal, None, Landmarks.none(), timings=None, log=tuple(log))
+def external_runs(files: Mapping[str, PosesFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
+    """Return a run for each trajectory file, with what it says of the frames as final output.
+
+    ``recording`` is the whole of it, of which ``sequence`` may be the first frames. Raises DataError where a file
+    is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
+    """
+    return tuple(_external(name, poses, recording, sequence) for name, poses in files.items())
 
 
-def _on_frames(t_ns: IntArray, frames_t_ns: IntArray) -> IntArray:
-    """Return stamps (N,) with those that are a frame's up to rounding replaced by the frame's."""
-    after = np.clip(np.searchsorted(frames_t_ns, t_ns), 1, frames_t_ns.size - 1)
-    before = after - 1
-    nearest = np.where(frames_t_ns[after] - t_ns < t_ns - frames_t_ns[before], after, before)
-    return np.where(np.abs(frames_t_ns[nearest] - t_ns) <= _ROUNDING_NS, frames_t_ns[nearest], t_ns)
+def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesFile]) -> None:
+    """Raise DataError where a trajectory file is given the name of an estimate that the recording brings."""
+    taken = {plain_name(name): name for name in references}
+    for name in files:
+        if plain_name(name) in taken:
+            raise DataError(f"the recording brings an estimate {taken[plain_name(name)]}; call {name} otherwise")
 
 
-def _range_s(t_ns: IntArray) -> str:
-    return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
+def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequence) -> Run:
+    trajectory, what = _stamped(poses, recording, sequence), str(poses.path)
+    check_clock(what, recording, trajectory.t_ns)
+    readings = [inverted(), of_the_camera(recording)]
+    if poses.other_order is not None:
+        readings.insert(0, in_other_order(poses.other_order))
+    confirmed = check_turns(what, recording, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)
+    if poses.other_order is not None and not confirmed:
+        check_order(poses.path, trajectory.T_world_imu, poses.other_order)
+    return _run(
+        name, trajectory, sequence, "final", f"read from {what} ({poses.format}, {len(poses)} poses)", _AS_FINAL
+    )
+
+
+def _stamped(poses: PosesFile, recording: Sequence, sequence: Sequence) -> Trajectory:
+    """Return the poses with their stamps, which are the frames' where the format has none."""
+    if poses.t_ns is not None:
+        return Trajectory(poses.t_ns, poses.T_world_imu)
+    counts = dict.fromkeys((recording.frame_count, sequence.frame_count))
+    if len(poses) not in counts:
+        expected = " or ".join(map(str, counts))
+        raise DataError(
+            f"{poses.path}: {len(poses)} rows, but a {poses.format} file has one for every frame, and there are "
+            f"{expected}; write a pose for each, or a format with stamps"
+        )
+    return Trajectory(recording.frames_t_ns[: len(poses)], poses.T_world_imu)
+
+
+def _run(name: str, whole: Trajectory, sequence: Sequence, output: Output, read: str, *remarks: str) -> Run:
+    """Return the run with a pose for every frame that the rule of association reaches."""
+    frames_t_ns = sequence.frames_t_ns
+    reached, poses = poses_at(whole.t_ns, whole.T_world_imu, frames_t_ns, median_period_ns(frames_t_ns))
+    log = [f"{read}, not run here: {_OTHER_TERMS}", *remarks]
+    if not reached.any():
+        log.append(f"none of its poses ({range_s(whole.t_ns)}) reaches one of the frames ({range_s(frames_t_ns)})")
+    said = Trajectory(frames_t_ns[reached], poses)
+    causal, final = (said, None) if output == "causal" else (None, said)
+    return Run(name, "ok", causal, final, Landmarks.none(), timings=None, log=tuple(log))

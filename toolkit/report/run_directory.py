@@ -3,14 +3,17 @@
 import json
 from pathlib import Path
 
-from toolkit.report import manifest, metrics_json
+from toolkit.estimate import Trajectory
+from toolkit.report import manifest, metrics_json, report_json
 from toolkit.report.atomic import check_replaceable, replaced_directory
-from toolkit.report.comparison import Comparison, plain_name
+from toolkit.report.comparison import Comparison
 from toolkit.report.figures import write_figures
+from toolkit.report.figures.alignment import truth_during
 from toolkit.report.report_md import report_text
 from toolkit.report.trajectory_files import write_landmarks, write_tum
 
 MANIFEST = "manifest.json"
+REPORT = "report.json"
 
 
 def check_run_directory(target: Path) -> None:
@@ -34,6 +37,7 @@ def write_run(comparison: Comparison, target: Path, *, command: str, seed: int) 
     """
     with replaced_directory(target, is_run_directory) as directory:
         _write_text(directory / "metrics.json", metrics_json.to_text(metrics_json.build(comparison)))
+        _write_text(directory / REPORT, json.dumps(report_json.build(comparison), allow_nan=False) + "\n")
         _write_trajectories(comparison, directory)
         figures = directory / "figures"
         figures.mkdir()
@@ -44,15 +48,17 @@ def write_run(comparison: Comparison, target: Path, *, command: str, seed: int) 
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:
-    trajectories, landmarks = directory / "trajectories", directory / "landmarks"
-    trajectories.mkdir()
-    landmarks.mkdir()
+    for folder in ("trajectories", "landmarks"):
+        (directory / folder).mkdir()
+    truth = truth_during(comparison.sequence)
+    if truth is not None:
+        write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            write_tum(trajectory, trajectories / f"{plain_name(row.estimator)}_{row.output}.tum")
+            write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
     for run in comparison.runs:
-        write_landmarks(run.landmarks, landmarks / f"{plain_name(run.estimator)}.csv")
+        write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from toolkit.cutting import NS_PER_S
 from toolkit.estimator import EstimatorEntry, find_all
-from toolkit.report import manifest, seeds_json
+from toolkit.report import manifest, seeds_json, seeds_report_json
 from toolkit.report.atomic import check_parent, replaced_directory
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.figures import save
 from toolkit.report.metrics_json import to_text
-from toolkit.report.run_directory import MANIFEST, check_run_directory, is_run_directory
+from toolkit.report.run_directory import MANIFEST, REPORT, check_run_directory, is_run_directory
 from toolkit.report.seeds_md import seeds_report
 from toolkit.report.session import STARTS, ProgressFor, Request, changes_of, unique_names
 from toolkit.sequence import Sequence
@@ -52,13 +52,13 @@ def compare_over_seeds(asked: OverSeedsRequest, progress_for: ProgressFor) -> It
     for directory in directories:
         check_run_directory(directory)
     for source, directory in zip(request.sources, directories, strict=True):
-        over, first = _over_seeds(source, asked, entries, progress_for)
+        over, first = run_over_seeds(source, asked, entries, progress_for)
         with progress_for(f"{over.name}: figures and report"):
             write_over_seeds(over, first, directory, command=request.command)
         yield over, directory
 
 
-def _over_seeds(
+def run_over_seeds(
     source: str, asked: OverSeedsRequest, entries: dict[str, EstimatorEntry], progress_for: ProgressFor
 ) -> tuple[OverSeeds, Sequence]:
     """Run everything on one source; return what came of it and the recording of the first seed."""
@@ -99,6 +99,8 @@ def write_over_seeds(over: OverSeeds, first: Sequence, target: Path, *, command:
     """
     with replaced_directory(target, is_run_directory) as directory:
         (directory / "seeds.json").write_text(to_text(seeds_json.build(over)), encoding="utf-8")
+        report = json.dumps(seeds_report_json.build(over), allow_nan=False) + "\n"
+        (directory / REPORT).write_text(report, encoding="utf-8")
         (directory / "figures").mkdir()
         captions = save(figures.draw(over), directory / "figures")
         (directory / "report.md").write_text(seeds_report(over, captions), encoding="utf-8")

@@ -2,19 +2,20 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from toolkit import runner
 from toolkit.audit import Audit, audit
 from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.trajectories import read_poses
 from toolkit.estimate import Output, Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.metrics import Scores, describe, score_run
 from toolkit.report.atomic import check_parent
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of, plain_name
-from toolkit.report.references import reference_runs
+from toolkit.report.references import check_names, external_runs, reference_runs
 from toolkit.report.run_directory import check_run_directory, write_run
 from toolkit.runner import Progress
 from toolkit.sequence import Prior, Sequence, Truth
@@ -32,7 +33,8 @@ class Request:
     """What to compare and where to write it.
 
     ``estimators`` are names, or the word for the whole ladder; ``keep`` names the faults that the audit reports
-    but leaves as they are; ``command`` is kept in the manifest.
+    but leaves as they are; ``trajectories`` are files of other systems by name, all of the one source; ``command``
+    is kept in the manifest.
     """
 
     sources: tuple[str, ...]
@@ -44,11 +46,12 @@ class Request:
     start: Start = "measurements"
     seed: int = 0
     command: str = ""
+    trajectories: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class _Case:
-    """One audited sequence with its start, the runs its recording brings, and the directory its results go to."""
+    """One audited sequence with its start, the runs of other systems, and the directory its results go to."""
 
     audited: Audit
     prior: Prior
@@ -61,7 +64,7 @@ def compare_all(request: Request, progress_for: ProgressFor) -> Iterator[tuple[C
 
     Everything that can be wrong with the request is checked before the first estimator starts. Raises
     EstimatorError for an unknown or unavailable estimator, OutputError where the results cannot be written,
-    DataError for a recording or truth that cannot be used.
+    DataError for a recording, truth or trajectory that cannot be used.
     """
     entries = find_all(request.estimators)
     builds = {name: entry.load() for name, entry in entries.items()}
@@ -122,23 +125,23 @@ def load_audited(source: str, truth: Truth | None, keep: frozenset[str], seed: i
 def _cases(request: Request, progress_for: ProgressFor) -> list[_Case]:
     """Prepare every sequence before any estimator runs; several go into sub-directories by name."""
     truth = None if request.truth is None else load_truth(request.truth)
-    audits, references = [], []
+    files = {name: read_poses(path) for name, path in request.trajectories.items()}
+    audits, others = [], []
     for source in request.sources:
         with progress_for(f"{source}: loading and checking"):
-            audits.append(load_audited(source, truth, request.keep, request.seed))
-            references.append(load_references(source))
-    if request.max_frames is not None:
-        # Only now: the audit judges slow faults (a bias, a lag) better on the whole recording.
-        audits = [replace(a, sequence=a.sequence.truncated(request.max_frames)) for a in audits]
+            whole = load_audited(source, truth, request.keep, request.seed)
+            # Only now: the audit judges slow faults (a bias, a lag) better on the whole recording.
+            sequence = whole.sequence.truncated(request.max_frames) if request.max_frames else whole.sequence
+            brought = load_references(source)
+            check_names(brought, files)
+            audits.append(replace(whole, sequence=sequence))
+            others.append(reference_runs(brought, sequence) + external_runs(files, whole.sequence, sequence))
     names = unique_names(a.sequence.name for a in audits)
     directories = [request.out] if len(audits) == 1 else [request.out / name for name in names]
     for directory in directories:
         check_run_directory(directory)
     start = STARTS[request.start]
-    return [
-        _Case(a, start(a.sequence), reference_runs(brought, a.sequence), d)
-        for a, brought, d in zip(audits, references, directories, strict=True)
-    ]
+    return [_Case(a, start(a.sequence), runs, d) for a, runs, d in zip(audits, others, directories, strict=True)]
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

@@ -108,6 +108,8 @@ def _cell(row: Row, column: Column) -> str:
         return _MISSING
     if column.decimals == 0:
         return f"{value:.0f}"
-    texts = (f"{value:.{decimals}f}" for decimals in range(column.decimals, -1, -1))
+    # An error of a few centimetres says nothing in two decimals.
+    most = column.decimals + (abs(value) < 0.1)
+    texts = (f"{value:.{decimals}f}" for decimals in range(most, -1, -1))
     # A diverged estimator may be light years away; its number must not tear the columns apart.
     return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")

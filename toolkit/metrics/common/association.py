@@ -53,7 +53,7 @@ def associate(estimate: Trajectory, truth: Truth, frame_period_ns: float) -> Mat
     t_ns, poses = estimate.t_ns[usable], estimate.T_world_imu[usable]
     if t_ns.size == 0 or truth_t_ns.size == 0:
         return Matched(np.empty(0, np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4)), np.empty(0))
-    scored, estimates = _at_stamps(t_ns, poses, truth_t_ns, frame_period_ns)
+    scored, estimates = poses_at(t_ns, poses, truth_t_ns, frame_period_ns)
     path_m = distance_along(truth_poses[:, :3, 3])
     return Matched(truth_t_ns[scored], truth_poses[scored], estimates, path_m[scored])
 
@@ -67,11 +67,11 @@ def truth_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple[Bool
     known = finite_poses(truth.T_world_imu)
     if not known.any() or t_ns.size == 0:
         return np.zeros(t_ns.size, dtype=bool), np.empty((0, 4, 4))
-    return _at_stamps(truth.t_ns[known], truth.T_world_imu[known], t_ns, frame_period_ns)
+    return poses_at(truth.t_ns[known], truth.T_world_imu[known], t_ns, frame_period_ns)
 
 
-def _at_stamps(t_ns: IntArray, poses: Array, at_ns: IntArray, frame_period_ns: float) -> tuple[BoolArray, Array]:
-    """Return which of the stamps (M,) the poses reach, and the poses (n, 4, 4) at those."""
+def poses_at(t_ns: IntArray, poses: Array, at_ns: IntArray, frame_period_ns: float) -> tuple[BoolArray, Array]:
+    """Return which of the stamps (M,) finite poses (N, 4, 4), N > 0, reach by the rule above, and the poses there."""
     tolerance_ns = min(STAMP_TOLERANCE_NS, median_period_ns(at_ns) / 4.0) if at_ns.size > 1 else STAMP_TOLERANCE_NS
     after = np.clip(np.searchsorted(t_ns, at_ns), 0, t_ns.size - 1)
     before = np.maximum(after - 1, 0)

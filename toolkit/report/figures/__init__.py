@@ -17,7 +17,12 @@ _DRAWINGS: tuple[Callable[[Comparison], Iterator[NamedFigure]], ...] = (
 
 def write_figures(comparison: Comparison, directory: Path) -> dict[str, str]:
     """Draw every figure the comparison has data for into PNG files; return file name -> caption, in order."""
-    return save((figure for drawing in _DRAWINGS for figure in drawing(comparison)), directory)
+    return save(drawn(comparison), directory)
+
+
+def drawn(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Draw every figure the comparison has data for."""
+    return (figure for drawing in _DRAWINGS for figure in drawing(comparison))
 
 
 def save(figures: Iterable[NamedFigure], directory: Path) -> dict[str, str]:

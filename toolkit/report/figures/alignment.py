@@ -20,9 +20,10 @@ NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
 
 
 class Errors(NamedTuple):
-    """Errors at stamps (N,): distance (N,) m and heading (N,) degrees within +-180."""
+    """Errors at stamps (N,) and paths (N,) m: distance (N,) m and heading (N,) degrees within +-180."""
 
     t_ns: IntArray
+    path_m: Array
     position_m: Array
     heading_deg: Array
 
@@ -63,6 +64,7 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
     heading = yaw_of(aligned[:, :3, :3]) - yaw_of(pairs.truth[:, :3, :3])
     return Errors(
         pairs.t_ns,
+        pairs.path_m,
         np.linalg.norm(aligned[:, :3, 3] - pairs.truth[:, :3, 3], axis=1),
         np.degrees((heading + np.pi) % (2.0 * np.pi) - np.pi),
     )

@@ -29,11 +29,26 @@ class _Reference(NamedTuple):
     caption: str
 
 
+class ErrorCurves(NamedTuple):
+    """The rows with their errors, how to call them ("error", or the difference from whom) and the caption."""
+
+    of_rows: list[tuple[Row, Errors]]
+    what: str
+    caption: str
+
+
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors (with truth) or of differences (without, given two trajectories)."""
+    curves = error_curves(comparison)
+    if curves is not None:
+        yield _figure(comparison, curves)
+
+
+def error_curves(comparison: Comparison) -> ErrorCurves | None:
+    """Return every row's errors (with truth) or differences (without), or None where no row has any."""
     reference = _truth(comparison) or _last_good_answer(comparison)
     if reference is None:
-        return
+        return None
     curves: list[tuple[Row, Errors]] = []
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
@@ -44,8 +59,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
         if errors is not None:
             curves.append((row, errors))
-    if curves:
-        yield _figure(comparison, curves, reference)
+    return ErrorCurves(curves, reference.what, reference.caption) if curves else None
 
 
 def _truth(comparison: Comparison) -> _Reference | None:
@@ -79,24 +93,24 @@ def _last_good_answer(comparison: Comparison) -> _Reference | None:
     return None
 
 
-def _figure(comparison: Comparison, curves: list[tuple[Row, Errors]], reference: _Reference) -> NamedFigure:
+def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     figure = new_figure(9.6, 5.6)
     position, heading = figure.subplots(2, 1, sharex=True)
     start_ns = int(comparison.sequence.frames_t_ns[0])
-    for row, errors in curves:
+    for row, errors in curves.of_rows:
         t_s = (errors.t_ns - start_ns) / NS_PER_S
         look = {"color": colour_of(comparison, row.estimator), "linestyle": line_of(row.output)}
         width = width_of(comparison, row.estimator)
         label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
         position.plot(t_s, errors.position_m, linewidth=width, label=label, **look)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
-    quiet(position, f"{comparison.sequence.name}: position {reference.what}", "", "position [m]")
-    quiet(heading, f"heading {reference.what}", "time [s]", "heading [deg]")
-    _limit_position(position, curves)
+    quiet(position, f"{comparison.sequence.name}: position {curves.what}", "", "position [m]")
+    quiet(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
+    _limit_position(position, curves.of_rows)
     low, high = heading.get_ylim()
     heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))
     figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
-    return NamedFigure("errors_over_time", reference.caption, figure)
+    return NamedFigure("errors_over_time", curves.caption, figure)
 
 
 def _limit_position(axes: Axes, curves: list[tuple[Row, Errors]]) -> None:

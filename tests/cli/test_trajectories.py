@@ -1,0 +1,173 @@
+"""``--trajectory`` and ``vislam export``: out of a run directory, back into a comparison, and nothing is lost."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface as evo
+
+from toolkit.cli import export, main
+from toolkit.datasets.trajectories import FORMATS, read_poses
+from toolkit.report import metrics_json, report_json
+
+Vislam = Callable[..., int]
+QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20")
+EVO = {
+    "tum": evo.read_tum_trajectory_file,
+    "kitti": evo.read_kitti_poses_file,
+    "euroc": evo.read_euroc_csv_trajectory,
+}
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> str:
+    message = capsys.readouterr().err
+    assert message.startswith("vislam: error: ")
+    assert message.count("\n") == 1
+    return message
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run directory of two estimators on the first frames of a drive, and its exports beside it; not to change."""
+    directory = tmp_path_factory.mktemp("exports") / "run"
+    assert main([*QUICK, "--out", str(directory)]) == 0
+    for name in FORMATS:
+        words = ("--estimator", "ekf", "--format", name, "--out", str(directory.parent / f"ekf.{name}"))
+        assert main(["export", str(directory), *words]) == 0
+    return directory
+
+
+@pytest.fixture(scope="module")
+def again(run: Path) -> Path:
+    """The run directory of the same comparison with every export as another system, and one that flew off."""
+    rows = [line.split() for line in (run.parent / "ekf.tum").read_text().splitlines() if not line.startswith("#")]
+    astray = "".join(" ".join([t, str(i * i), *rest]) + "\n" for i, (t, _, *rest) in enumerate(rows))
+    (run.parent / "astray.tum").write_text(astray)
+    files = {**{f"by {name}": f"ekf.{name}" for name in FORMATS}, "astray": "astray.tum"}
+    words = [word for name, file in files.items() for word in ("--trajectory", f"{name}={run.parent / file}")]
+    # What another system made of it is not judged as a run of ours is: the exit status speaks of ours alone.
+    assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
+    return run.parent / "again"
+
+
+def test_evo_reads_in_every_export_what_the_run_directory_holds(run: Path) -> None:
+    held = evo.read_tum_trajectory_file(run / "trajectories/ekf_final.tum")
+    for name, reader in EVO.items():
+        there = reader(run.parent / f"ekf.{name}")
+        np.testing.assert_allclose(there.poses_se3, held.poses_se3, atol=1e-9, rtol=0.0)
+        if name != "kitti":
+            np.testing.assert_array_equal(there.timestamps, held.timestamps)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_an_export_scores_as_what_it_is_an_export_of(again: Path, name: str) -> None:
+    document = json.loads((again / "metrics.json").read_text())
+    assert metrics_json.violations(document) == []
+    by_row = {(run["estimator"], run["output"]): run for run in document["runs"]}
+    ours, theirs = by_row["ekf", "final"]["metrics"], by_row[f"by {name}", "final"]
+    for key in ("ate_se3_m", "ate_yaw_m", "ate_se3_deg", "rpe_1s_m", "pairs"):
+        assert theirs["metrics"][key] == pytest.approx(ours[key], abs=1e-9)
+    # its triangulation is iterated until a step no longer matters, not to the last digit
+    assert theirs["metrics"]["heldout_reproj_rmse_px"] == pytest.approx(ours["heldout_reproj_rmse_px"], abs=1e-6)
+    assert theirs["metrics"]["coverage_percent"] == 100.0
+    assert theirs["metrics"]["nees_pose_mean"] is None
+    assert theirs["notes"]["nees_pose_mean"] == "the estimator states no covariance"
+
+
+def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> None:
+    report = (again / "report.md").read_text()
+    assert "| by euroc | final | ok | 20 | 100.0 |" in report
+    assert "ekf.euroc (EuRoC, 20 poses), not run here" in report
+    for file in ("trajectories/by_euroc_final.tum", "figures/top_by_euroc.png"):
+        assert (again / file).is_file()
+    manifest = json.loads((again / "manifest.json").read_text())
+    assert manifest["references"] == ["by tum", "by kitti", "by euroc", "by openvins", "astray"]
+    assert report_json.violations(json.loads((again / "report.json").read_text())) == []
+    assert main(["report", str(again)]) == 0
+    page = (again / "report.html").read_text()
+    (payload,) = re.findall(r'<script type="application/json" id="payload">(.*?)</script>', page, flags=re.S)
+    (row,) = [row for row in json.loads(payload)["cases"][0]["rows"] if row["estimator"] == "by euroc"]
+    assert row["metrics"]["total_s"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "why"),
+    [
+        (("--trajectory", "poses.tum"), 2, "expected NAME=FILE"),
+        (("--trajectory", "=poses.tum"), 2, "expected NAME=FILE"),
+        (("--trajectory", "ekf=poses.tum"), 2, "the name ekf is taken by ekf"),
+        (("--trajectory", "truth=poses.tum"), 2, "the name truth is taken by truth"),
+        (("--trajectory", "a b=poses.tum", "--trajectory", "a_b=poses.tum"), 2, "a_b is taken by another trajectory"),
+        (("--trajectory", "(!)=poses.tum"), 2, "has no letter or digit"),
+        (("flight", "--trajectory", "theirs=poses.tum"), 2, "exactly one SEQUENCE"),
+        (("--trajectory", "theirs=poses.tum", "--seeds", "2"), 2, "--trajectory and --seeds exclude each other"),
+        (("--trajectory", "theirs=poses.tum"), 3, "poses.tum: cannot be read"),
+        (("--trajectory", "theirs=empty"), 3, "empty: the file holds no poses"),
+    ],
+)
+def test_a_trajectory_that_cannot_be_used_is_told_before_anything_runs(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], status: int, why: str
+) -> None:
+    Path("empty").touch()
+    assert vislam(*QUICK[:2], *words, *QUICK[2:], "--out", "again") == status
+    assert why in told(capsys)
+    assert not Path("again").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ((), "holds several trajectories; choose one with --estimator: dead-reckoning, ekf, truth"),
+        (("--estimator", "batch"), "has no trajectory of batch; there are dead-reckoning, ekf, truth"),
+    ],
+)
+def test_a_choice_that_is_not_there_is_told_with_those_that_are(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path, words: tuple[str, ...], why: str
+) -> None:
+    assert vislam("export", str(run), *words, "--format", "tum", "--out", "out.tum") == 3
+    assert why in told(capsys)
+    assert not Path("out.tum").exists()
+
+
+def test_an_output_that_was_not_given_is_told(vislam: Vislam, capsys: pytest.CaptureFixture[str], again: Path) -> None:
+    words = ("--estimator", "by tum", "--output", "causal", "--format", "tum", "--out", "out.tum")
+    assert vislam("export", str(again), *words) == 3
+    assert "has no causal trajectory of by tum, only a final one" in told(capsys)
+
+
+def test_kitti_cannot_hold_a_trajectory_with_gaps(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path
+) -> None:
+    shutil.copytree(run, "gaps")
+    path = Path("gaps/trajectories/ekf_final.tum")
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
+    assert vislam("export", "gaps", "--estimator", "ekf", "--format", "kitti", "--out", "out") == 3
+    assert "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames" in told(capsys)
+
+
+def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) -> None:
+    for words in (("truth",), ("ekf", "--output", "causal"), ("ekf", "--output", "final")):
+        assert vislam("export", str(run), "--estimator", *words, "--format", "euroc", "--out", "out.csv") == 0
+        assert len(read_poses(Path("out.csv"))) == 20
+
+
+def test_a_file_that_cannot_be_written_is_told(vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path) -> None:
+    Path("taken").mkdir()
+    assert vislam("export", str(run), "--estimator", "ekf", "--format", "tum", "--out", "taken") == 4
+    assert "taken is a directory" in told(capsys)
+
+
+def test_a_comparison_over_seeds_has_nothing_to_export(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    seeds = ("--estimators", "dead-reckoning", "--max-frames", "5", "--seeds", "2", "--workers", "1", "--out", "seeds")
+    assert vislam("compare", "drive", *seeds) == 0
+    capsys.readouterr()
+    assert vislam("export", "seeds", "--format", "tum", "--out", "out") == 3
+    assert "over seeds and holds no trajectories" in told(capsys)
+
+
+def test_the_formats_offered_are_those_there_are() -> None:
+    assert tuple(FORMATS) == export.FORMATS

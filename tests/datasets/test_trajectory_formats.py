@@ -1,0 +1,249 @@
+"""Trajectory files: what is written is read back, evo reads it alike, and every wrong file gets one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface as evo
+
+from toolkit.datasets.trajectories import FORMATS, read_poses
+from toolkit.datasets.trajectories.rows import stamp_text
+from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
+from toolkit.geometry import se3, so3_exp
+
+COUNT = 50
+STAMPED = ("tum", "euroc", "openvins")
+# The bound asked for; 15 printed digits of positions of some km keep 1e-11 m.
+TOLERANCE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def trajectory() -> Trajectory:
+    """Poses some km from the origin, turned any way, at today's stamps that no double holds."""
+    rng = np.random.default_rng(5)
+    t_ns = 1_600_000_000_123_456_789 + np.cumsum(rng.integers(10**7, 10**8, COUNT))
+    poses = se3(so3_exp(2.0 * rng.normal(size=(COUNT, 3))), 1e3 * rng.normal(size=(COUNT, 3)))
+    return Trajectory(t_ns, poses, rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 6)))
+
+
+def written(folder: Path, name: str, trajectory: Trajectory) -> Path:
+    path = folder / "poses.txt"
+    path.write_text(FORMATS[name].text(trajectory), encoding="utf-8")
+    return path
+
+
+def lines_of(name: str, trajectory: Trajectory) -> list[list[str]]:
+    """Return the words of the rows of a file."""
+    text = FORMATS[name].text(trajectory)
+    rows = [line for line in text.splitlines() if not line.startswith("#")]
+    return [row.split("," if name == "euroc" else " ") for row in rows]
+
+
+def spoiled(folder: Path, name: str, rows: list[list[str]]) -> Path:
+    path = folder / "spoiled"
+    path.write_text("\n".join(("," if name == "euroc" else " ").join(row) for row in rows) + "\n")
+    return path
+
+
+def complaint(path: Path) -> str:
+    with pytest.raises(DataError) as raised:
+        read_poses(path)
+    message = str(raised.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_recognised_and_read_back(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    read = read_poses(written(tmp_path, name, trajectory))
+    assert read.format.lower() == name
+    np.testing.assert_allclose(read.T_world_imu, trajectory.T_world_imu, atol=TOLERANCE, rtol=0.0)
+    if name == "kitti":
+        assert read.t_ns is None
+    else:
+        assert read.t_ns is not None
+        np.testing.assert_array_equal(read.t_ns, trajectory.t_ns)
+
+
+@pytest.mark.parametrize("name", ["tum", "kitti", "euroc"])
+def test_evo_reads_the_same_poses(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    readers = {
+        "tum": evo.read_tum_trajectory_file,
+        "kitti": evo.read_kitti_poses_file,
+        "euroc": evo.read_euroc_csv_trajectory,
+    }
+    theirs = readers[name](written(tmp_path, name, trajectory))
+    np.testing.assert_allclose(theirs.poses_se3, trajectory.T_world_imu, atol=TOLERANCE, rtol=0.0)
+    if name != "kitti":
+        # evo holds seconds as doubles, which are 2.4e-7 s apart today
+        np.testing.assert_allclose(theirs.timestamps, trajectory.t_ns / 1e9, atol=2.4e-7, rtol=0.0)
+
+
+@pytest.mark.parametrize("name", ["tum", "kitti"])
+def test_what_evo_writes_is_read(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    path = tmp_path / "evo"
+    theirs = evo.read_tum_trajectory_file(written(tmp_path, "tum", trajectory))
+    writers = {"tum": evo.write_tum_trajectory_file, "kitti": evo.write_kitti_poses_file}
+    writers[name](path, theirs)
+    np.testing.assert_allclose(read_poses(path).T_world_imu, trajectory.T_world_imu, atol=TOLERANCE, rtol=0.0)
+
+
+def test_openvins_states_keep_velocity_and_biases_in_its_order(trajectory: Trajectory) -> None:
+    values = np.array(lines_of("openvins", trajectory), dtype=float)
+    assert trajectory.v_world is not None
+    assert trajectory.bias is not None
+    np.testing.assert_allclose(values[:, 8:11], trajectory.v_world, rtol=1e-14)
+    np.testing.assert_allclose(values[:, 11:], np.roll(trajectory.bias, 3, axis=1), rtol=1e-14)
+    unknown = np.array(lines_of("openvins", Trajectory(trajectory.t_ns, trajectory.T_world_imu)), dtype=float)
+    assert np.isnan(unknown[:, 8:]).all()
+
+
+def test_the_states_quaternion_is_jpls_of_the_world_to_the_imu(trajectory: Trajectory) -> None:
+    """Trawny & Roumeliotis (2005), eq. (78): C(q) = (2 q4^2 - 1) I - 2 q4 [q]x + 2 q q^T."""
+    x, y, z, w = np.array(lines_of("openvins", trajectory)[0][1:5], dtype=float)
+    vector, cross = np.array([x, y, z]), np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    R_imu_world = (2 * w**2 - 1) * np.eye(3) - 2 * w * cross + 2 * np.outer(vector, vector)
+    np.testing.assert_allclose(R_imu_world, trajectory.T_world_imu[0, :3, :3].T, atol=1e-14)
+
+
+def test_both_files_of_openvins_are_read(tmp_path: Path, trajectory: Trajectory) -> None:
+    calibrated = [[*row, "0.01", "1", *["0.5"] * 15] for row in lines_of("openvins", trajectory)]
+    recorded = [[*row, *["1e-4"] * 12] for row in lines_of("tum", trajectory)]
+    for rows in (calibrated, recorded):
+        read = read_poses(spoiled(tmp_path, "openvins", rows))
+        assert read.format == "OpenVINS"
+        np.testing.assert_allclose(read.T_world_imu, trajectory.T_world_imu, atol=TOLERANCE, rtol=0.0)
+
+
+def test_more_columns_a_heading_and_a_last_comma_do_no_harm_in_euroc_files(
+    tmp_path: Path, trajectory: Trajectory
+) -> None:
+    heading = ["timestamp", "p_RS_R_x [m]", "and so on"]
+    rows = [heading, *([*row, "0.1", "0.2", "0.3", ""] for row in lines_of("euroc", trajectory))]
+    read = read_poses(spoiled(tmp_path, "euroc", rows))
+    np.testing.assert_allclose(read.T_world_imu, trajectory.T_world_imu, atol=TOLERANCE, rtol=0.0)
+
+
+@pytest.mark.parametrize("name", STAMPED)
+def test_poses_that_are_not_finite_are_left_out(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    poses = trajectory.T_world_imu.copy()
+    poses[1, 0, 3] = np.nan
+    read = read_poses(written(tmp_path, name, Trajectory(trajectory.t_ns, poses)))
+    assert read.t_ns is not None
+    np.testing.assert_array_equal(read.t_ns, np.delete(trajectory.t_ns, 1))
+
+
+def test_kitti_leaves_no_pose_out(trajectory: Trajectory) -> None:
+    poses = trajectory.T_world_imu.copy()
+    poses[1, 0, 3] = np.nan
+    with pytest.raises(DataError, match="pose 1 is not finite, and KITTI's rows are frames; choose a format with"):
+        FORMATS["kitti"].text(Trajectory(trajectory.t_ns, poses))
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "text"),
+    [
+        (0, "0.000000000"),
+        (1, "0.000000001"),
+        (1_600_000_000_123_456_789, "1600000000.123456789"),
+        (-1_500_000_000, "-1.500000000"),
+        (999_999_999, "0.999999999"),
+    ],
+)
+def test_stamps_keep_every_nanosecond(t_ns: int, text: str) -> None:
+    assert stamp_text(t_ns) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "per_second", "unit"),
+    [
+        ("tum", 10**9, "nanoseconds: divide by 1e9"),
+        ("tum", 10**6, "microseconds: divide by 1e6"),
+        ("tum", 10**3, "milliseconds: divide by 1e3"),
+        ("openvins", 10**9, "nanoseconds: divide by 1e9"),
+        ("euroc", 10**6, "microseconds: multiply by 1e3"),
+        ("euroc", 10**3, "milliseconds: multiply by 1e6"),
+        ("euroc", 1, "seconds: multiply by 1e9"),
+    ],
+)
+@pytest.mark.parametrize("start", ["epoch", "zero"])
+def test_a_wrong_unit_of_time_is_named(
+    tmp_path: Path, trajectory: Trajectory, name: str, per_second: int, unit: str, start: str
+) -> None:
+    t_ns = trajectory.t_ns - (0 if start == "epoch" else trajectory.t_ns[0])
+    stamps = [f"{t * per_second / 1e9:.6f}" if per_second < 10**9 else str(t) for t in t_ns.tolist()]
+    rows = [[stamp, *row[1:]] for stamp, row in zip(stamps, lines_of(name, trajectory), strict=True)]
+    assert f"the stamps look like {unit}" in complaint(spoiled(tmp_path, name, rows))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [("nan", "line 4 holds a value that is not finite"), ("x1", "line 4 is not numeric")],
+)
+def test_a_value_that_is_no_number_is_named(
+    tmp_path: Path, trajectory: Trajectory, name: str, word: str, says: str
+) -> None:
+    rows = lines_of(name, trajectory)
+    rows[3][3] = word
+    assert says in complaint(spoiled(tmp_path, name, rows))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_line_that_is_cut_off_is_named(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    rows = lines_of(name, trajectory)
+    del rows[-1][4:]
+    message = complaint(spoiled(tmp_path, name, rows))
+    assert f"line {COUNT} has 4 columns, expected {len(rows[0])} ({FORMATS[name].COLUMNS})" in message
+
+
+@pytest.mark.parametrize("name", STAMPED)
+def test_decreasing_and_repeated_stamps_are_named(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    for before in (0, 1):
+        rows = lines_of(name, trajectory)
+        rows[2][0] = rows[before][0]
+        message = complaint(spoiled(tmp_path, name, rows))
+        assert "line 3 is not later than the line before it; sort the file by time" in message
+
+
+@pytest.mark.parametrize("name", STAMPED)
+def test_a_quaternion_that_is_not_of_unit_length_is_named(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    rows = lines_of(name, trajectory)
+    rows[2][1:8] = ["0.9"] * 7
+    assert "line 3 has a quaternion that is not of unit length" in complaint(spoiled(tmp_path, name, rows))
+
+
+@pytest.mark.parametrize("word", ["-1", "1.1"])
+def test_a_matrix_that_is_no_rotation_is_named(tmp_path: Path, word: str) -> None:
+    rows = ["1 0 0 5 0 1 0 6 0 0 1 7", f"{word} 0 0 5 0 1 0 6 0 0 1 7"]
+    assert "line 2 does not hold a rotation; expected r11 r12 r13 x" in complaint(
+        spoiled(tmp_path, "kitti", [row.split() for row in rows])
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "the file holds no poses; there are tum (t x y z qx qy qz qw), kitti"),
+        (b"# t x y z\n\n", "the file holds no poses"),
+        (b"timestamp,x,y,z,qw,qx,qy,qz\n", "the file holds no poses"),
+        (b"\xff\xfe\x00\x80", "not a text file"),
+        (b"1 2 3 4 5\n", "5 columns separated by blanks are no format that is known; there are tum"),
+        (b"1,2,3,4,5\n", "5 columns separated by commas are no format that is known"),
+        (b"1e400 0 0 0 0 0 0 1\n", "time[0] is inf"),
+        (b"1e12 0 0 0 0 0 0 1\n", "must be in seconds"),
+        (b"nan,0,0,0,1,0,0,0\n", "line 1 has no finite time (nan); remove the line"),
+        (b"1e30,0,0,0,1,0,0,0\n", "line 1 has the time 1e30, beyond any clock"),
+    ],
+)
+def test_a_file_of_no_format_is_refused(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "poses"
+    path.write_bytes(content)
+    assert says in complaint(path)
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent", tmp_path):
+        assert "cannot be read" in complaint(path)

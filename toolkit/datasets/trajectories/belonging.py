@@ -1,0 +1,174 @@
+"""The checks that a trajectory belongs to a recording: one clock, one unit of time, and turns as the gyro says."""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.cutting import NS_PER_S
+from toolkit.datasets.trajectories.poses import OtherOrder
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray, so3_log
+from toolkit.sequence import Sequence
+
+# The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,
+# unexplained than under the file's own: slow turns correlate with unrelated ones by chance, 0.8 at times.
+_FITTING_CORRELATION, _UNEXPLAINED_SHARE = 0.5, 1.0 / 3.0
+# Rates are means over this long at least, over which even a jittery estimate has turned more than its noise.
+_STEP_NS = NS_PER_S // 4
+# Stamps beyond this count from an epoch, stamps below it from the start of a recording or of a day.
+_EPOCH_S = 1e6
+# A unit is wrong where most stamps miss the frames, and nearly all meet and cover half of them in another.
+_MOST, _NEARLY_ALL, _COVERED = 0.5, 0.9, 0.5
+_SCALES = (1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9)
+
+
+class Reading(NamedTuple):
+    """Another meaning that rotations (N, 3, 3) may have: ``only_if`` it holds they fit, and what to do about it."""
+
+    only_if: str
+    remedy: str
+    reread: Callable[[Array], Array]
+
+
+def in_other_order(order: OtherOrder) -> Reading:
+    """Return the reading with quaternions in the other order."""
+    return Reading(f"read {order.name}", order.remedy, order.reread)
+
+
+def inverted() -> Reading:
+    """Return the reading of rotations from the world to the IMU."""
+    remedy = "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them"
+    return Reading("inverted", remedy, lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2))
+
+
+def of_the_camera(sequence: Sequence) -> Reading:
+    """Return the reading of poses of the left camera."""
+    R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T
+    remedy = "the poses look like the left camera's: multiply each by the inverse of T_imu_cam from the right"
+    return Reading("taken as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
+
+
+def check_clock(what: str, sequence: Sequence, t_ns: IntArray) -> None:
+    """Raise DataError where stamps (N,) and frames do not overlap, or only in another unit of time.
+
+    Both ranges and the likely cause are named.
+    """
+    frames_t_ns = sequence.frames_t_ns
+    scale = _fitting_scale(frames_t_ns, t_ns)
+    overlap = t_ns[-1] >= frames_t_ns[0] and t_ns[0] <= frames_t_ns[-1]
+    if overlap and scale is None:
+        return
+    if scale is None:
+        told, cause = "they do not overlap", _clock_difference(frames_t_ns, t_ns)
+    else:
+        told, cause = "they fit only in another unit of time", f"multiply the stamps by {scale:g}"
+    ranges = f"{what} covers {range_s(t_ns)}, the frames {range_s(frames_t_ns)}"
+    raise DataError(f"{sequence.name}: {ranges}: {told}; {cause}")
+
+
+def check_turns(what: str, sequence: Sequence, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]) -> bool:
+    """Say whether rotations (N, 3, 3) turn as the gyro says; a recording may be too short or too straight to tell.
+
+    Raises DataError where they do so under one of the readings, and not as given: read wrongly, a trajectory turns
+    the other way and about other axes.
+    """
+    within, sample_t_ns, gyro_radps = _gyro_along(sequence, t_ns)
+    steps = _Steps.of(t_ns[within])
+    if steps.start.size < 2:
+        return False
+    measured = steps.mean_rates(sample_t_ns, gyro_radps)
+    given = R_world_imu[within]
+    as_given = _correlation(steps.rates(given), measured)
+    fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
+    best, fit = max(fits.items(), key=lambda item: item[1])
+    if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):
+        raise DataError(f"{sequence.name}: {what} turns as the gyro says only if {best.only_if}; {best.remedy}")
+    return as_given > _FITTING_CORRELATION and as_given >= fit
+
+
+def range_s(t_ns: IntArray) -> str:
+    """Return the first and the last of stamps in words."""
+    return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
+
+
+def _fitting_scale(frames_t_ns: IntArray, t_ns: IntArray) -> float | None:
+    """Return the factor that alone makes stamps (N,) those of the frames, or None."""
+    first, last = float(frames_t_ns[0]), float(frames_t_ns[-1])
+
+    def share_within(stamps: Array) -> float:
+        return float(((stamps >= first) & (stamps <= last)).mean())
+
+    stamps = t_ns.astype(np.float64)
+    if share_within(stamps) > _MOST:
+        return None
+    for scale in _SCALES:
+        scaled: Array = scale * stamps
+        if share_within(scaled) >= _NEARLY_ALL and scaled[-1] - scaled[0] >= _COVERED * (last - first):
+            return scale
+    return None
+
+
+def _gyro_along(sequence: Sequence, t_ns: IntArray) -> tuple[BoolArray, IntArray, Array]:
+    """Return which stamps (N,) the gyro reaches, and its samples in order: stamps (S,) and rates (S, 3) rad/s."""
+    motion = sequence.motion
+    usable = np.flatnonzero(np.isfinite(motion.values).all(axis=1))
+    samples = usable[np.argsort(motion.t_ns[usable], kind="stable")]
+    if samples.size < 2:
+        return np.zeros(t_ns.size, dtype=bool), np.empty(0, np.int64), np.empty((0, 3))
+    sample_t_ns = motion.t_ns[samples]
+    within = (t_ns >= sample_t_ns[0]) & (t_ns <= sample_t_ns[-1])
+    return within, sample_t_ns, motion.values[samples, 3:]
+
+
+class _Steps(NamedTuple):
+    """Steps between stamps (N,), of their indices (M,): from each one to the first that is far enough behind it."""
+
+    t_ns: IntArray
+    start: IntArray
+    end: IntArray
+
+    @classmethod
+    def of(cls, t_ns: IntArray) -> "_Steps":
+        """Return the steps that end within the stamps."""
+        end = np.searchsorted(t_ns, t_ns + _STEP_NS)
+        start = np.flatnonzero(end < t_ns.size)
+        return cls(t_ns, start, end[start])
+
+    def rates(self, R_world_imu: Array) -> Array:
+        """Return the mean rates of rotation (M, 3) rad/s of orientations (N, 3, 3), in the body frame."""
+        turns = np.swapaxes(R_world_imu[self.start], -1, -2) @ R_world_imu[self.end]
+        rates: Array = so3_log(turns) / self._duration_s[:, None]
+        return rates
+
+    def mean_rates(self, sample_t_ns: IntArray, samples_radps: Array) -> Array:
+        """Return the means (M, 3) of samples (S, 3), taken as straight lines."""
+        sample_s, at_s = (sample_t_ns - self.t_ns[0]) / NS_PER_S, (self.t_ns - self.t_ns[0]) / NS_PER_S
+        areas = 0.5 * (samples_radps[1:] + samples_radps[:-1]) * np.diff(sample_s)[:, None]
+        turned = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+        at_stamps = np.stack([np.interp(at_s, sample_s, axis) for axis in turned.T], axis=1)
+        means: Array = (at_stamps[self.end] - at_stamps[self.start]) / self._duration_s[:, None]
+        return means
+
+    @property
+    def _duration_s(self) -> Array:
+        duration_s: Array = (self.t_ns[self.end] - self.t_ns[self.start]) / NS_PER_S
+        return duration_s
+
+
+def _correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series (N, 3) about their means (a gyro has a bias), over all axes at once."""
+    a, b = one - one.mean(axis=0), other - other.mean(axis=0)
+    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float((a * b).sum()) / norm if norm > 0.0 else 0.0
+
+
+def _clock_difference(frames_t_ns: IntArray, t_ns: IntArray) -> str:
+    """Name the likely reason why two recordings of one drive do not overlap in time."""
+    frames_s, other_s = frames_t_ns[0] / NS_PER_S, t_ns[0] / NS_PER_S
+    hours = (frames_s - other_s) / 3600.0
+    if abs(frames_s) > _EPOCH_S > abs(other_s) or abs(other_s) > _EPOCH_S > abs(frames_s):
+        return f"one counts from its own start: add {frames_s - other_s:.3f} s to it if both start together"
+    if abs(hours) < 24.5 and abs(hours - round(hours)) * 3600.0 < max(1.0, abs(t_ns[-1] / NS_PER_S - other_s)):
+        return f"the clocks are about {hours:.0f} h apart, as time zones are: shift it"
+    return "it is of another drive or clock"

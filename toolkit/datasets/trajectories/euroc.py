@@ -1,0 +1,58 @@
+"""EuRoC: ``t,x,y,z,qw,qx,qy,qz`` between commas, whole nanoseconds and metres, Hamilton with the scalar first.
+
+More columns may follow, as velocity and biases do in the data set's truth; they are not read. Burri et al., "The EuRoC
+micro aerial vehicle datasets" (IJRR 2016).
+"""
+
+import numpy as np
+
+from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
+from toolkit.datasets.trajectories.rows import Rows
+from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
+from toolkit.geometry import quaternion_from_rotation
+
+COLUMNS = "t,x,y,z,qw,qx,qy,qz"
+HEADER = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+W_LAST = OtherOrder(
+    1, "w last", "the quaternions look w last; EuRoC's order is qw,qx,qy,qz: move the eighth column before the fifth"
+)
+_WIDTH = 8
+_TO_XYZW = [0, 1, 2, 4, 5, 6, 3]
+# Nobody states more than two thousand poses a second, so closer stamps do not count nanoseconds.
+_SHORTEST_STEP_NS = 5e5
+# What they count where the step is below: halfway, as factors go, between steps of 50 ms in one unit and the next.
+_UNITS = (
+    (1.6, "seconds: multiply by 1e9"),
+    (1.6e3, "milliseconds: multiply by 1e6"),
+    (_SHORTEST_STEP_NS, "microseconds: multiply by 1e3"),
+)
+
+
+def recognises(rows: Rows) -> bool:
+    """Say whether rows have the shape of this format."""
+    return rows.commas and rows.width >= _WIDTH
+
+
+def parse(rows: Rows) -> PosesFile:
+    """Return the poses of rows.
+
+    Raises DataError, naming the line and the likely cause, where they are not a table of numbers, time does not
+    increase or is not in nanoseconds, or quaternions are not of unit length.
+    """
+    table = rows.numbers(rows.width, COLUMNS)
+    t_ns = rows.stamps(1)
+    step = float(np.median(np.abs(np.diff(table[:, 0])))) if len(table) > 1 else np.inf
+    unit = next((name for below, name in _UNITS if step < below), None)
+    if unit is not None:
+        raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}")
+    T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, 1:_WIDTH][:, _TO_XYZW])
+    return PosesFile(rows.path, "EuRoC", t_ns, T_world_imu, W_LAST)
+
+
+def text(trajectory: Trajectory) -> str:
+    """Return a trajectory as the text of a file; poses that are not finite are left out."""
+    told = finite(trajectory)
+    quaternions = np.roll(quaternion_from_rotation(told.T_world_imu[:, :3, :3]), 1, axis=1)
+    values = np.hstack([told.positions, quaternions]).tolist()
+    return rows_text(HEADER, zip(map(str, told.t_ns.tolist()), values, strict=True), ",")

@@ -1,0 +1,109 @@
+"""The lines of a text file as words with their line numbers, and stamps in words as exact nanoseconds."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.cutting import NS_PER_S
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray
+
+_LARGEST_NS = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What a table in a text file holds: the number and the words of each line that is not empty or a comment.
+
+    There is at least one line; ``commas`` tells that commas separate the words, and not blanks.
+    """
+
+    path: Path
+    line_numbers: list[int]
+    words: list[list[str]]
+    commas: bool
+
+    @property
+    def width(self) -> int:
+        """How many words the first line has."""
+        return len(self.words[0])
+
+    def numbers(self, width: int, columns: str) -> Array:
+        """Return all words as numbers (N, width); ``columns`` names the first of them.
+
+        Raises DataError naming the line that has another number of words or one that is no number.
+        """
+        return np.array([self._numbers(n, words, width, columns) for n, words in self], dtype=float)
+
+    def stamps(self, per_unit_ns: int) -> IntArray:
+        """Return the first words, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
+
+        A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
+        or beyond what 64 bits hold.
+        """
+        return np.array([self._stamp(n, words[0], per_unit_ns) for n, words in self], dtype=np.int64)
+
+    def __iter__(self) -> Iterator[tuple[int, list[str]]]:
+        return zip(self.line_numbers, self.words, strict=True)
+
+    def _numbers(self, line_number: int, words: list[str], width: int, columns: str) -> list[float]:
+        if len(words) != width:
+            found = f"{self.path}: line {line_number} has {len(words)} columns"
+            raise DataError(f"{found}, expected {width} ({columns})")
+        try:
+            return [float(word) for word in words]
+        except ValueError as error:
+            raise DataError(f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}") from error
+
+    def _stamp(self, line_number: int, word: str, per_unit_ns: int) -> int:
+        try:
+            t_ns = int((Decimal(word) * per_unit_ns).to_integral_value())
+        except (InvalidOperation, OverflowError, ValueError):
+            raise DataError(f"{self.path}: line {line_number} has no finite time ({word}); remove the line") from None
+        if abs(t_ns) > _LARGEST_NS:
+            raise DataError(f"{self.path}: line {line_number} has the time {word}, beyond any clock; check its unit")
+        return t_ns
+
+
+def read_rows(path: Path, kind: str) -> Rows:
+    """Return the rows of a file; comments start with ``#``, and a heading without it may precede commas.
+
+    ``kind`` says what such a file is. Raises DataError where it is missing, empty or not text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file; {kind}") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    lines = [(n, line.partition("#")[0].strip()) for n, line in enumerate(text.splitlines(), start=1)]
+    lines = [(n, line) for n, line in lines if line]
+    commas = bool(lines) and "," in lines[-1][1]
+    rows = [(n, _words(line, commas=commas)) for n, line in lines]
+    if commas and not _is_number(rows[0][1][0]):
+        rows = rows[1:]
+    if not rows:
+        raise DataError(f"{path}: the file holds no poses; {kind}")
+    return Rows(path, [n for n, _ in rows], [words for _, words in rows], commas)
+
+
+def stamp_text(t_ns: int) -> str:
+    """Write nanoseconds as seconds with nine decimals; goes through integers, for a double holds only 16 digits."""
+    sign, (seconds, rest_ns) = "-" if t_ns < 0 else "", divmod(abs(t_ns), NS_PER_S)
+    return f"{sign}{seconds}.{rest_ns:09d}"
+
+
+def _words(line: str, *, commas: bool) -> list[str]:
+    """Split a line; some programs end theirs with a comma."""
+    return [word.strip() for word in line.removesuffix(",").split(",")] if commas else line.split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
