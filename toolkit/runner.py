@@ -9,7 +9,7 @@ import resource
 import sys
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -105,12 +105,13 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
     if not finished.converged:
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
-    reasons = [None if t is None else contradiction(t, sequence) for t in (causal, finished.trajectory)]
-    for reason in dict.fromkeys(reasons):
+    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said))
+    to_judge = (finished.trajectory,) if causal is None or run.final_is_causal else (causal, finished.trajectory)
+    for reason in dict.fromkeys(contradiction(trajectory, sequence) for trajectory in to_judge):
         if reason is not None:
             status = "diverged"
             log.append(f"the trajectory diverged: {reason}")
-    return Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
+    return replace(run, status=status, log=tuple(log))
 
 
 def _info(said: list[Estimate]) -> dict[str, Array]:

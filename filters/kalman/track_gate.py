@@ -1,8 +1,9 @@
 """The gate of the windowed filters: which tracks, and which of their sightings, may correct the window.
 
 A track speaks as a whole, so that one slipped sighting would silence all the others. Where a track fails the
-gate, the sighting that disagrees most with the rest of the track and with the window is given up and the track
-asks again, once, if two sightings are left.
+gate beyond all doubt, the sighting that disagrees most with the rest of the track and with the window is given up
+and the track asks again, once, if two sightings are left. One that fails by little may be a sound track with bad
+luck: to look for the sighting to blame would be to choose the measurements by their agreement.
 """
 
 from typing import NamedTuple
@@ -18,6 +19,8 @@ from filters.kalman.multiview import Constraints, Linearised, Sightings
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import StereoRig
 
+# A track this many times beyond its gate has slipped: chance does not reach there.
+SLIPPED_FACTOR = 2.0
 FEWEST_SIGHTINGS = 2
 
 
@@ -58,12 +61,12 @@ class TrackGate:
 
         ``innovation`` counts what was used, and a track tested as many times as it asked.
         """
-        heard, failed = self._asked(sightings, innovation)
-        again = failed.select(failed.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+        heard, slipped = self._asked(sightings, innovation)
+        again = slipped.select(slipped.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
         return heard.joined(self._asked(again, innovation)[0]) if len(again.track_ids) else heard
 
     def _asked(self, sightings: Sightings, innovation: Innovation) -> tuple[Heard, Sightings]:
-        """Return the tracks that pass as they are, and the others without their worst sighting."""
+        """Return the tracks that pass as they are, and those that have slipped without their worst sighting."""
         joint = self._joint
         points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
@@ -74,11 +77,11 @@ class TrackGate:
         accepted = np.asarray(nis < gate_at(said.dof))
         innovation.add(nis, said.dof, accepted)
         heard = Heard(sightings.track_ids, points, linearised, said)
-        failed = ~accepted
-        worst = _worst_sighting(heard.select(failed), precision[failed], sightings.seen[failed])
-        seen = sightings.seen[failed].copy()
+        slipped = np.asarray(nis > SLIPPED_FACTOR * gate_at(said.dof))
+        worst = _worst_sighting(heard.select(slipped), precision[slipped], sightings.seen[slipped])
+        seen = sightings.seen[slipped].copy()
         seen[np.arange(len(worst)), worst] = False
-        return heard.select(accepted), sightings.select(failed)._replace(seen=seen)
+        return heard.select(accepted), sightings.select(slipped)._replace(seen=seen)
 
     def _precision(self, said: Constraints) -> Array:
         """Return the inverse of the covariance (F, 3W - 3, 3W - 3) of what each track says."""

@@ -1,0 +1,74 @@
+"""The notebooks: .py and .ipynb are one notebook, it runs on built-in data alone, and what is kept is small."""
+
+import importlib.util
+import os
+import re
+from pathlib import Path
+from types import ModuleType
+
+import nbformat
+import pytest
+
+NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
+SOURCES = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.py"))
+MOST_BYTES = 300_000
+
+each = pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
+
+
+@pytest.fixture(scope="module")
+def execution() -> ModuleType:
+    """Return notebooks/execute.py, which is a program and no part of a package."""
+    spec = importlib.util.spec_from_file_location("execute_notebooks", NOTEBOOKS / "execute.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_there_are_four_notebooks() -> None:
+    assert [source.stem[:2] for source in SOURCES] == ["01", "02", "03", "04"]
+
+
+@each
+def test_the_pair_has_the_same_cells(source: Path, execution: ModuleType) -> None:
+    written, kept = execution.read_source(source), nbformat.read(source.with_suffix(".ipynb"), 4)
+    assert [(c.cell_type, c.source) for c in kept.cells] == [(c.cell_type, c.source) for c in written.cells], (
+        f"python notebooks/execute.py {source.name} writes it again"
+    )
+
+
+@each
+def test_what_is_kept_was_executed_without_an_error_and_is_small(source: Path) -> None:
+    kept = source.with_suffix(".ipynb")
+    notebook = nbformat.read(kept, 4)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert not [o for cell in code for o in cell.outputs if o.output_type == "error" or o.get("name") == "stderr"]
+    assert kept.stat().st_size <= MOST_BYTES
+
+
+@each
+def test_no_path_of_one_machine_is_kept(source: Path) -> None:
+    text = source.with_suffix(".ipynb").read_text(encoding="utf-8")
+    assert not [path for path in ("/home/", "/work/", "/tmp/", "/Users/", str(NOTEBOOKS)) if path in text]
+
+
+@pytest.mark.parametrize("page", [*SOURCES, NOTEBOOKS / "README.md"], ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    linked = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+    assert not [target for target in linked if not (NOTEBOOKS / target).exists()]
+
+
+@each
+def test_it_runs_where_no_real_recording_is(
+    source: Path, execution: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("VISLAM_DATA", str(tmp_path))
+    # Tests run side by side: numerical libraries that start threads of their own would only fight for the cores.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, os.environ.get(name, "1"))
+    executed = execution.execute(source)  # raises where a cell fails
+    said = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
+    assert "the real" not in said
