@@ -49,10 +49,14 @@ class _Unwatched:
 
 
 def trials_of(case: Case) -> list[CaseTrial]:
-    """Return the trials of a case: one a seed; a recording has few seeds, so there each estimator is one as well."""
+    """Return the trials of a case: one a seed; a recording has few seeds, so there each estimator is one as well.
+
+    Files are found here, by whole paths: a process that runs a trial may stand elsewhere, in another environment.
+    """
     groups = [case.estimators] if case.simulated else [(name,) for name in case.estimators]
+    source, truth = located(case.source), None if case.truth is None else located(case.truth)
     return [
-        CaseTrial(case.source, seed, group, start_from_measurements, duration_s=case.duration_s, truth=case.truth)
+        CaseTrial(source, seed, group, start_from_measurements, duration_s=case.duration_s, truth=truth)
         for seed in case.seeds
         for group in groups
     ]
@@ -78,11 +82,11 @@ def case_sequence(trial: CaseTrial) -> Sequence:
 
 def located(source: str) -> str:
     """Return a built-in name as it is, and a path where it leads: from here, or from the folder VISLAM_DATA."""
-    root = os.environ.get(DATA_ROOT)
-    if source in built_ins() or root is None or Path(source).expanduser().exists():
+    if source in built_ins():
         return source
-    below = Path(root).expanduser() / source
-    return str(below) if below.exists() else source
+    root, here = os.environ.get(DATA_ROOT), Path(source).expanduser()
+    places = [here] if root is None else [here, Path(root).expanduser() / source]
+    return next((str(place.absolute()) for place in places if place.exists()), source)
 
 
 def run_case(trial: CaseTrial) -> Iterator[Timed]:
