@@ -1,8 +1,8 @@
 """Full smoother: Levenberg-Marquardt over all poses and landmarks at once, answering at the end (GTSAM).
 
 What it approximates: nothing but the noise; every measurement is relinearised at every iteration (Dellaert &
-Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from the causal pass of the decoupled
-filter, for a dead-reckoned start ends in poor minima.
+Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from what msckf-fej says and the landmarks
+mapped along that, for a start that has run off, dead-reckoned or too sure of itself, ends in poor minima.
 """
 
 import gtsam
@@ -13,12 +13,14 @@ from filters.graph.landmarks import restricted, worth_smoothing
 from filters.graph.motion import motion_graph
 from filters.graph.robust import seen_ids, solve_in_stages
 from filters.kalman.belief import initial_belief
-from filters.kalman.decoupled import DecoupledEkf
+from filters.kalman.linearisation import AtFirstEstimates
+from filters.kalman.mapped import MapAlong
+from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
-from toolkit.sequence import Packet, StereoFrame
+from toolkit.sequence import Packet
 
 RUNG, CHANGE = 120, "+ the future"
 
@@ -35,23 +37,23 @@ class Batch:
         self._rig = setup.rig
         self._motion = motion_graph(setup)
         self._first_belief = initial_belief(setup.prior, setup.motion_kind)
-        self._causal_pass = DecoupledEkf(setup)
+        self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates(), WindowSize(CLONES[setup.motion_kind]))
+        self._map = MapAlong(setup.rig)
         self._packets: list[Packet] = []
-        self._frames: list[StereoFrame] = []
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> None:
         """Remember the packet and carry the causal pass on; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
-        passed = ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched)
-        self._frames.append(restricted(packet.frame, passed))
+        self._map.see(packet.frame, self._estimates[-1].T_world_imu)
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, and for the covariance of every state."""
-        known = self._causal_pass.landmarks()
-        track_ids = worth_smoothing(self._frames, known)
-        frames = [restricted(f, np.isin(f.track_ids, track_ids)) for f in self._frames]
+        known = self._map.landmarks()
+        shown = [packet.frame for packet in self._packets]
+        track_ids = worth_smoothing(shown, known)
+        frames = [restricted(frame, np.isin(frame.track_ids, track_ids)) for frame in shown]
         smoothed = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
@@ -68,7 +70,8 @@ class Batch:
         graph = gtsam.NonlinearFactorGraph()
         for factor in self._motion.hold(self._first_belief, 0):
             graph.add(factor)
-        best_bias = self._causal_pass.belief.bias
+        best_bias = self._estimates[-1].bias
+        assert best_bias is not None
         for packet in self._packets:
             if packet.motion is not None:
                 for factor in self._motion.step(packet.motion, best_bias, packet.index):

@@ -66,6 +66,6 @@ class FixedLag:
         left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < oldest_ns}
         self._growth.forget(left)
         self._last_seen_ns = {i: t_ns for i, t_ns in self._last_seen_ns.items() if i not in left}
-        for track_id in self._last_seen_ns:
-            self._points[track_id] = values.atPoint3(L(track_id))
-        self._growth.belief = self._growth.belief.at(self._states[-1])
+        in_window = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
+        self._points |= in_window
+        self._growth.solved(self._states[-1], in_window)

@@ -17,7 +17,7 @@ from filters.graph.incremental import IncrementalTree
 from filters.graph.marginals import state_cov
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import se3_inverse, transform
+from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.models.factors import L
 from toolkit.sequence import Packet
 
@@ -45,8 +45,10 @@ class Isam2:
         self._stamps_ns.append(packet.frame.t_ns)
         self._note(packet, self._tree.add(grown.factors, grown.values, grown.state_keys))
         estimate = self._newest(grown, packet)
-        self._drop_landmarks_behind(estimate, grown, packet)
-        self._growth.belief = self._growth.belief.at(estimate)
+        seen = [i for i in grown.landmark_ids if self._tree.has(L(i))]
+        points = self._tree.points(map(L, seen))
+        self._growth.solved(estimate, dict(zip(seen, points, strict=True)))
+        self._drop_landmarks_behind(seen, points, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
@@ -66,11 +68,10 @@ class Isam2:
         cov = state_cov(self._tree.isam, self._growth.motion.keys(packet.index), estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
-    def _drop_landmarks_behind(self, estimate: Estimate, grown: Grown, packet: Packet) -> None:
+    def _drop_landmarks_behind(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
         """Drop what is no longer in front of the camera that sees it: its sightings would say nothing at all."""
-        seen = [i for i in grown.landmark_ids if self._tree.has(L(i))]
         T_cam_world = se3_inverse(estimate.T_world_imu @ self._rig.T_imu_cam)
-        depths_m = transform(T_cam_world, self._tree.points(map(L, seen)))[:, 2]
+        depths_m = transform(T_cam_world, points)[:, 2]
         behind = [seen[row] for row in np.flatnonzero(depths_m <= 0.0)]
         if behind:
             self._growth.forget(set(behind))

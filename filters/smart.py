@@ -15,18 +15,18 @@ import numpy as np
 from filters.graph.landmarks import restricted
 from filters.graph.marginals import in_estimate_order
 from filters.graph.motion import motion_graph
+from filters.graph.slips import bound_to_its_map, slipped
 from filters.graph.structureless import Sightings
 from filters.graph.window import Prior, Window, solved, without_oldest
 from filters.graph.window_tracks import Tracked
-from filters.kalman.belief import Belief, initial_belief
-from filters.kalman.decoupled import DecoupledEkf
+from filters.kalman.belief import initial_belief
 from filters.kalman.prediction import predicted, predictor
 from toolkit.cutting import NS_PER_S
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.sequence import Packet
+from toolkit.sequence import Packet, StereoFrame
 
 RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration"
 LAG_S = 2.0
@@ -43,7 +43,6 @@ class Smart:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
         self._motion, self._predictor = motion_graph(setup), predictor(setup)
-        self._causal_pass = DecoupledEkf(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._tracked = _nothing()
         self._states: list[Estimate] = []
@@ -52,13 +51,12 @@ class Smart:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
-        self._causal_pass.step(packet)
         tracked = self._grown(packet)
         try:
             window, cov = solved(tracked.window, self._rig)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
-            tracked = self._afresh(packet)
+            tracked = self._begun(packet)
             window, cov = solved(tracked.window, self._rig)
         self._tracked = replace(tracked, window=window)
         self._read(packet, cov)
@@ -73,29 +71,28 @@ class Smart:
     def _grown(self, packet: Packet) -> Tracked:
         """Return the window with the packet's state, predicted, and its sightings."""
         if packet.motion is None:
-            return self._begun(self._belief, packet)
+            return self._begun(packet)
         factors = self._motion.step(packet.motion, self._belief.bias, packet.index)
-        self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
-        return self._with_state(self._tracked, packet, _graph(factors))
+        step, points = self._predictor.step(self._belief, packet.motion), self._tracked.points_by_id()
+        expected = predicted(bound_to_its_map(self._belief), step)
+        sound = restricted(packet.frame, ~slipped(packet.frame, points, expected, self._rig))
+        self._belief = predicted(self._belief, step)
+        return self._with_state(self._tracked, packet.index, sound, _graph(factors))
 
-    def _afresh(self, packet: Packet) -> Tracked:
-        """Return a window that begins here: the mean as predicted, the covariance that of the causal pass."""
-        return self._begun(self._causal_pass.belief.at(self._belief.estimate(packet.frame.t_ns)), packet)
+    def _begun(self, packet: Packet) -> Tracked:
+        """Return a window that begins here, held at the state as predicted."""
+        hold = self._motion.hold(self._belief, packet.index)
+        return self._with_state(_nothing(), packet.index, packet.frame, _graph(hold))
 
-    def _begun(self, belief: Belief, packet: Packet) -> Tracked:
-        hold = self._motion.hold(belief, packet.index)
-        return self._with_state(_nothing(), packet, _graph(hold))
-
-    def _with_state(self, tracked: Tracked, packet: Packet, factors: gtsam.NonlinearFactorGraph) -> Tracked:
-        window, estimate = tracked.window, self._belief.estimate(packet.frame.t_ns)
+    def _with_state(self, tracked: Tracked, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph) -> Tracked:
+        window, estimate = tracked.window, self._belief.estimate(frame.t_ns)
         new = gtsam.Values()
-        self._motion.insert(new, estimate, packet.index)
-        keys = tuple(self._motion.keys(packet.index))
+        self._motion.insert(new, estimate, k)
         values = gtsam.Values(window.values)
         values.insert(new)
-        longer = replace(window, keys=(*window.keys, keys), values=values, motion=(*window.motion, factors))
-        passed = restricted(packet.frame, ~np.isin(packet.frame.track_ids, self._causal_pass.mismatched))
-        return replace(tracked, window=longer).seeing(passed, estimate.T_world_imu, self._rig)
+        keys = (*window.keys, tuple(self._motion.keys(k)))
+        longer = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
+        return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
 
     def _read(self, packet: Packet, cov: Array) -> None:
         """Take over every state and landmark of the window; drop the landmarks that fell behind a camera."""
@@ -105,8 +102,8 @@ class Smart:
         stamps_ns = [s.t_ns for s in self._states[first:]] + [packet.frame.t_ns]
         read = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
         self._states[first:] = [*read[:-1], replace(read[-1], cov=in_estimate_order(cov, read[-1].T_world_imu[:3, :3]))]
-        self._points |= dict(zip(self._tracked.track_ids.tolist(), window.points, strict=True))
-        self._belief = self._belief.at(read[-1])
+        self._points |= self._tracked.points_by_id()
+        self._belief = self._belief.at(self._states[-1])
 
     def _shorten(self, packet: Packet) -> None:
         oldest_ns = packet.frame.t_ns - self._lag_ns

@@ -1,14 +1,15 @@
 """Run one estimator over one sequence: feed it the packets, time it, keep both kinds of output.
 
-Nothing here knows an estimator by name. A run is ``ok`` only when its estimates are finite, its solves
-converged and its trajectory does not contradict the measured motion; otherwise it says ``diverged`` or
-``failed`` and why.
+Nothing here knows an estimator by name. A run is ``ok`` only when its estimates are finite, its solves converged,
+its trajectory does not contradict the measured motion and its gate lets measurements pass; otherwise it says
+``diverged`` or ``failed`` and why.
 """
 
 import resource
 import sys
 import time
 import traceback
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -19,7 +20,7 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.plausibility import contradiction
+from toolkit.plausibility import contradiction, deafness
 from toolkit.sequence import Packet, Prior, Sequence
 
 
@@ -106,12 +107,24 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
     run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said))
-    to_judge = (finished.trajectory,) if causal is None or run.final_is_causal else (causal, finished.trajectory)
-    for reason in dict.fromkeys(contradiction(trajectory, sequence) for trajectory in to_judge):
+    reasons = [contradiction(trajectory, sequence) for trajectory in _to_judge(run)] + [deafness(run.info)]
+    for reason in dict.fromkeys(reasons):
         if reason is not None:
             status = "diverged"
             log.append(f"the trajectory diverged: {reason}")
     return replace(run, status=status, log=tuple(log))
+
+
+def _to_judge(run: Run) -> Iterator[Trajectory]:
+    """Yield what contradicts nothing in a run that works.
+
+    A final state without a covariance is at least as certain as the causal one was.
+    """
+    if run.causal is not None and not run.final_is_causal:
+        yield run.causal
+    if run.final is not None:
+        lacks = run.final.cov is None and run.causal is not None and np.array_equal(run.causal.t_ns, run.final.t_ns)
+        yield replace(run.final, cov=run.causal.cov) if lacks and run.causal is not None else run.final
 
 
 def _info(said: list[Estimate]) -> dict[str, Array]:

@@ -20,6 +20,10 @@ class Tracked:
     window: Window
     track_ids: IntArray
 
+    def points_by_id(self) -> dict[int, Array]:
+        """Return the point (3,) m of every track."""
+        return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
+
     def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "Tracked":
         """Add what the newest state sees: tracks known go on, new ones near enough start where stereo puts them."""
         known = np.isin(frame.track_ids, self.track_ids)

@@ -51,10 +51,11 @@ class Belief:
         return replace(self, T_world_imu=T_world_imu, v_world=v_world, bias=bias, cov=0.5 * (cov + cov.T))
 
     def at(self, estimate: Estimate) -> "Belief":
-        """Return the belief with the mean of an estimate; what the estimate lacks stays."""
+        """Return the belief that an estimate says; what the estimate lacks stays."""
         v_world = self.v_world if estimate.v_world is None else estimate.v_world
         bias = self.bias if estimate.bias is None else estimate.bias
-        return replace(self, T_world_imu=estimate.T_world_imu, v_world=v_world, bias=bias)
+        cov = self.cov if estimate.cov is None else estimate.cov
+        return replace(self, T_world_imu=estimate.T_world_imu, v_world=v_world, bias=bias, cov=cov)
 
     def estimate(self, t_ns: int, **info: float) -> Estimate:
         """Say the belief as an Estimate; a velocity is given only where it is part of the state."""

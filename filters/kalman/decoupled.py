@@ -9,17 +9,11 @@ import numpy as np
 from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
 from filters.kalman.diagnostics import Innovation
-from filters.kalman.gate import STEREO_GATE
 from filters.kalman.landmarks import TrackedMap
 from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import IntArray
 from toolkit.sequence import Packet
-
-# This filter is too sure of itself for its gate to speak for a smoother, which relinearises: only a sighting this
-# many times beyond the gate is a mismatch to every estimator.
-MISMATCH_FACTOR = 4.0
 
 
 class DecoupledEkf:
@@ -30,29 +24,21 @@ class DecoupledEkf:
         self._predictor = predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
-        self._mismatched: IntArray = np.empty(0, dtype=np.int64)
 
     @property
     def belief(self) -> Belief:
         """Return what the filter believes of the IMU now."""
         return self._belief
 
-    @property
-    def mismatched(self) -> IntArray:
-        """Return the ids of the tracks whose sighting in the last frame is beyond all doubt a mismatch."""
-        return self._mismatched
-
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
             self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
         seen, uvs_px = self._map.seen_again(packet.frame)
-        self._mismatched = np.empty(0, dtype=np.int64)
         innovation = Innovation()
         if len(seen):
             self._belief, accepted, nis = correct_pose(self._belief, seen, uvs_px, self._rig)
             innovation.add(nis, np.full(len(seen), 3), accepted)
-            self._mismatched = seen.track_ids[nis > MISMATCH_FACTOR * STEREO_GATE]
             seen = correct_landmarks_gated(seen, uvs_px, self._belief, self._rig, accepted)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **innovation.info())
