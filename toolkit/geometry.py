@@ -7,6 +7,7 @@ estimation in robotics" (2018), appendix B.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -22,19 +23,28 @@ _SMALL_ANGLE_SQUARED = 0.25
 _INVERSE_FACTORIALS = 1.0 / np.concatenate([[1.0], np.cumprod(np.arange(1.0, 21.0))])
 
 
-def _cosine_tail(first: int) -> Array:
+@cache
+def _cosine_tail(first: int) -> tuple[float, ...]:
     """Return the coefficients of sum_k (-1)^k x^k / (2k + first)!, highest power first."""
     orders = np.arange(first, first + 14, 2)
     signs = np.where(np.arange(orders.size) % 2 == 0, 1.0, -1.0)
-    return (signs * _INVERSE_FACTORIALS[orders])[::-1]
+    return tuple((signs * _INVERSE_FACTORIALS[orders])[::-1].tolist())
 
 
 def _coefficient(angle_squared: Array, first: int, closed_form: Callable[[Array, Array], Array]) -> Array:
     """Evaluate one of the trigonometric coefficients of the exponential map at any angle."""
     small = angle_squared < _SMALL_ANGLE_SQUARED
+    if small.all():
+        return _taylor(angle_squared, first)
     safe = np.where(small, 1.0, angle_squared)
-    taylor = np.polyval(_cosine_tail(first), np.where(small, angle_squared, 0.0))
-    result: Array = np.where(small, taylor, closed_form(np.sqrt(safe), safe))
+    return np.where(small, _taylor(np.where(small, angle_squared, 0.0), first), closed_form(np.sqrt(safe), safe))
+
+
+def _taylor(angle_squared: Array, first: int) -> Array:
+    highest, *lower = _cosine_tail(first)
+    result = np.full_like(angle_squared, highest)
+    for coefficient in lower:
+        result = result * angle_squared + coefficient
     return result
 
 

@@ -16,6 +16,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Sightings
 from filters.kalman.prediction import predictor
+from filters.kalman.triangulation import triangulate
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.sequence import Packet, StereoFrame, StereoRig
@@ -77,7 +78,7 @@ class JointEkf:
         sightings = Sightings(
             frame.track_ids[new], frame.uvs_px[new][:, None], np.ones((int(new.sum()), 1), dtype=bool)
         )
-        points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
+        points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
         if len(points):
             linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)

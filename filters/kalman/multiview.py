@@ -1,4 +1,4 @@
-"""Landmarks seen from several poses of a window: triangulation, and measurements freed of the landmark.
+"""Landmarks seen from several poses of a window: their measurements linearised, and freed of the landmark.
 
 Everything works on F tracks at once, padded to W poses: ``uvs_px`` (F, W, 3) with a mask ``seen`` (F, W).
 Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial
@@ -12,10 +12,6 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
-
-_ITERATIONS, _FIRST_DAMPING = 6, 1e-3
-# A track whose best disparity is below this tells the direction but not the depth; its linearisation is no use.
-LEAST_DISPARITY_PX = 1.0
 
 
 class Sightings(NamedTuple):
@@ -71,59 +67,6 @@ def _in_front(points_cam: Array) -> Array:
     result = points_cam.copy()
     result[..., 2] = np.where(np.abs(result[..., 2]) < 1e-3, 1e-3, result[..., 2])
     return result
-
-
-def triangulate(sightings: Sightings, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
-    """Return the points (F, 3) that fit all sightings best, and which of them (F,) can be relied on.
-
-    Levenberg-Marquardt over all tracks at once, from the stereo triangulation with the largest disparity. A
-    point is reliable if it lies in front of every pose that saw it and had a disparity worth the name.
-    """
-    disparity_px = np.where(sightings.seen, stereo.disparity_px(sightings.uvs_px), -np.inf)
-    nearest = np.argmax(disparity_px, axis=1)
-    rows = np.arange(len(nearest))
-    wide = disparity_px[rows, nearest] > LEAST_DISPARITY_PX
-    uvs_px = np.where(wide[:, None], sightings.uvs_px[rows, nearest], [rig.cx_px + 1.0, rig.cx_px, rig.cy_px])
-    points = stereo.triangulate_world(uvs_px, poses[nearest], rig)
-    damping = np.full(len(points), _FIRST_DAMPING)
-    now = linearise(sightings, points, poses, poses, rig)
-    cost = _cost(now)
-    for _ in range(_ITERATIONS):
-        H, g = _normal_equations(now)
-        H = H + damping[:, None, None] * H * np.eye(3)
-        tried = points + np.linalg.solve(H + 1e-12 * np.eye(3), g[..., None])[..., 0]
-        then = linearise(sightings, tried, poses, poses, rig)
-        better = _cost(then) < cost
-        points = np.where(better[:, None], tried, points)
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-        if np.all(~better | (cost - _cost(then) < 1e-6 * cost)):
-            break
-        now = _chosen(better, then, now)
-        cost = np.where(better, _cost(then), cost)
-    final = linearise(sightings, points, poses, poses, rig)
-    return points, wide & (final.depth_m > 0.1).all(axis=1)
-
-
-def _chosen(rows: BoolArray, new: Linearised, old: Linearised) -> Linearised:
-    """Return the new linearisation of some tracks (F,) and the old one of the others."""
-
-    def pick(a: Array, b: Array) -> Array:
-        return np.where(np.expand_dims(rows, tuple(range(1, a.ndim))), a, b)
-
-    return Linearised(*[pick(a, b) for a, b in zip(new, old, strict=True)])
-
-
-def _cost(linearised: Linearised) -> Array:
-    squares: Array = np.einsum("fwi,fwi->f", linearised.residuals, linearised.residuals)
-    return np.where((linearised.depth_m > 0.0).all(axis=1), squares, np.inf)
-
-
-def _normal_equations(linearised: Linearised) -> tuple[Array, Array]:
-    H_point = linearised.H_point
-    return (
-        np.einsum("fwij,fwik->fjk", H_point, H_point),
-        np.einsum("fwij,fwi->fj", H_point, linearised.residuals),
-    )
 
 
 class Constraints(NamedTuple):

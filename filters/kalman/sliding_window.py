@@ -67,21 +67,32 @@ class SlidingWindowFilter:
         return self._memory.landmarks()
 
     def _correct_by_tracks(self, innovation: Innovation) -> None:
-        """Let the tracks that ended speak, and those that span a full window before its oldest pose leaves."""
-        self._speak(self._tracks.take(self._tracks.ended()), innovation, room=0)
-        if len(self._joint.clones) > self._size.clones:
-            room = self._size.landmarks - len(self._joint.landmark_ids)
-            self._speak(self._tracks.take(self._tracks.spanning()), innovation, room)
+        """Let the tracks that ended speak, and those that span a full window, for its oldest pose leaves next.
 
-    def _speak(self, sightings: Sightings, innovation: Innovation, room: int) -> None:
-        """Correct the window by tracks and keep as many of them as landmarks as there is room for."""
+        All at once, unless there is room for landmarks: what a landmark is linearised at for life is triangulated
+        after the window has been corrected by the others.
+        """
+        speaking = self._tracks.ended()
+        full = len(self._joint.clones) > self._size.clones
+        if full and not self._room:
+            speaking = speaking | self._tracks.spanning()
+        self._speak(self._tracks.take(speaking), innovation)
+        if full and self._room:
+            self._speak(self._tracks.take(self._tracks.spanning()), innovation)
+
+    @property
+    def _room(self) -> int:
+        return max(self._size.landmarks - len(self._joint.landmark_ids), 0)
+
+    def _speak(self, sightings: Sightings, innovation: Innovation) -> None:
+        """Correct the window by tracks; keep as many of those still seen as landmarks as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
         heard = TrackGate(joint, self._at, self._rig).passed(sightings, innovation)
         if not len(heard.points):
             return
         self._memory.remember(heard.track_ids, heard.points)
-        kept = heard.select(np.arange(max(min(room, len(heard.points)), 0)))
+        kept = heard.select(np.flatnonzero(heard.seen[:, -1])[: self._room])
         if len(kept.points):
             joint_landmarks.keep(joint, kept.track_ids, kept.points, kept.linearised)
         H, residuals = multiview.compressed(*_stacked(heard.said))

@@ -16,6 +16,7 @@ from filters.kalman.gate import gate_at
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, Sightings
+from filters.kalman.triangulation import triangulate
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import StereoRig
 
@@ -25,9 +26,10 @@ FEWEST_SIGHTINGS = 2
 
 
 class Heard(NamedTuple):
-    """F tracks that passed: their ids (F,) and points (F, 3), their sightings and what these say of the window."""
+    """F tracks that passed: ids (F,), who saw what (F, W), points (F, 3), and what the sightings say of the window."""
 
     track_ids: IntArray
+    seen: BoolArray
     points: Array
     linearised: Linearised
     said: Constraints
@@ -36,7 +38,7 @@ class Heard(NamedTuple):
         """Return some of the tracks."""
         linearised = Linearised(*[array[rows] for array in self.linearised])
         said = Constraints(self.said.residuals[rows], self.said.H[rows], self.said.dof[rows])
-        return Heard(self.track_ids[rows], self.points[rows], linearised, said)
+        return Heard(self.track_ids[rows], self.seen[rows], self.points[rows], linearised, said)
 
     def joined(self, other: "Heard") -> "Heard":
         """Return both together."""
@@ -46,8 +48,8 @@ class Heard(NamedTuple):
             np.concatenate([self.said.H, other.said.H]),
             np.concatenate([self.said.dof, other.said.dof]),
         )
-        ids = np.concatenate([self.track_ids, other.track_ids])
-        return Heard(ids, np.concatenate([self.points, other.points]), linearised, said)
+        ids, seen = np.concatenate([self.track_ids, other.track_ids]), np.concatenate([self.seen, other.seen])
+        return Heard(ids, seen, np.concatenate([self.points, other.points]), linearised, said)
 
 
 class TrackGate:
@@ -68,7 +70,7 @@ class TrackGate:
     def _asked(self, sightings: Sightings, innovation: Innovation) -> tuple[Heard, Sightings]:
         """Return the tracks that pass as they are, and those that have slipped without their worst sighting."""
         joint = self._joint
-        points, reliable = multiview.triangulate(sightings, joint.clones, self._rig)
+        points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
         linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
         said = multiview.without_landmark(linearised, sightings.seen)
@@ -76,7 +78,7 @@ class TrackGate:
         nis = np.einsum("fi,fij,fj->f", said.residuals, precision, said.residuals)
         accepted = np.asarray(nis < gate_at(said.dof))
         innovation.add(nis, said.dof, accepted)
-        heard = Heard(sightings.track_ids, points, linearised, said)
+        heard = Heard(sightings.track_ids, sightings.seen, points, linearised, said)
         slipped = np.asarray(nis > SLIPPED_FACTOR * gate_at(said.dof))
         worst = _worst_sighting(heard.select(slipped), precision[slipped], sightings.seen[slipped])
         seen = sightings.seen[slipped].copy()

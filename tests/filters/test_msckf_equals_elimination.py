@@ -20,6 +20,7 @@ from filters.kalman.multiview import Linearised, Sightings
 from filters.kalman.prediction import predictor
 from filters.kalman.sliding_window import SlidingWindowFilter, WindowSize
 from filters.kalman.tracks import WindowTracks
+from filters.kalman.triangulation import triangulate
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.simulation import DRIVE, FLIGHT
@@ -48,7 +49,7 @@ def window_of(recording) -> Window:
         tracks.add_frame(packet.frame)
     taken = tracks.take(np.ones(len(tracks.ended()), dtype=bool))
     taken = taken.select(taken.seen.sum(axis=1) >= 2)
-    points, reliable = multiview.triangulate(taken, joint.clones, setup.rig)
+    points, reliable = triangulate(taken.uvs_px, taken.seen, joint.clones, setup.rig)
     taken, points = taken.select(reliable), points[reliable]
     return Window(joint, taken, points, multiview.linearise(taken, points, joint.clones, joint.clones, setup.rig))
 

@@ -13,6 +13,7 @@ from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.multiview import Sightings
 from filters.kalman.prediction import predictor
 from filters.kalman.track_gate import TrackGate
+from filters.kalman.triangulation import triangulate
 from toolkit.estimator import Setup
 from toolkit.models import stereo
 from toolkit.simulation import DRIVE, simulate
@@ -82,7 +83,7 @@ def test_the_fall_foretold_is_what_leaving_the_sighting_out_brings(scene):
     bad = slipped(sightings, {4: [2]})
     gate = TrackGate(joint, AtLatestEstimates(), rig)
     without = bad.select(np.array([4]))._replace(seen=(np.arange(WINDOW) != 2)[None])
-    points, _ = multiview.triangulate(without, joint.clones, rig)
+    points, _ = triangulate(without.uvs_px, without.seen, joint.clones, rig)
     with_it = multiview.linearise(bad.select(np.array([4])), points, joint.clones, joint.clones, rig)
     alone = multiview.linearise(without, points, joint.clones, joint.clones, rig)
 

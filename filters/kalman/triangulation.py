@@ -1,0 +1,111 @@
+"""Where landmarks are that several poses have seen: Levenberg-Marquardt over all tracks at once.
+
+The sightings are taken as one flat list, ordered by track, for tracks differ much in length. Source of the problem:
+Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation", appendix.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
+from toolkit.models import stereo
+from toolkit.sequence import StereoRig
+
+_ITERATIONS, _FIRST_DAMPING = 6, 1e-3
+# What a track says is freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
+_RELATIVE_DECREASE = 1e-4
+# A track whose best disparity is below this tells the direction but not the depth; its linearisation is no use.
+LEAST_DISPARITY_PX = 1.0
+_LEAST_DEPTH_M = 0.1
+
+
+class _Views(NamedTuple):
+    """N sightings (N, 3) px, ordered by track, and how each sees the world: ``p_cam = R p_world + t``.
+
+    ``track`` (N,) tells whose point each sees, ``first`` (F,) where each track's sightings begin.
+    """
+
+    uvs_px: Array
+    R_cam_world: Array
+    t_cam: Array
+    track: IntArray
+    first: IntArray
+
+
+class _Fit(NamedTuple):
+    """Points (F, 3), half the squared error (F,) of each, infinite behind a camera, and its derivatives."""
+
+    points: Array
+    cost: Array
+    gradient: Array
+    hessian: Array
+    depth_m: Array
+
+
+def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
+    """Return the points (F, 3) that fit sightings (F, W, 3) px from poses (W, 4, 4) best, and which (F,) to rely on.
+
+    ``seen`` (F, W) marks the sightings, of which every track must have one. The start is the stereo triangulation
+    with the largest disparity. A point is reliable if it lies in front of every pose that saw it and had a disparity
+    worth the name.
+    """
+    if not len(seen):
+        return np.empty((0, 3)), np.empty(0, dtype=bool)
+    start, wide = _nearest(uvs_px, seen, poses, rig)
+    views = _views(uvs_px, seen, poses, rig)
+    fit, damping = _fit(start, views, rig), np.full(len(start), _FIRST_DAMPING)
+    for _ in range(_ITERATIONS):
+        damped = fit.hessian + (damping[:, None, None] * fit.hessian + 1e-12) * np.eye(3)
+        tried = _fit(fit.points + np.linalg.solve(damped, fit.gradient[..., None])[..., 0], views, rig)
+        better = tried.cost < fit.cost
+        unsettled = better & (fit.cost - tried.cost > _RELATIVE_DECREASE * fit.cost)
+        fit = _chosen(better, tried, fit)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        if not unsettled.any():
+            break
+    return fit.points, wide & (fit.depth_m > _LEAST_DEPTH_M)
+
+
+def _nearest(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
+    """Return where the sighting with the largest disparity puts each point (F, 3), and whether (F,) it is enough."""
+    disparity_px = np.where(seen, stereo.disparity_px(uvs_px), -np.inf)
+    nearest = np.argmax(disparity_px, axis=1)
+    rows = np.arange(len(nearest))
+    wide = disparity_px[rows, nearest] > LEAST_DISPARITY_PX
+    best_px = np.where(wide[:, None], uvs_px[rows, nearest], [rig.cx_px + 1.0, rig.cx_px, rig.cy_px])
+    return stereo.triangulate_world(best_px, poses[nearest], rig), wide
+
+
+def _views(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> _Views:
+    track, pose = np.nonzero(seen)
+    T_cam_world = se3_inverse(poses @ rig.T_imu_cam)
+    first = np.searchsorted(track, np.arange(len(seen)))
+    return _Views(uvs_px[seen], T_cam_world[pose, :3, :3], T_cam_world[pose, :3, 3], track, first)
+
+
+def _fit(points: Array, views: _Views, rig: StereoRig) -> _Fit:
+    points_cam = (views.R_cam_world @ points[views.track][:, :, None])[..., 0] + views.t_cam
+    depth_m = points_cam[:, 2].copy()
+    points_cam[:, 2] = np.where(np.abs(depth_m) < 1e-3, 1e-3, depth_m)
+    information = np.linalg.inv(rig.cov_uv_px2)
+    residuals_px = views.uvs_px - stereo.project(points_cam, rig)
+    weighted_px = residuals_px @ information
+    H = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
+    H_transposed = np.swapaxes(H, 1, 2)
+    nearest_m = np.minimum.reduceat(depth_m, views.first)
+    cost = 0.5 * np.add.reduceat(np.einsum("ni,ni->n", residuals_px, weighted_px), views.first)
+    gradient = np.add.reduceat((H_transposed @ weighted_px[..., None])[..., 0], views.first)
+    hessian = np.add.reduceat(H_transposed @ information @ H, views.first)
+    return _Fit(points, np.where(nearest_m > 0.0, cost, np.inf), gradient, hessian, nearest_m)
+
+
+def _chosen(rows: BoolArray, new: _Fit, old: _Fit) -> _Fit:
+    """Return the new fit of some tracks (F,) and the old one of the others."""
+    if rows.all():
+        return new
+
+    def pick(a: Array, b: Array) -> Array:
+        return np.where(np.expand_dims(rows, tuple(range(1, a.ndim))), a, b)
+
+    return _Fit(*[pick(a, b) for a, b in zip(new, old, strict=True)])
