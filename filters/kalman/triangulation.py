@@ -59,7 +59,7 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
         damped = fit.hessian + (damping[:, None, None] * fit.hessian + 1e-12) * np.eye(3)
         tried = _fit(fit.points + np.linalg.solve(damped, fit.gradient[..., None])[..., 0], views, rig)
         better = tried.cost < fit.cost
-        unsettled = better & (fit.cost - tried.cost > _RELATIVE_DECREASE * fit.cost)
+        unsettled = tried.cost < (1.0 - _RELATIVE_DECREASE) * fit.cost
         fit = _chosen(better, tried, fit)
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if not unsettled.any():

@@ -1,0 +1,70 @@
+"""Landmarks from several poses: exact where nothing has noise, the least-squares answer where it has."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from filters.kalman.triangulation import triangulate
+from toolkit.geometry import se3, se3_inverse, so3_exp, transform
+from toolkit.models import stereo
+from toolkit.sequence import StereoRig
+
+RIG = StereoRig(450.0, 455.0, 360.0, 240.0, 0.11, np.eye(4), np.diag([1.0, 1.0, 0.5]))
+
+
+def scene(seed: int, tracks: int = 40, window: int = 6):
+    """Return points (F, 3), poses (W, 4, 4), exact sightings (F, W, 3) px, and who saw what, two at least each."""
+    rng = np.random.default_rng(seed)
+    turns = so3_exp(0.05 * rng.standard_normal((window, 3)))
+    poses = se3(turns, np.cumsum(0.2 * rng.standard_normal((window, 3)), axis=0))
+    points = rng.uniform([-2.0, -1.5, 3.0], [2.0, 1.5, 8.0], size=(tracks, 3))
+    uvs_px = np.stack([stereo.project(transform(se3_inverse(pose), points), RIG) for pose in poses], axis=1)
+    seen = rng.uniform(size=(tracks, window)) < 0.6
+    seen[:, :2] = True
+    return points, poses, np.where(seen[..., None], uvs_px, 0.0), seen
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_sightings_give_the_points(seed):
+    points, poses, uvs_px, seen = scene(seed)
+    found, reliable = triangulate(uvs_px, seen, poses, RIG)
+    assert reliable.all()
+    np.testing.assert_allclose(found, points, atol=1e-7)
+
+
+def test_noisy_sightings_give_the_least_squares_points():
+    _, poses, uvs_px, seen = scene(4)
+    uvs_px = uvs_px + np.random.default_rng(0).standard_normal(uvs_px.shape) * [1.0, 1.0, np.sqrt(0.5)]
+    found, reliable = triangulate(uvs_px, seen, poses, RIG)
+    whitener = np.linalg.inv(np.linalg.cholesky(RIG.cov_uv_px2))
+
+    def residuals(point, track):
+        own = [transform(se3_inverse(pose), point[None]) for pose in poses[seen[track]]]
+        predicted = stereo.project(np.concatenate(own), RIG)
+        return ((uvs_px[track, seen[track]] - predicted) @ whitener.T).ravel()
+
+    assert reliable.all()
+    for track, point in enumerate(found):
+        best = least_squares(residuals, point, args=(track,), xtol=1e-12, ftol=1e-12)
+        # The search ends where it has nothing to gain: a hundredth of a standard deviation of the point.
+        spread = np.linalg.inv(best.jac.T @ best.jac)
+        assert (point - best.x) @ np.linalg.solve(spread, point - best.x) < 0.01**2
+
+
+def test_a_point_behind_a_pose_or_without_disparity_is_not_relied_on():
+    _, poses, uvs_px, seen = scene(5)
+    behind = poses.copy()
+    behind[1, :3, :3] = so3_exp(np.array([0.0, np.pi, 0.0]))  # no point is in front of both
+    assert not triangulate(uvs_px, seen, behind, RIG)[1].any()
+    flat = uvs_px.copy()
+    flat[0, :, 1] = flat[0, :, 0]
+    found, reliable = triangulate(flat, seen, poses, RIG)
+    assert not reliable[0]
+    assert reliable[1:].all()
+    assert np.isfinite(found).all()
+
+
+def test_no_track_gives_no_point():
+    found, reliable = triangulate(np.empty((0, 3, 3)), np.empty((0, 3), dtype=bool), np.tile(np.eye(4), (3, 1, 1)), RIG)
+    assert found.shape == (0, 3)
+    assert reliable.shape == (0,)
