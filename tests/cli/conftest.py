@@ -8,6 +8,7 @@ import pytest
 from toolkit.cli import main
 
 Vislam = Callable[..., int]
+OneLine = Callable[[], str]
 
 
 @pytest.fixture
@@ -23,3 +24,16 @@ def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
             return left.code
 
     return run
+
+
+@pytest.fixture
+def one_line(capsys: pytest.CaptureFixture[str]) -> OneLine:
+    """Return a function that returns what was told on stderr, which must be an error in one line."""
+
+    def read() -> str:
+        told = capsys.readouterr().err
+        assert told.startswith("vislam: error: ")
+        assert told.count("\n") == 1
+        return told
+
+    return read

@@ -10,6 +10,7 @@ from toolkit import estimator
 from toolkit.report.seeds_json import violations
 
 Vislam = Callable[..., int]
+OneLine = Callable[[], str]
 QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10")
 
 
@@ -50,14 +51,12 @@ RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
     ],
 )
 def test_what_cannot_be_repeated_is_a_wrong_command_line(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], why: str
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], why: str
 ) -> None:
     if words[0] == "drive" and "--truth" in words:
         Path("gt.tum").write_text("")
     assert vislam("compare", *words, *QUICK) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert why in told
+    assert why in one_line()
     assert not Path("runs").exists()
 
 

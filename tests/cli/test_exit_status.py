@@ -12,14 +12,8 @@ import pytest
 from toolkit import runner
 
 Vislam = Callable[..., int]
+OneLine = Callable[[], str]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10")
-
-
-def one_line(capsys: pytest.CaptureFixture[str]) -> str:
-    told = capsys.readouterr().err
-    assert told.startswith("vislam: error: ")
-    assert told.count("\n") == 1
-    return told
 
 
 @pytest.mark.parametrize(
@@ -39,37 +33,37 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
         ("simulate", "drive", "--out", "d", "--duration", "0"),
     ],
 )
-def test_a_wrong_command_line_is_2(vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+def test_a_wrong_command_line_is_2(vislam: Vislam, one_line: OneLine, words: tuple[str, ...]) -> None:
     assert vislam(*words) == 2
-    one_line(capsys)
+    one_line()
 
 
-def test_a_recording_that_is_not_there_is_3(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
     assert vislam("compare", "no/such/recording.npz", "--estimators", "dead-reckoning") == 3
-    assert "no/such/recording.npz" in one_line(capsys)
+    assert "no/such/recording.npz" in one_line()
 
 
-def test_a_truth_that_is_not_there_is_3(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_truth_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
     assert vislam(*QUICK, "--truth", "missing.tum") == 3
-    assert "missing.tum" in one_line(capsys)
+    assert "missing.tum" in one_line()
 
 
 @pytest.mark.parametrize("out", ["taken", "taken/run"])
 def test_an_output_that_cannot_be_written_is_4_before_anything_runs(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, out: str
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
     Path("taken").write_text("a file")
     monkeypatch.setattr(runner, "run", _never)
     assert vislam(*QUICK, "--out", out) == 4
-    assert out in one_line(capsys)
+    assert out in one_line()
 
 
 def test_an_unknown_estimator_is_5_before_anything_runs(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "run", _never)
     assert vislam("compare", "drive", "--estimators", "dead-reckoning,oracle") == 5
-    assert "oracle" in one_line(capsys)
+    assert "oracle" in one_line()
 
 
 def test_a_diverged_estimator_is_1_and_its_results_are_written(
@@ -83,14 +77,14 @@ def test_a_diverged_estimator_is_1_and_its_results_are_written(
 
 
 def test_an_interrupt_is_130_and_leaves_nothing(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(runner, "run", interrupted)
     assert vislam(*QUICK, "--out", "run") == 130
-    assert "interrupted" in one_line(capsys)
+    assert "interrupted" in one_line()
     assert list(Path().iterdir()) == []
 
 

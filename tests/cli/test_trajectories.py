@@ -15,19 +15,13 @@ from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.report import metrics_json, report_json
 
 Vislam = Callable[..., int]
+OneLine = Callable[[], str]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20")
 EVO = {
     "tum": evo.read_tum_trajectory_file,
     "kitti": evo.read_kitti_poses_file,
     "euroc": evo.read_euroc_csv_trajectory,
 }
-
-
-def told(capsys: pytest.CaptureFixture[str]) -> str:
-    message = capsys.readouterr().err
-    assert message.startswith("vislam: error: ")
-    assert message.count("\n") == 1
-    return message
 
 
 @pytest.fixture(scope="module")
@@ -110,11 +104,11 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
     ],
 )
 def test_a_trajectory_that_cannot_be_used_is_told_before_anything_runs(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], status: int, why: str
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], status: int, why: str
 ) -> None:
     Path("empty").touch()
     assert vislam(*QUICK[:2], *words, *QUICK[2:], "--out", "again") == status
-    assert why in told(capsys)
+    assert why in one_line()
     assert not Path("again").exists()
 
 
@@ -126,27 +120,25 @@ def test_a_trajectory_that_cannot_be_used_is_told_before_anything_runs(
     ],
 )
 def test_a_choice_that_is_not_there_is_told_with_those_that_are(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path, words: tuple[str, ...], why: str
+    vislam: Vislam, one_line: OneLine, run: Path, words: tuple[str, ...], why: str
 ) -> None:
     assert vislam("export", str(run), *words, "--format", "tum", "--out", "out.tum") == 3
-    assert why in told(capsys)
+    assert why in one_line()
     assert not Path("out.tum").exists()
 
 
-def test_an_output_that_was_not_given_is_told(vislam: Vislam, capsys: pytest.CaptureFixture[str], again: Path) -> None:
+def test_an_output_that_was_not_given_is_told(vislam: Vislam, one_line: OneLine, again: Path) -> None:
     words = ("--estimator", "by tum", "--output", "causal", "--format", "tum", "--out", "out.tum")
     assert vislam("export", str(again), *words) == 3
-    assert "has no causal trajectory of by tum, only a final one" in told(capsys)
+    assert "has no causal trajectory of by tum, only a final one" in one_line()
 
 
-def test_kitti_cannot_hold_a_trajectory_with_gaps(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path
-) -> None:
+def test_kitti_cannot_hold_a_trajectory_with_gaps(vislam: Vislam, one_line: OneLine, run: Path) -> None:
     shutil.copytree(run, "gaps")
     path = Path("gaps/trajectories/ekf_final.tum")
     path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
     assert vislam("export", "gaps", "--estimator", "ekf", "--format", "kitti", "--out", "out") == 3
-    assert "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames" in told(capsys)
+    assert "ekf final has 19 poses for 20 frames, and KITTI's rows are the frames" in one_line()
 
 
 def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) -> None:
@@ -155,18 +147,20 @@ def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) 
         assert len(read_poses(Path("out.csv"))) == 20
 
 
-def test_a_file_that_cannot_be_written_is_told(vislam: Vislam, capsys: pytest.CaptureFixture[str], run: Path) -> None:
+def test_a_file_that_cannot_be_written_is_told(vislam: Vislam, one_line: OneLine, run: Path) -> None:
     Path("taken").mkdir()
     assert vislam("export", str(run), "--estimator", "ekf", "--format", "tum", "--out", "taken") == 4
-    assert "taken is a directory" in told(capsys)
+    assert "taken is a directory" in one_line()
 
 
-def test_a_comparison_over_seeds_has_nothing_to_export(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_comparison_over_seeds_has_nothing_to_export(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], one_line: OneLine
+) -> None:
     seeds = ("--estimators", "dead-reckoning", "--max-frames", "5", "--seeds", "2", "--workers", "1", "--out", "seeds")
     assert vislam("compare", "drive", *seeds) == 0
     capsys.readouterr()
     assert vislam("export", "seeds", "--format", "tum", "--out", "out") == 3
-    assert "over seeds and holds no trajectories" in told(capsys)
+    assert "over seeds and holds no trajectories" in one_line()
 
 
 def test_the_formats_offered_are_those_there_are() -> None:

@@ -1,11 +1,16 @@
 """Recordings small enough to write, spoil and read again in a test, and the way to the real ones."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+
+from toolkit.errors import DataError
+
+Refused = Callable[..., None]
 
 
 @pytest.fixture
@@ -68,3 +73,16 @@ def openvins(tmp_path: Path) -> Path:
     truth = [f"{0.1 * k + 0.1:.1f},{k},1,0,0,0,1,2,3,4,5,6,.1,.2,.3,.4,.5,.6" for k in range(4)]
     (folder / "truth_cam.csv").write_text("\n".join([columns, *truth]) + "\n")
     return folder
+
+
+@pytest.fixture
+def assert_refused() -> Refused:
+    """Return a check that reading a file fails in one line, which names the file and holds a pattern."""
+
+    def check(read: Callable[[], object], path: Path, pattern: str) -> None:
+        with pytest.raises(DataError, match=pattern) as raised:
+            read()
+        assert str(path) in str(raised.value)
+        assert "\n" not in str(raised.value)
+
+    return check

@@ -1,5 +1,8 @@
 """A made-up comparison: a simulated recording, and runs that are its truth with a known error."""
 
+import json
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +52,22 @@ def run_directory(comparison: Comparison, tmp_path_factory: pytest.TempPathFacto
     target = tmp_path_factory.mktemp("runs") / "made-up"
     write_run(comparison, target, command="vislam compare made-up --seed 3", seed=3)
     return target
+
+
+@pytest.fixture
+def run_called(run_directory: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Return a function that copies the run directory with a name put for its recording's and for one run's."""
+
+    def copied(name: str) -> Path:
+        target = tmp_path / "run"
+        shutil.copytree(run_directory, target)
+        for document in ("metrics.json", "report.json", "manifest.json"):
+            text = (target / document).read_text()
+            renamed = text.replace('"steady"', json.dumps(name)).replace('"drive"', json.dumps(name))
+            (target / document).write_text(renamed)
+        return target
+
+    return copied
 
 
 def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:

@@ -25,6 +25,9 @@ exit status:
   130  interrupted (Ctrl-C or SIGTERM); nothing is left half-written"""
 
 
+DEFAULT_ESTIMATORS = ("dead-reckoning", "ekf", "batch")
+
+
 class UsageError(VislamError):
     """A command line that asks for something that does not exist."""
 
@@ -107,6 +110,22 @@ def positive_seconds(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected seconds greater than zero, not {text}")
     return value
+
+
+def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the names of estimators, with what they are named for."""
+    parser.add_argument(
+        "--estimators",
+        metavar="NAME,...",
+        type=names,
+        default=DEFAULT_ESTIMATORS,
+        help=f"{what} (default: {','.join(DEFAULT_ESTIMATORS)})",
+    )
+
+
+def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:
+    """Add the number of processes; None stands for one a CPU."""
+    parser.add_argument("--workers", metavar="N", type=at_least(1), help=f"{what} (default: one a CPU)")
 
 
 def add_repair_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, at_least, epilog, names, positive_seconds
+from toolkit.cli.arguments import (
+    UsageError,
+    add_estimators_argument,
+    add_workers_argument,
+    at_least,
+    epilog,
+    positive_seconds,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,7 +23,6 @@ if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
     from toolkit.regression.baseline import Baseline, Case
 
-ESTIMATORS = ("dead-reckoning", "ekf", "batch")
 SEEDS, FEWEST_SEEDS = 24, 5
 
 
@@ -37,13 +43,7 @@ def add_to(subcommands: Subcommands) -> None:
         nargs="+",
         help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
     )
-    parser.add_argument(
-        "--estimators",
-        metavar="NAME,...",
-        type=names,
-        default=ESTIMATORS,
-        help=f"what to measure, see 'vislam list' (default: {','.join(ESTIMATORS)})",
-    )
+    add_estimators_argument(parser, "what to measure, see 'vislam list'")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
     parser.add_argument(
         "--seeds",
@@ -68,7 +68,7 @@ def add_to(subcommands: Subcommands) -> None:
         default=[],
         help="ground truth of a recorded sequence, from the same places; may be given several times",
     )
-    parser.add_argument("--workers", metavar="N", type=at_least(1), help="processes side by side (default: one a CPU)")
+    add_workers_argument(parser)
     parser.set_defaults(command=command)
 
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import at_least, epilog
+from toolkit.cli.arguments import add_workers_argument, epilog
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -34,7 +34,7 @@ def add_to(subcommands: Subcommands) -> None:
         required=True,
         help="what vislam baseline wrote; of a folder, the one for the releases installed here",
     )
-    parser.add_argument("--workers", metavar="N", type=at_least(1), help="processes side by side (default: one a CPU)")
+    add_workers_argument(parser)
     for name, what in _FILES.items():
         parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
     parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")

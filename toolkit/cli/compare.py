@@ -8,7 +8,15 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults, named_file, names
+from toolkit.cli.arguments import (
+    add_estimators_argument,
+    add_repair_arguments,
+    add_workers_argument,
+    at_least,
+    epilog,
+    kept_faults,
+    named_file,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,7 +25,6 @@ if TYPE_CHECKING:
     from toolkit.report.session import Request
 
 SEQUENCES = ("kitti00", "drive")
-ESTIMATORS = ("dead-reckoning", "ekf", "batch")
 
 
 def add_to(subcommands: Subcommands) -> None:
@@ -36,13 +43,7 @@ def add_to(subcommands: Subcommands) -> None:
         default=SEQUENCES,
         help=f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
     )
-    parser.add_argument(
-        "--estimators",
-        metavar="NAME,...",
-        type=names,
-        default=ESTIMATORS,
-        help=f"what to compare, see 'vislam list'; 'ladder' is every rung (default: {','.join(ESTIMATORS)})",
-    )
+    add_estimators_argument(parser, "what to compare, see 'vislam list'; 'ladder' is every rung")
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth; with exactly one SEQUENCE")
     parser.add_argument(
         "--trajectory",
@@ -70,12 +71,7 @@ def add_to(subcommands: Subcommands) -> None:
         default=1,
         help="repeat simulated sequences over N seeds, from --seed",
     )
-    parser.add_argument(
-        "--workers",
-        metavar="N",
-        type=at_least(1),
-        help="processes side by side with --seeds (default: one a CPU)",
-    )
+    add_workers_argument(parser, "processes side by side with --seeds")
     parser.set_defaults(command=command)
 
 

@@ -2,8 +2,7 @@
 
 from toolkit.regression.bounded import SHOWN
 from toolkit.regression.verdict import Check, Verdict
-from toolkit.report.seeds_table import number
-from toolkit.report.table import Table
+from toolkit.report.table import Table, number
 
 _MISSING = "-"
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))

@@ -2,11 +2,12 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 
 from toolkit.report.comparison import Comparison, Row
+from toolkit.report.contract import object_violations, schema_violations
 from toolkit.sequence import Sequence
 
 SCHEMA = "vislam.metrics/1"
@@ -137,30 +138,18 @@ def violations(document: object) -> list[str]:
     """Return everything in which a parsed document breaks the contract; empty for a valid one."""
     if not isinstance(document, dict):
         return ["the document is not an object"]
-    found = [] if document.get("schema") == SCHEMA else [f"schema is {document.get('schema')!r}, not {SCHEMA!r}"]
-    found += _field_violations(document.get("sequence"), "sequence", _SEQUENCE_FIELDS)
+    found = list(schema_violations(document, SCHEMA))
+    found += object_violations(document.get("sequence"), "sequence", _SEQUENCE_FIELDS, _CHOICES)
     for name, item_fields in (("audit", _FINDING_FIELDS), ("runs", _RUN_FIELDS)):
         items = document.get(name)
         if not isinstance(items, list):
             found.append(f"{name} is not a list")
             continue
         for i, item in enumerate(items):
-            found += _field_violations(item, f"{name}[{i}]", item_fields)
+            found += object_violations(item, f"{name}[{i}]", item_fields, _CHOICES)
             if name == "runs" and isinstance(item, dict):
                 found += _metric_violations(item, f"runs[{i}]")
     return found
-
-
-def _field_violations(item: object, where: str, expected: Mapping[str, tuple[type, ...]]) -> Iterator[str]:
-    if not isinstance(item, dict):
-        yield f"{where} is not an object"
-        return
-    for name, types in expected.items():
-        # type(), not isinstance(): True must not pass for the number 1.
-        if name not in item or type(item[name]) not in types:
-            yield f"{where}.{name} is missing or not {' or '.join(t.__name__ for t in types)}"
-        elif name in _CHOICES and item[name] not in _CHOICES[name]:
-            yield f"{where}.{name} is {item[name]!r}, not one of {_CHOICES[name]}"
 
 
 def _metric_violations(run: Json, where: str) -> Iterator[str]:

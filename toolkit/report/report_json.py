@@ -12,6 +12,7 @@ from toolkit.metrics import Judged
 from toolkit.metrics.common.consistency import POSE_DOF, nees_band, nees_over_time
 from toolkit.metrics.common.scores import Unavailable
 from toolkit.report.comparison import Comparison, Row, plain_name
+from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
 from toolkit.report.figures.top_view import last_word
@@ -211,18 +212,9 @@ def violations(document: object) -> list[str]:
     """Return everything in which a parsed document breaks the contract; empty for a valid one."""
     if not isinstance(document, dict):
         return ["the document is not an object"]
-    found = [] if document.get("schema") == SCHEMA else [f"schema is {document.get('schema')!r}, not {SCHEMA!r}"]
-    found += _missing(document, "the document", _FIELDS)
+    found = list(schema_violations(document, SCHEMA))
+    found += object_violations(document, "the document", _FIELDS)
     runs = document.get("runs")
     for i, run in enumerate(runs if isinstance(runs, list) else []):
-        found += _missing(run, f"runs[{i}]", _RUN_FIELDS)
+        found += object_violations(run, f"runs[{i}]", _RUN_FIELDS)
     return found
-
-
-def _missing(item: object, where: str, expected: dict[str, tuple[type, ...]]) -> Iterator[str]:
-    if not isinstance(item, dict):
-        yield f"{where} is not an object"
-        return
-    for name, types in expected.items():
-        if name not in item or type(item[name]) not in types:
-            yield f"{where}.{name} is missing or not {' or '.join(t.__name__ for t in types)}"

@@ -7,29 +7,30 @@ from dataclasses import fields
 import numpy as np
 
 from toolkit.metrics import describe
+from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.metrics_json import METRIC_KEYS, Json
 from toolkit.sweep.over_seeds import Group, OverSeeds, Spread
 
 SCHEMA = "vislam.seeds/1"
 STATUSES = ("ok", "diverged", "failed")
 _SPREAD_FIELDS = tuple(field.name for field in fields(Spread))
-_FIELDS: dict[str, type] = {
-    "sequence": dict,
-    "seeds": list,
-    "hashes": list,
-    "start": str,
-    "estimators": list,
-    "runs": list,
-    "log": list,
+_FIELDS: dict[str, tuple[type, ...]] = {
+    "sequence": (dict,),
+    "seeds": (list,),
+    "hashes": (list,),
+    "start": (str,),
+    "estimators": (list,),
+    "runs": (list,),
+    "log": (list,),
 }
-_RUN_FIELDS: dict[str, type] = {
-    "estimator": str,
-    "output": str,
-    "status": list,
-    "counts": dict,
-    "metrics": dict,
-    "notes": dict,
-    "over_seeds": dict,
+_RUN_FIELDS: dict[str, tuple[type, ...]] = {
+    "estimator": (str,),
+    "output": (str,),
+    "status": (list,),
+    "counts": (dict,),
+    "metrics": (dict,),
+    "notes": (dict,),
+    "over_seeds": (dict,),
 }
 
 
@@ -103,8 +104,8 @@ def violations(document: object) -> list[str]:
     """Return everything in which a parsed document breaks the contract; empty for a valid one."""
     if not isinstance(document, dict):
         return ["the document is not an object"]
-    found = [] if document.get("schema") == SCHEMA else [f"schema is {document.get('schema')!r}, not {SCHEMA!r}"]
-    found += _missing(document, "the document", _FIELDS)
+    found = list(schema_violations(document, SCHEMA))
+    found += object_violations(document, "the document", _FIELDS)
     seeds, runs = document.get("seeds"), document.get("runs")
     if not isinstance(seeds, list) or not isinstance(runs, list):
         return found
@@ -113,17 +114,8 @@ def violations(document: object) -> list[str]:
     return found
 
 
-def _missing(item: object, where: str, expected: dict[str, type]) -> Iterator[str]:
-    if not isinstance(item, dict):
-        yield f"{where} is not an object"
-        return
-    for name, wanted in expected.items():
-        if type(item.get(name)) is not wanted:
-            yield f"{where}.{name} is missing or not {wanted.__name__}"
-
-
 def _run_violations(run: object, where: str, seeds: int) -> Iterator[str]:
-    broken = list(_missing(run, where, _RUN_FIELDS))
+    broken = list(object_violations(run, where, _RUN_FIELDS))
     yield from broken
     if broken or not isinstance(run, dict):
         return

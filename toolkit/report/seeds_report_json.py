@@ -1,17 +1,16 @@
 """``report.json`` of a comparison over seeds: what a report draws and says beyond seeds.json."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from toolkit.geometry import Array
+from toolkit.report.contract import field_violations, schema_violations
 from toolkit.report.metrics_json import Json
 from toolkit.report.report_json import SCHEMA, numbers
 from toolkit.report.seeds_md import headline
 from toolkit.report.seeds_table import consistency_lines, status_lines
 from toolkit.sweep.over_seeds import Group, OverSeeds
 
-_FIELDS: dict[str, type] = {"t_s": list, "runs": list, "words": dict}
+_FIELDS: dict[str, tuple[type, ...]] = {"t_s": (list,), "runs": (list,), "words": (dict,)}
 
 
 def build(over: OverSeeds) -> Json:
@@ -53,11 +52,4 @@ def violations(document: object) -> list[str]:
     """Return everything in which a parsed document breaks the contract; empty for a valid one."""
     if not isinstance(document, dict):
         return ["the document is not an object"]
-    found = [] if document.get("schema") == SCHEMA else [f"schema is {document.get('schema')!r}, not {SCHEMA!r}"]
-    return found + list(_missing(document))
-
-
-def _missing(document: Json) -> Iterator[str]:
-    for name, wanted in _FIELDS.items():
-        if type(document.get(name)) is not wanted:
-            yield f"{name} is missing or not {wanted.__name__}"
+    return [*schema_violations(document, SCHEMA), *field_violations(document, _FIELDS)]

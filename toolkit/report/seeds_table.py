@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator
 
-from toolkit.report.table import Table
+from toolkit.report.table import Table, number
 from toolkit.sweep.over_seeds import Group, OverSeeds
 
 _MISSING = "-"
-_WIDEST_NUMBER = 5
 # Key, name, what of it, unit, decimals; "mean" and "std" are over the seeds.
 _COLUMNS = (
     ("ate_none_m", "ATE", "none", "m", 3),
@@ -47,12 +46,6 @@ def _row(group: Group, over: OverSeeds, *, first: bool) -> tuple[str, ...]:
 def _mean(group: Group, key: str, decimals: int) -> str:
     spread = group.spread(key)
     return _MISSING if spread is None else number(spread.mean, decimals)
-
-
-def number(value: float, decimals: int) -> str:
-    """Return a number with at most so many decimals in five characters, in powers of ten where it needs more."""
-    texts = (f"{value:.{d}f}" for d in range(decimals, -1, -1))
-    return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")
 
 
 def status_lines(over: OverSeeds) -> Iterator[str]:

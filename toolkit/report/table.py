@@ -109,7 +109,11 @@ def _cell(row: Row, column: Column) -> str:
     if column.decimals == 0:
         return f"{value:.0f}"
     # An error of a few centimetres says nothing in two decimals.
-    most = column.decimals + (abs(value) < 0.1)
-    texts = (f"{value:.{decimals}f}" for decimals in range(most, -1, -1))
+    return number(value, column.decimals + (abs(value) < 0.1))
+
+
+def number(value: float, decimals: int) -> str:
+    """Return a number with at most so many decimals in five characters, in powers of ten where it needs more."""
+    texts = (f"{value:.{d}f}" for d in range(decimals, -1, -1))
     # A diverged estimator may be light years away; its number must not tear the columns apart.
     return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")

@@ -1,0 +1,170 @@
+"""The page in a real browser: it sorts, switches off, takes a theme, fits its screen, and runs no name as code."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from toolkit.report.html import write_html
+
+pytest.importorskip("selenium.webdriver", reason="needs selenium, from the extra 'test'")
+
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+Page = Any  # conftest.py
+LAPTOP, WIDE, PHONE = (1280, 800), (1600, 900), (390, 844)
+HOSTILE = "</script><script>window.broken = 1</script><img src=x onerror='window.broken = 2'>"
+
+
+def metrics_of(run_directory: Path, key: str) -> list[float]:
+    """Return the values a metric has in the table's rows: one of two equal outputs counts once."""
+    runs = json.loads((run_directory / "metrics.json").read_text())["runs"]
+    shown = {run["estimator"]: run["metrics"][key] for run in runs}
+    return [value for value in shown.values() if value is not None]
+
+
+def test_a_click_on_a_header_sorts_and_a_second_one_turns_around(page: Page, single: Path, run_directory: Path) -> None:
+    page.open(single)
+    ascending = sorted(metrics_of(run_directory, "ate_se3_m"))
+    header = "th[data-key='ate_se3_m']"
+    for direction, values in (("ascending", ascending), ("descending", ascending[::-1])):
+        page.click(f"{header} button")
+        assert page.find(header).get_attribute("aria-sort") == direction
+        shown = page.column("ate_se3_m")
+        assert [float(value) for value in shown if value is not None] == values
+        assert shown[-1] is None  # what is missing stays last, whichever way
+    assert len(page.all("th[aria-sort='ascending'], th[aria-sort='descending']")) == 1
+
+
+def test_the_keyboard_sorts_and_keeps_its_place(page: Page, single: Path, run_directory: Path) -> None:
+    page.open(single)
+    page.press("th[data-key='total_s'] button", Keys.ENTER)
+    values = [float(value) for value in page.column("total_s") if value is not None]
+    assert values == sorted(metrics_of(run_directory, "total_s"))
+    assert page.run("return document.activeElement.closest('th').dataset.key") == "total_s"
+    assert "total" in page.find("#announcer").get_attribute("textContent")
+
+
+def test_all_metrics_can_be_shown(page: Page, single: Path, run_directory: Path) -> None:
+    page.open(single)
+    assert not page.all("th[data-key='ate_sim3_m']")
+    page.click(".summary .quiet")
+    shown = [float(value) for value in page.column("ate_sim3_m") if value is not None]
+    assert shown == metrics_of(run_directory, "ate_sim3_m")
+
+
+def test_a_missing_value_is_a_dash_with_its_reason(page: Page, single: Path) -> None:
+    page.open(single)
+    cell = page.into_view("tbody tr:last-child td.missing")
+    assert cell.text.startswith("\N{EN DASH}")
+    assert "the run gave no trajectory" in cell.get_attribute("textContent")
+    ActionChains(page.driver).move_to_element(cell).perform()
+    assert "the run gave no trajectory" in page.find(".hint").text
+
+
+def test_trouble_is_told_in_words(page: Page, single: Path) -> None:
+    page.open(single)
+    told = page.find(".trouble").text
+    assert "astray diverged" in told
+    assert "broken failed" in told
+    assert [one.text for one in page.all(".status.bad")] == ["diverged", "failed"]
+
+
+@pytest.mark.parametrize("how", ["click", "keyboard"])
+def test_an_estimator_can_be_switched_off_everywhere(page: Page, single: Path, how: str) -> None:
+    page.open(single)
+    views = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart='Position error']")
+    before = [page.picture(view) for view in views]
+    chip = ".chip[data-line='steady both']"
+    if how == "click":
+        page.click(chip)
+        ActionChains(page.driver).move_by_offset(0, 200).perform()  # or it stays pointed at
+    else:
+        page.press(chip, Keys.SPACE)
+        page.run("document.activeElement.blur()")
+    assert page.find(chip).get_attribute("aria-pressed") == "false"
+    assert all(page.picture(view) != picture for view, picture in zip(views, before, strict=True))
+    assert "off" in page.find("tbody tr").get_attribute("class")
+    page.press(".chip.plain", Keys.ENTER)
+    page.run("document.activeElement.blur()")
+    assert [page.picture(view) for view in views] == before
+
+
+def test_the_theme_follows_the_system_and_the_button(page: Page, single: Path) -> None:
+    def background() -> tuple[int, ...]:
+        colour: str = page.run("return getComputedStyle(document.body).backgroundColor")
+        return tuple(int(part) for part in colour[4:-1].split(","))
+
+    page.open(single, scheme="dark")
+    assert max(background()) < 64
+    canvas = "canvas[data-view='top']"
+    dark = page.picture(canvas)
+    page.press("button.theme", Keys.ENTER)
+    assert min(background()) > 192
+    assert page.picture(canvas) != dark
+    page.driver.refresh()
+    assert min(background()) > 192  # it is remembered
+    page.open(single, scheme="light")
+    assert min(background()) > 192
+
+
+@pytest.mark.parametrize("size", [PHONE, (320, 568), LAPTOP])
+@pytest.mark.parametrize("which", ["single", "several"])
+def test_no_page_is_wider_than_its_screen(
+    page: Page, request: pytest.FixtureRequest, which: str, size: tuple[int, int]
+) -> None:
+    page.open(request.getfixturevalue(which), size)
+    page.click(".summary .quiet")  # every metric: the table scrolls in itself
+    assert page.run("return document.documentElement.scrollWidth") <= size[0]
+    assert page.run("return document.querySelector('.table-frame').scrollWidth") > 390
+
+
+def test_several_runs_stand_side_by_side_and_below_each_other_on_a_phone(page: Page, several: Path) -> None:
+    def edges() -> list[tuple[float, float]]:
+        boxes = page.run(
+            "return [...document.querySelectorAll('.cases > .case')].map((c) => c.getBoundingClientRect())"
+        )
+        return [(box["left"], box["top"]) for box in boxes]
+
+    page.open(several, WIDE)
+    left, right = edges()
+    assert right[0] > left[0]
+    assert right[1] == left[1]
+    assert len(page.all("tbody tr")) == 8
+    page.open(several, PHONE)
+    upper, lower = edges()
+    assert lower[0] == upper[0]
+    assert lower[1] > upper[1]
+
+
+def test_whatever_can_be_used_has_a_name_and_a_visible_focus(page: Page, single: Path) -> None:
+    page.open(single)
+    page.click(".summary .quiet")
+    nameless = page.run(
+        "return [...document.querySelectorAll('button, select, input, a, summary, [tabindex]')].filter((e) => !("
+        "e.getAttribute('aria-label') || e.textContent.trim() || e.closest('label')?.textContent.trim()))"
+        ".map((e) => e.outerHTML)"
+    )
+    assert nameless == []
+    reached = set()
+    page.run("document.activeElement.blur(); window.scrollTo(0, 0)")
+    for _ in range(90):
+        ActionChains(page.driver).send_keys(Keys.TAB).perform()
+        outline = page.run("return getComputedStyle(document.activeElement).outlineStyle")
+        kind = page.run("const e = document.activeElement; return e.dataset.view ?? e.type ?? e.tagName.toLowerCase()")
+        if kind == "body":
+            break
+        assert outline != "none", kind
+        reached.add(kind)
+    assert {"button", "select-one", "range", "top", "orbit", "summary"} <= reached
+
+
+def test_a_hostile_name_runs_nothing(page: Page, run_called: Callable[[str], Path], tmp_path: Path) -> None:
+    write_html([run_called(HOSTILE)], tmp_path / "page.html")
+    page.open(tmp_path / "page.html")
+    assert page.find("h1").text == HOSTILE
+    assert page.run("return window.broken === undefined")
+    assert page.run("return document.querySelectorAll('img').length") == 0

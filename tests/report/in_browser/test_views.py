@@ -1,0 +1,124 @@
+"""The views and charts of the page in a real browser: they move and zoom by pointer, by keyboard and by touch."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("selenium.webdriver", reason="needs selenium, from the extra 'test'")
+
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+
+Page = Any  # conftest.py
+PHONE = (390, 844)
+
+
+@pytest.mark.parametrize(
+    ("view", "key", "back"),
+    [
+        ("top", Keys.ARROW_LEFT, Keys.ARROW_RIGHT),
+        ("top", "+", "0"),
+        ("orbit", Keys.ARROW_LEFT, Keys.ARROW_RIGHT),
+        ("orbit", Keys.ARROW_UP, "0"),
+        ("orbit", "-", "0"),
+    ],
+)
+def test_views_answer_to_the_keyboard(page: Page, single: Path, view: str, key: str, back: str) -> None:
+    page.open(single)
+    canvas = f"canvas[data-view='{view}']"
+    before = page.picture(canvas)
+    page.press(canvas, key)
+    assert page.picture(canvas) != before
+    page.press(canvas, back)
+    assert page.picture(canvas) == before
+
+
+@pytest.mark.parametrize("view", ["top", "orbit"])
+def test_views_answer_to_the_pointer_and_the_buttons(page: Page, single: Path, view: str) -> None:
+    page.open(single)
+    canvas = f"canvas[data-view='{view}']"
+    before = page.picture(canvas)
+    ActionChains(page.driver).drag_and_drop_by_offset(page.into_view(canvas), 60, 10).perform()
+    dragged = page.picture(canvas)
+    assert dragged != before
+    page.run("arguments[0].closest('.view-frame').querySelector('button').click()", page.find(canvas))
+    assert page.picture(canvas) != dragged
+
+
+def test_the_wheel_zooms_only_where_it_is_asked_to(page: Page, single: Path) -> None:
+    page.open(single)
+    element = page.into_view("canvas[data-view='top']")
+    before = page.picture("canvas[data-view='top']")
+    wheel = (
+        "arguments[0].dispatchEvent(new WheelEvent('wheel', { deltaY: -200, ctrlKey: arguments[1], cancelable: true }))"
+    )
+    page.run(wheel, element, False)
+    assert page.picture("canvas[data-view='top']") == before
+    page.run(wheel, element, True)
+    assert page.picture("canvas[data-view='top']") != before
+
+
+def test_two_fingers_zoom(page: Page, single: Path) -> None:
+    page.open(single, PHONE)
+    canvas = page.into_view("canvas[data-view='top']")
+    before = page.picture("canvas[data-view='top']")
+    box = page.run("const b = arguments[0].getBoundingClientRect(); return [b.left + b.width / 2, b.top + 100]", canvas)
+
+    def touch(kind: str, *offsets: int) -> None:
+        points = [{"x": box[0] + dx, "y": box[1], "id": i} for i, dx in enumerate(offsets)]
+        page.driver.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", -20, 20)
+    for spread in range(25, 90, 10):
+        touch("touchMove", -spread, spread)
+    touch("touchEnd")
+    assert page.picture("canvas[data-view='top']") != before
+    assert page.run("return window.visualViewport.scale") == 1  # the view was zoomed, not the page
+
+
+def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
+    page.open(single)
+    figures = ("canvas[data-view='top']", "canvas[data-view='orbit']", "canvas[data-chart='Position error']")
+    before = [page.picture(figure) for figure in figures]
+    page.press(".scrubber input", *[Keys.PAGE_UP] * 3)
+    assert all(page.picture(figure) != picture for figure, picture in zip(figures, before, strict=True))
+    told = page.find(".readout").text
+    assert told.endswith(" m")
+    assert float(told.split(" s")[0]) > 0.0
+    assert page.find(".scrubber input").get_attribute("aria-valuetext") == told
+
+
+def test_pointing_at_a_chart_reads_every_line_there(page: Page, single: Path) -> None:
+    page.open(single)
+    ActionChains(page.driver).move_to_element(page.into_view("canvas[data-chart='Position error']")).perform()
+    page.settle()
+    told = page.find(".hint").text
+    assert all(name in told for name in ("steady", "astray", "late final"))
+    assert page.find(".readout").text != "0.0 s, 0 m"
+
+
+def test_errors_are_over_distance_or_time(page: Page, single: Path) -> None:
+    page.open(single)
+    chart = "canvas[data-chart='Position error']"
+    over_distance = page.picture(chart)
+    page.click(".segmented button:last-child")
+    assert page.find(".segmented button:last-child").get_attribute("aria-pressed") == "true"
+    assert page.picture(chart) != over_distance
+
+
+def test_landmarks_can_be_left_out(page: Page, single: Path) -> None:
+    page.open(single)
+    before = page.picture("canvas[data-view='top']")
+    page.run("const s = document.querySelector('select'); s.value = ''; s.dispatchEvent(new Event('change'))")
+    assert page.picture("canvas[data-view='top']") != before
+
+
+def test_a_view_can_fill_the_window_and_escape_leaves_it(page: Page, single: Path) -> None:
+    page.open(single, PHONE)
+    page.press(".view-card .quiet", Keys.ENTER)
+    assert page.run("return document.querySelector('.expanded').getBoundingClientRect().height") == PHONE[1]
+    ActionChains(page.driver).send_keys(Keys.ESCAPE).perform()
+    page.settle()
+    assert not page.all(".expanded")
+    assert page.run("return document.activeElement.textContent") == "Expand"
