@@ -1,8 +1,9 @@
 """The robust schedule of a batch solve: a convex loss to get near, a redescending one to settle, then the rest alone.
 
-The last solve takes the sightings that pass the filters' gate at the solution, and these at their full weight: a
-redescending loss weighs good sightings down as well, and what it returns is neither efficient nor does its
-curvature tell a covariance.
+The last solve takes the sightings that chance explains at the solution, and these at their full weight: a redescending
+loss weighs good sightings down as well, and what it returns is neither efficient nor does its curvature tell a
+covariance. The filters' gate would not do: to keep the 95 % that agree best with a solution is to choose the
+measurements by their agreement, a sixth of the squared error gone, and made a simulated drive 1.7 times less accurate.
 """
 
 from collections.abc import Iterator
@@ -10,10 +11,11 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from scipy.special import chdtri
 
 from filters.graph.landmarks import restricted
 from filters.graph.levenberg_marquardt import Solution, Stopping, solve
-from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
+from filters.kalman.gate import mahalanobis_squared
 from toolkit.geometry import Array
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
@@ -34,6 +36,8 @@ SCHEDULE = (
     Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-3, 60)),
 )
 _LAST = Stopping(1e-4, 60)
+# A sound sighting is farther from the right solution than this once in a thousand.
+FAR_SIGHTING = float(chdtri(3, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +63,7 @@ def solve_in_stages(
         values = solve(graph, _only_seen(values, frames), stage.stopping).values
         frames = _without_those_behind(frames, values, rig)
     frames = [
-        restricted(frame, distance_squared < STEREO_GATE)
+        restricted(frame, distance_squared < FAR_SIGHTING)
         for frame, distance_squared, _ in _residuals(frames, values, rig)
     ]
     graph = _with_sightings(motion, frames, StereoFactors(rig))
