@@ -1,0 +1,48 @@
+"""Where the decoupled filter becomes sure of a wrong pose, it says so, and no other rung goes with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.metrics import score_run
+from toolkit.simulation import FLIGHT, simulate
+from toolkit.start import start_from_measurements
+
+# A hand-held rig as they are: biases unknown before the start and drifting fast, few tracks that end soon.
+ROUGH = replace(
+    FLIGHT,
+    duration_s=20.0,
+    rig=replace(FLIGHT.rig, baseline_m=0.11),
+    camera=replace(FLIGHT.camera, rate_hz=10.0, max_tracks=30, loss_per_frame=0.1),
+    motion=replace(FLIGHT.motion, bias_sigma=np.repeat([0.05, 0.003], 3)),
+)
+CENTIMETRES = 0.05
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Return the flight started from its measurements, as a real recording is."""
+    blind = audit(replace(simulate(ROUGH, 0), prior=None)).sequence
+    return replace(blind, prior=start_from_measurements(blind))
+
+
+def test_the_decoupled_filter_that_ran_off_is_said_to_have_diverged(recording, run_estimator):
+    run = run_estimator("ekf", recording)
+    assert score_run(run, "causal", recording).values["ate_yaw_m"] > 1.0
+    assert run.status == "diverged"
+    assert "passed its own gate: it is sure of a wrong pose" in run.log[-1]
+
+
+@pytest.mark.parametrize(
+    ("name", "output"),
+    [
+        *[("msckf-fej", "causal"), ("msckf-slam", "causal"), ("fixed-lag", "causal"), ("smart", "causal")],
+        *[("isam2", "final"), ("batch", "final")],
+    ],
+)
+def test_the_others_stay_within_centimetres(name, output, recording, run_estimator):
+    run = run_estimator(name, recording)
+    assert run.status == "ok"
+    assert score_run(run, output, recording).values["ate_yaw_m"] < CENTIMETRES
