@@ -23,7 +23,7 @@ from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.sequence import Packet, StereoFrame
 
-# Sightings that passed the gate at the causal pass but strain it here are weighed down from the gate's own bound.
+# Sightings that have not slipped but strain the filters' gate are weighed down from the gate's own bound.
 HUBER_THRESHOLD = float(np.sqrt(STEREO_GATE))
 
 
