@@ -76,9 +76,9 @@ def correct_landmarks(
 
 
 def correct_landmarks_gated(
-    landmarks: LandmarkMap, uvs_px: Array, belief: Belief, rig: StereoRig, trusted: BoolArray
+    landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig, trusted: BoolArray
 ) -> LandmarkMap:
     """Correct the trusted (N,) landmarks whose sightings also pass the gate; leave the others as they are."""
-    corrected, nis, depth_m = correct_landmarks(landmarks, uvs_px, belief.T_world_imu, belief.cov[POSE, POSE], rig)
+    corrected, nis, depth_m = correct_landmarks(landmarks, uvs_px, T_world_imu, pose_cov, rig)
     accepted = trusted & (nis < STEREO_GATE) & (depth_m > 0.0)
     return landmarks.corrected(accepted, corrected.points, corrected.covs)

@@ -6,7 +6,7 @@ landmark, and the filter is too sure of itself: its covariance does not grow wit
 
 import numpy as np
 
-from filters.kalman.belief import Belief, initial_belief
+from filters.kalman.belief import POSE, initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
 from filters.kalman.diagnostics import Innovation
 from filters.kalman.landmarks import TrackedMap
@@ -25,11 +25,6 @@ class DecoupledEkf:
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._map = TrackedMap(setup.rig)
 
-    @property
-    def belief(self) -> Belief:
-        """Return what the filter believes of the IMU now."""
-        return self._belief
-
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
@@ -39,7 +34,8 @@ class DecoupledEkf:
         if len(seen):
             self._belief, accepted, nis = correct_pose(self._belief, seen, uvs_px, self._rig)
             innovation.add(nis, np.full(len(seen), 3), accepted)
-            seen = correct_landmarks_gated(seen, uvs_px, self._belief, self._rig, accepted)
+            pose, pose_cov = self._belief.T_world_imu, self._belief.cov[POSE, POSE]
+            seen = correct_landmarks_gated(seen, uvs_px, pose, pose_cov, self._rig, accepted)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **innovation.info())
 

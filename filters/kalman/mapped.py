@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from filters.kalman.correction import correct_landmarks
-from filters.kalman.gate import STEREO_GATE
+from filters.kalman.correction import correct_landmarks_gated
 from filters.kalman.landmarks import TrackedMap
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array
@@ -20,9 +19,8 @@ class MapAlong:
         """Correct the landmarks the frame shows again and start its new ones, seen from a pose (4, 4)."""
         seen, uvs_px = self._map.seen_again(frame)
         if len(seen):
-            corrected, nis, depth_m = correct_landmarks(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig)
-            accepted = (nis < STEREO_GATE) & (depth_m > 0.0)
-            seen = seen.corrected(accepted, corrected.points, corrected.covs)
+            everyone = np.ones(len(seen), dtype=bool)
+            seen = correct_landmarks_gated(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, everyone)
         self._map.keep(seen, frame, T_world_imu)
 
     def landmarks(self) -> Landmarks:
