@@ -114,6 +114,20 @@ def returning_tracks(sequence: Sequence) -> Plant:
     return Plant("returning-tracks", with_observations(sequence, rows), hidden.size)
 
 
+def doubled_disparity(sequence: Sequence) -> Plant:
+    """Detect only near points in frame 0, and double the disparity of each ever after."""
+    o = sequence.observations
+    disparities = o.uv_px[:, 0] - o.uv_px[:, 1]
+    near = [o.track_id[(o.frame == k) & (disparities > 10.0)] for k in (0, 1)]
+    detected = np.intersect1d(*near)
+    of_detected = np.isin(o.track_id, detected)
+    uv_px = o.uv_px.copy()
+    later = of_detected & (o.frame > 0)
+    uv_px[later, 1] -= disparities[later]
+    kept = of_detected | (o.frame > 0)
+    return Plant("doubled-disparity", with_observations(sequence, kept, uv_px=uv_px), detected.size)
+
+
 def mixed_axes(sequence: Sequence) -> Plant:
     return Plant("mixed-axes", turned(sequence, np.diag([1.0, -1.0, -1.0])), 1)
 
@@ -141,6 +155,7 @@ PLANTS: dict[str, Callable[[Sequence], Plant]] = {
     "no-disparity": no_disparity,
     "stale-frames": stale_frames,
     "returning-tracks": returning_tracks,
+    "doubled-disparity": doubled_disparity,
     "mixed-axes": mixed_axes,
     "extrinsic-translation": extrinsic_translation,
     "twist-lag": twist_lag,

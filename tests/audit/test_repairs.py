@@ -8,7 +8,7 @@ import pytest
 
 from toolkit.audit import Finding, audit
 from toolkit.geometry import Array, so3_exp
-from toolkit.sequence import Sequence
+from toolkit.sequence import Observations, Sequence
 
 Make = Callable[..., Sequence]
 PlantIn = Callable[[str, Sequence], Sequence]
@@ -90,6 +90,29 @@ def test_repeated_tracks_end_at_a_stale_frame_and_start_anew_after_it(clean_reco
     dropped = len(faulty.observations) - len(repaired)
     assert dropped > carried.size > 4
     assert len(set(zip(repaired.frame.tolist(), repaired.track_id.tolist(), strict=True))) == len(repaired)
+
+
+def test_doubled_disparities_are_what_they_were_and_no_other_sighting_is_touched(
+    clean_recording: Make, planted: PlantIn
+) -> None:
+    clean = clean_recording()
+    faulty = planted("doubled-disparity", clean).observations
+    repaired = audit(replace(clean, observations=faulty)).sequence.observations
+    o = clean.observations
+    pixel_of = dict(zip(zip(o.frame, o.track_id, strict=True), o.uv_px, strict=True))
+    expected = [pixel_of[seen] for seen in zip(repaired.frame, repaired.track_id, strict=True)]
+    np.testing.assert_allclose(repaired.uv_px, expected, rtol=0.0, atol=1e-9)
+    assert len(repaired) == len(faulty)
+
+
+def test_a_wall_that_comes_ever_nearer_is_not_taken_for_a_doubling(clean_recording: Make) -> None:
+    """Points at one depth that halves in every interval: the ratio is 2 for all of them, but does not stop."""
+    clean, tracks, frames = clean_recording(), 12, 4
+    frame, track_id = np.divmod(np.arange(tracks * frames), tracks)
+    disparity, left = 10.0 * 2.0**frame, 300.0 + 20.0 * track_id
+    uv_px = np.column_stack([left, left - disparity, np.full(left.size, 200.0)])
+    nearing = replace(clean, observations=Observations(frame, track_id, uv_px))
+    assert "doubled-disparity" not in {f.fault for f in audit(nearing).findings}
 
 
 def test_a_parked_vehicle_that_repeats_its_pixels_is_not_stale(clean_recording: Make) -> None:

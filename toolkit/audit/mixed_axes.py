@@ -100,5 +100,5 @@ FAULT = Fault(
     "mixed-axes",
     "motion samples and camera extrinsic in different axes",
     check,
-    after=("stale-frames", "no-disparity", "not-finite", "time-gap"),
+    after=("stale-frames", "doubled-disparity", "no-disparity", "not-finite", "time-gap"),
 )
