@@ -50,7 +50,7 @@ for rung in rungs:
 # some 600 sightings a frame, and the joint filters' cost grows with the cube of that; one track in ten is plenty.
 
 # %%
-MAX_FRAMES = {"0027": 150, "kitti00": 60}
+MAX_FRAMES = {"0027": 150, "kitti00": 40}
 
 
 def thinned(sequence: Sequence, one_in: int) -> Sequence:

@@ -117,7 +117,7 @@ print(f"{mine.status}: position error {scores.values['ate_se3_m']:.2f} m over {d
 # Beside the others, on the same packets. `own=` takes estimators that live in a notebook.
 
 # %%
-comparison = compare("drive", ["dead-reckoning", "ekf", "batch"], own={"two-view": build})
+comparison = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build})
 table(comparison, "ATE SE(3)", "RPE 100 m", "reproj held-out")
 
 # %%
@@ -125,8 +125,7 @@ figures(comparison)["errors_over_time"]
 
 # %% [markdown]
 # It uses each point for two frames only, and forgets it. Whatever the error of one step is, the next step starts from
-# it: this is dead reckoning still, with better steps. The filter and the smoother follow a point for as long as it is
-# seen.
+# it: this is dead reckoning still, with better steps. The filter follows a point for as long as it is seen.
 #
 # ## A file of its own
 #
@@ -168,7 +167,7 @@ print("two-view:", find("two-view").summary())
 # estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
-over = compare_over_seeds("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=60)
+over = compare_over_seeds("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=40)
 table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose", "NEES in band")
 
 # %%

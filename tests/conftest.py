@@ -1,10 +1,13 @@
 """What tests of several packages share: the way to the real recordings, and one line that runs an estimator."""
 
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from toolkit import runner
 from toolkit.estimate import Run
@@ -12,6 +15,29 @@ from toolkit.estimator import find
 from toolkit.sequence import Prior, Sequence
 
 PROJECT = Path(__file__).parents[1]
+
+# Where systems keep what is one user's or passing. Before it stands no part of a longer path or of an address.
+_OF_ONE_MACHINE = re.compile(
+    r"(?:file://|(?<![\w.:/~-]))/(?:home|Users|root|tmp|var|private|mnt|media)/[\w.~-]+|\b[A-Z]:\\+Users\\+"
+)
+
+
+# Half a minute and more each: a page's commands, a whole notebook.
+_LONGEST = {"test_everything_a_page_shows_runs_and_prints_the_tables_shown", "test_it_runs_where_no_real_recording_is"}
+# As long together, and on one worker, for its tests share their runs.
+_LONG_FILE = "test_figures_on_real_data.py"
+# What pytest-xdist hands to each of two workers before it shares out the rest as they ask for it.
+_FIRST_SHARE = 1 / 8
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest tests first in the shares of two workers, so that neither has one left when the other is done."""
+    longest = [item for item in items if getattr(item, "originalname", None) in _LONGEST]
+    together = [item for item in items if item.path.name == _LONG_FILE]
+    others = [item for item in items if item not in longest and item not in together]
+    one, other = longest[::2], together + longest[1::2]
+    rest = max(round(_FIRST_SHARE * len(items)) - len(one), 0)
+    items[:] = [*one, *others[:rest], *other, *others[rest:]]
 
 
 class Unheard:
@@ -33,6 +59,36 @@ def real() -> Callable[[str], Path]:
         return path
 
     return find_recording
+
+
+@pytest.fixture(scope="session")
+def machine_paths() -> Callable[[str], list[str]]:
+    """Return a function that finds, in a text for everybody, the paths that exist on one machine alone."""
+    return _OF_ONE_MACHINE.findall
+
+
+@contextmanager
+def _without_pixels() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda _figure, path, **_options: Path(path).touch())
+        yield
+
+
+@pytest.fixture(scope="session")
+def without_pixels() -> Callable[[], AbstractContextManager[None]]:
+    """Return a context in which every figure is drawn, but an empty file stands where its pixels would be.
+
+    Rendering takes longer than all else in a comparison of a few frames. Tests that are about something else do
+    without; the documentation's commands, the examples in help and a test of run directories render theirs.
+    """
+    return _without_pixels
+
+
+@pytest.fixture
+def unrendered() -> Iterator[None]:
+    """Run a test without the pixels of its figures."""
+    with _without_pixels():
+        yield
 
 
 @pytest.fixture(scope="session")

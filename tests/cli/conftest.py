@@ -1,14 +1,43 @@
 """The command line run in this process, in an empty directory."""
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+from toolkit.audit import Audit
 from toolkit.cli import main
+from toolkit.report import session
+from toolkit.sequence import Truth
+from toolkit.simulation import SCENARIOS
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
+
+
+_load_audited = session.load_audited
+
+
+@cache
+def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], seed: int) -> Audit:
+    """Return a simulated recording audited; a test that puts another audit in gets what that one says."""
+    return _load_audited(source, None, keep, seed)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def audited_once() -> Iterator[None]:
+    """Simulate and audit each built-in recording once for all tests: most of them run ten frames of the same one."""
+
+    def remembered(source: str, truth: Truth | None, keep: frozenset[str], seed: int) -> Audit:
+        if truth is None and source in SCENARIOS:
+            return _audited(session.audit, source, keep, seed)
+        return _load_audited(source, truth, keep, seed)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session, "load_audited", remembered)
+        yield
 
 
 @pytest.fixture
@@ -24,6 +53,20 @@ def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
             return left.code
 
     return run
+
+
+@pytest.fixture(scope="session")
+def _short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("short") / "run"
+    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10")
+    assert main([*words, "--out", str(directory)]) == 0
+    return directory
+
+
+@pytest.fixture
+def short_run(_short_run: Path, vislam: Vislam) -> Path:
+    """Return ``run`` in this test's directory: what a comparison of a few frames left, made once for all tests."""
+    return Path(shutil.copytree(_short_run, "run"))
 
 
 @pytest.fixture

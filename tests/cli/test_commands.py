@@ -12,6 +12,8 @@ from toolkit.report import session
 from toolkit.report.metrics_json import violations
 
 Vislam = Callable[..., int]
+pytestmark = pytest.mark.usefixtures("unrendered")
+
 DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10")
 
 

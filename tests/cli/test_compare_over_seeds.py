@@ -31,6 +31,7 @@ def test_a_run_directory_over_seeds(vislam: Vislam, capsys: pytest.CaptureFixtur
     assert all(name in Path("run/report.md").read_text() for name in figures)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_several_sequences_get_a_directory_each_and_replace_what_was_there(vislam: Vislam) -> None:
     for _ in range(2):
         assert vislam("compare", "drive", "drive-imu", *QUICK, "--seeds", "2", "--workers", "1", "--out", "all") == 0
@@ -60,6 +61,7 @@ def test_what_cannot_be_repeated_is_a_wrong_command_line(
     assert not Path("runs").exists()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_the_table_has_the_change_of_each_rung_once(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

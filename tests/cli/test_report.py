@@ -10,6 +10,9 @@ import pytest
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
+
+pytestmark = pytest.mark.usefixtures("unrendered")
+
 QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10")
 
 
@@ -20,14 +23,15 @@ def payload_of(page: Path) -> dict[str, Any]:
     return payload
 
 
-def test_the_page_goes_into_the_run_directory(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
-    assert vislam("compare", "drive", *QUICK, "--out", "run") == 0
+def test_the_page_goes_into_the_run_directory(
+    vislam: Vislam, short_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     capsys.readouterr()
     assert vislam("report", "run") == 0
     told = capsys.readouterr()
     assert told.out == "report: run/report.html\n"
     assert told.err == ""
-    (case,) = payload_of(Path("run/report.html"))["cases"]
+    (case,) = payload_of(short_run / "report.html")["cases"]
     assert case["title"] == "drive"
     assert vislam("compare", "drive", *QUICK, "--out", "run") == 0  # the run directory is still one of ours
 
@@ -41,11 +45,10 @@ def test_several_runs_make_one_page_beside_them(vislam: Vislam) -> None:
     assert Path("pages/one.html").is_file()
 
 
-def test_a_comparison_over_seeds_has_a_page(vislam: Vislam) -> None:
+def test_a_comparison_over_seeds_has_a_page(vislam: Vislam, short_run: Path) -> None:
     quick = ("--estimators", "ekf", "--max-frames", "10", "--seeds", "2", "--workers", "1")
     assert vislam("compare", "drive", *quick, "--out", "seeds") == 0
-    assert vislam("compare", "drive", *QUICK, "--out", "run") == 0
-    assert vislam("report", "seeds", "run", "--out", "both.html") == 0
+    assert vislam("report", "seeds", str(short_run), "--out", "both.html") == 0
     seeds, run = payload_of(Path("both.html"))["cases"]
     assert [seeds["kind"], run["kind"]] == ["seeds", "run"]
     told = json.loads(Path("seeds/seeds.json").read_text())
@@ -70,22 +73,22 @@ def test_trouble_is_told_in_one_line(
     vislam: Vislam,
     capsys: pytest.CaptureFixture[str],
     one_line: OneLine,
+    short_run: Path,
     words: tuple[str, ...],
     status: int,
     why: str,
 ) -> None:
     Path("empty").mkdir()
     Path("file").touch()
-    if "run" in words:
-        assert vislam("compare", "drive", *QUICK, "--out", "run") == 0
     capsys.readouterr()
     assert vislam("report", *words) == status
     assert why in one_line()
     assert list(Path("empty").iterdir()) == []
 
 
-def test_a_run_of_an_earlier_version_says_how_to_repeat_it(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
-    assert vislam("compare", "drive", *QUICK, "--out", "run") == 0
-    Path("run/report.json").unlink()
-    assert vislam("report", "run") == 3
+def test_a_run_of_an_earlier_version_says_how_to_repeat_it(
+    vislam: Vislam, short_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (short_run / "report.json").unlink()
+    assert vislam("report", str(short_run)) == 3
     assert "repeat it: vislam compare drive" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from toolkit.report import metrics_json, report_json
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
+WithoutPixels = Callable[[], AbstractContextManager[None]]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20")
 EVO = {
     "tum": evo.read_tum_trajectory_file,
@@ -24,11 +26,15 @@ EVO = {
 }
 
 
+pytestmark = pytest.mark.usefixtures("unrendered")
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory: pytest.TempPathFactory, without_pixels: WithoutPixels) -> Path:
     """The run directory of two estimators on the first frames of a drive, and its exports beside it; not to change."""
     directory = tmp_path_factory.mktemp("exports") / "run"
-    assert main([*QUICK, "--out", str(directory)]) == 0
+    with without_pixels():
+        assert main([*QUICK, "--out", str(directory)]) == 0
     for name in FORMATS:
         words = ("--estimator", "ekf", "--format", name, "--out", str(directory.parent / f"ekf.{name}"))
         assert main(["export", str(directory), *words]) == 0
@@ -36,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def again(run: Path) -> Path:
+def again(run: Path, without_pixels: WithoutPixels) -> Path:
     """The run directory of the same comparison with every export as another system, and one that flew off."""
     rows = [line.split() for line in (run.parent / "ekf.tum").read_text().splitlines() if not line.startswith("#")]
     astray = "".join(" ".join([t, str(i * i), *rest]) + "\n" for i, (t, _, *rest) in enumerate(rows))
@@ -44,7 +50,8 @@ def again(run: Path) -> Path:
     files = {**{f"by {name}": f"ekf.{name}" for name in FORMATS}, "astray": "astray.tum"}
     words = [word for name, file in files.items() for word in ("--trajectory", f"{name}={run.parent / file}")]
     # What another system made of it is not judged as a run of ours is: the exit status speaks of ours alone.
-    assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
+    with without_pixels():
+        assert main([*QUICK, *words, "--out", str(run.parent / "again")]) == 0
     return run.parent / "again"
 
 

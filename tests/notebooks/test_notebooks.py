@@ -1,9 +1,11 @@
 """The notebooks: .py and .ipynb are one notebook, it runs on built-in data alone, and what is kept is small."""
 
 import importlib.util
+import json
 import os
 import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -52,10 +54,33 @@ def test_what_is_kept_was_executed_without_an_error_and_is_small(source: Path) -
 
 
 @each
-def test_no_path_of_one_machine_is_kept(source: Path) -> None:
+def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[str], list[str]]) -> None:
     text = source.with_suffix(".ipynb").read_text(encoding="utf-8")
+    assert machine_paths(text) == []
     places = {Path.home(), Path(tempfile.gettempdir()), ROOT} - {Path("/")}  # the home of a user who has none
     assert not [place for place in places if f"{place}{os.sep}" in text]
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        'read "/home/somebody/drive.npz"',
+        "<module '/Users/somebody/my filters.py'>",
+        "file:///home/somebody/figure.png",
+        "(/tmp/ipykernel_123/456.py:1)",
+        r"C:\Users\somebody\drive.npz",
+        json.dumps(r"C:\Users\somebody"),
+    ],
+)
+def test_the_path_of_another_machine_is_recognised(said: str, machine_paths: Callable[[str], list[str]]) -> None:
+    assert len(machine_paths(f"text {said} text")) == 1
+
+
+@pytest.mark.parametrize("said", ["https://example.org/home/page.html", "runs/tmp/figure.png", "and/or", "../home/x"])
+def test_an_address_or_a_path_inside_the_project_is_no_machines(
+    said: str, machine_paths: Callable[[str], list[str]]
+) -> None:
+    assert machine_paths(f"text {said} text") == []
 
 
 @pytest.mark.parametrize("page", [*SOURCES, NOTEBOOKS / "README.md"], ids=lambda page: page.name)

@@ -1,6 +1,7 @@
 """The two commands together, on short simulations: what ``vislam baseline`` writes, ``vislam check`` judges."""
 
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,20 +9,11 @@ import numpy as np
 import pytest
 
 from toolkit.cli import main
+from toolkit.cli.baseline import command_to_keep
 from toolkit.regression.releases import installed
 
 Vislam = Callable[..., int]
-MAKE = (
-    "baseline",
-    "drive:1",
-    "data-copy:4",
-    "--estimators",
-    "dead-reckoning,ekf",
-    "--seeds",
-    "5",
-    "--out",
-    "base.json",
-)
+MAKE = ("baseline", "drive:1", "data-copy:4", "--estimators", "dead-reckoning,ekf", "--seeds", "5")
 PROJECT = Path(__file__).parents[2]
 
 
@@ -34,7 +26,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> str:
         patch.setenv("VISLAM_DATA", str(folder / "root"))
         (folder / "root").mkdir()
         (folder / "root/data-copy").symlink_to(PROJECT / "data/drive_small")
-        assert main(MAKE) == 0
+        assert main([*MAKE, "--out", str(folder / "base.json")]) == 0
     return (folder / "base.json").read_text()
 
 
@@ -64,6 +56,16 @@ def changed(change: Callable[[dict], object]) -> None:
 
 
 CHECK = ("check", "--baseline", "base.json", "--skip-speed")
+
+
+def test_a_baseline_says_by_which_command_it_was_made_but_not_in_which_folder(made: str) -> None:
+    assert json.loads(made)["made_by"]["command"] == f"vislam {shlex.join(MAKE)} --out base.json"
+
+
+@pytest.mark.parametrize("given", [("--out", "some/folder/new.json"), ("--out=/some/folder/new.json",)])
+def test_no_folder_is_kept_however_the_output_is_given(given: tuple[str, ...]) -> None:
+    kept = command_to_keep(["vislam", "baseline", "data/drive_small", *given, "--seeds", "5"])
+    assert kept.replace("--out=", "--out ") == "vislam baseline data/drive_small --out new.json --seeds 5"
 
 
 def test_the_same_code_passes_bit_for_bit(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:

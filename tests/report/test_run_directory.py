@@ -11,6 +11,9 @@ from toolkit.report.comparison import Comparison
 from toolkit.report.metrics_json import violations
 from toolkit.report.run_directory import check_run_directory, write_run
 
+# Where it does not matter what is in a figure's file.
+unrendered = pytest.mark.usefixtures("unrendered")
+
 
 def write(comparison: Comparison, target: Path) -> None:
     write_run(comparison, target, command="vislam compare", seed=0)
@@ -31,6 +34,7 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert all(f"(figures/{name}.png)" in report for name in figures)
 
 
+@unrendered
 def test_the_manifest_says_how_to_repeat_the_run(comparison: Comparison, tmp_path: Path) -> None:
     write(comparison, tmp_path / "run")
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
@@ -53,6 +57,7 @@ def test_a_failure_while_writing_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@unrendered
 def test_a_failure_while_writing_keeps_the_earlier_run(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -69,6 +74,7 @@ def test_a_failure_while_writing_keeps_the_earlier_run(
     assert (tmp_path / "run" / "manifest.json").read_bytes() == before
 
 
+@unrendered
 def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -88,6 +94,7 @@ def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
     assert (target / "metrics.json").is_file()
 
 
+@unrendered
 def test_an_earlier_run_is_replaced_as_a_whole(comparison: Comparison, tmp_path: Path) -> None:
     write(comparison, tmp_path / "run")
     (tmp_path / "run" / "left_over.txt").write_text("from the last time")
@@ -96,6 +103,7 @@ def test_an_earlier_run_is_replaced_as_a_whole(comparison: Comparison, tmp_path:
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+@unrendered
 def test_an_empty_directory_is_used(comparison: Comparison, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     write(comparison, tmp_path / "run")

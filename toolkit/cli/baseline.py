@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,13 +86,26 @@ def command(options: argparse.Namespace) -> int:
     out = options.out or Path(f"baseline_{label()}.json")
     check_writable(out)
     workers = options.workers or usable_cpus()
-    made = new_baseline(
-        cases, workers, made_here(shlex.join(options.command_line)), lambda told: progress_on(sys.stderr, told)
-    )
+    made_by = made_here(command_to_keep(options.command_line))
+    made = new_baseline(cases, workers, made_by, lambda told: progress_on(sys.stderr, told))
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join([*ends, f"baseline: {out}"]))
     return 1 if ends else 0
+
+
+def command_to_keep(words: list[str]) -> str:
+    """Return the command line with the output's name alone: a baseline is shared, and its folder is of one machine."""
+    kept = []
+    for before, word in pairwise(["", *words]):
+        option, _, file = word.partition("=")
+        if before == "--out":
+            kept.append(Path(word).name)
+        elif option == "--out" and file:
+            kept.append(f"--out={Path(file).name}")
+        else:
+            kept.append(word)
+    return shlex.join(kept)
 
 
 def _cases(options: argparse.Namespace) -> list[Case]:
