@@ -3,7 +3,8 @@
 What it approximates: a track says all it knows about the poses that saw it, at every iteration anew, and its landmark
 is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
 marginalised with it as they were linearised then; one that lives on starts anew, so no landmark is remembered beyond
-the window. Its causal answer is the newest state, its final answer each state as it left the window.
+the window. Its causal answer is the newest state, its final answer each state as it left the window, with the
+covariance the window had for it.
 """
 
 from collections.abc import Iterable
@@ -17,7 +18,8 @@ from filters.graph.marginals import in_estimate_order
 from filters.graph.motion import motion_graph
 from filters.graph.slips import bound_to_its_map, slipped
 from filters.graph.structureless import Sightings
-from filters.graph.window import Prior, Window, solved, without_oldest
+from filters.graph.window import Prior, Window
+from filters.graph.window_solver import Solution, solved, without_oldest
 from filters.graph.window_tracks import Tracked
 from filters.kalman.belief import initial_belief
 from filters.kalman.prediction import predicted, predictor
@@ -45,6 +47,7 @@ class Smart:
         self._motion, self._predictor = motion_graph(setup), predictor(setup)
         self._belief = initial_belief(setup.prior, setup.motion_kind)
         self._tracked = _nothing()
+        self._solution = Solution(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
         self._log: list[str] = []
@@ -53,20 +56,21 @@ class Smart:
         """Take in one packet and say where the IMU is."""
         tracked = self._grown(packet)
         try:
-            window, cov = solved(tracked.window, self._rig)
+            self._solution = solved(tracked.window, self._rig)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
+            self._complete_all()
             tracked = self._begun(packet)
-            window, cov = solved(tracked.window, self._rig)
-        self._tracked = replace(tracked, window=window)
-        self._read(packet, cov)
+            self._solution = solved(tracked.window, self._rig)
+        self._tracked = replace(tracked, window=self._solution.window)
+        self._read(packet)
         self._shorten(packet)
         return self._states[-1]
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
-        states = [replace(state, cov=None) for state in self._states]
-        return Finished(Trajectory.of(states), Landmarks.of(self._points), log=tuple(self._log))
+        self._complete_all()
+        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
 
     def _grown(self, packet: Packet) -> Tracked:
         """Return the window with the packet's state, predicted, and its sightings."""
@@ -94,21 +98,35 @@ class Smart:
         longer = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
         return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
 
-    def _read(self, packet: Packet, cov: Array) -> None:
+    def _read(self, packet: Packet) -> None:
         """Take over every state and landmark of the window; drop the landmarks that fell behind a camera."""
         self._tracked, behind = self._tracked.in_front(self._rig)
         self._log += [f"frame {packet.index}: landmark {i} fell behind a camera and was dropped" for i in behind]
         window, first = self._tracked.window, packet.index + 1 - len(self._tracked.window.keys)
         stamps_ns = [s.t_ns for s in self._states[first:]] + [packet.frame.t_ns]
-        read = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
-        self._states[first:] = [*read[:-1], replace(read[-1], cov=in_estimate_order(cov, read[-1].T_world_imu[:3, :3]))]
+        self._states[first:] = [self._motion.read(window.values, first + i, t_ns) for i, t_ns in enumerate(stamps_ns)]
+        self._complete([len(window.keys) - 1])
         self._points |= self._tracked.points_by_id()
         self._belief = self._belief.at(self._states[-1])
 
+    def _complete(self, places: Iterable[int]) -> None:
+        """Give states of the window, by their places in it, the covariance they have there."""
+        first = len(self._states) - len(self._solution.window.keys)
+        for i in places:
+            state = self._states[first + i]
+            cov = in_estimate_order(self._solution.cov(i), state.T_world_imu[:3, :3])
+            self._states[first + i] = replace(state, cov=cov)
+
+    def _complete_all(self) -> None:
+        self._complete(range(len(self._solution.window.keys)))
+
     def _shorten(self, packet: Packet) -> None:
-        oldest_ns = packet.frame.t_ns - self._lag_ns
-        while self._states[packet.index + 1 - len(self._tracked.window.keys)].t_ns < oldest_ns:
-            window, _ = without_oldest(self._tracked.window, self._rig)
+        """Let the states go that are older than the lag, all at once."""
+        oldest_ns, in_window = packet.frame.t_ns - self._lag_ns, len(self._tracked.window.keys)
+        leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
+        if leaving:
+            self._complete(range(leaving))
+            window = without_oldest(self._tracked.window, leaving, self._rig)
             self._tracked = replace(self._tracked, window=window).compacted()
 
 

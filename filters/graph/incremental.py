@@ -13,12 +13,16 @@ import numpy as np
 
 from filters.graph.held_linear import Held, contained, held_of, renewed
 from filters.graph.indeterminate import variable_named, weak_hold
+from filters.graph.resting import Resting
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 
 # The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
 # states left out of the order make the tree ever denser.
-ORDERED_FRAMES = 100
+RECENT_FRAMES = 100
+# What none of so many frames concerns is linearised anew in the end only: a heading that turns by a hair moves the
+# whole past, and a frame would cost as much as the run is long.
+FLUID_FRAMES = 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
 # How far variables may stray from where they are linearised: rad, m/s, the biases' units; and for positions and
@@ -38,7 +42,8 @@ class IncrementalTree:
         self._bias_size, self._baseline_m = bias_size, baseline_m
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
-        self._recent: deque[list[int]] = deque(maxlen=ORDERED_FRAMES)
+        self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
+        self._resting = Resting(FLUID_FRAMES)
         self._slot_count = 0
         self._held: dict[int, Held] = {}
         self._sightings: dict[int, list[int]] = {}
@@ -51,6 +56,7 @@ class IncrementalTree:
         if self._factorization == "QR":
             self._return_to_cholesky(values)
         self._recent.append(state_keys)
+        self._resting.concerns(factors.keyVector())
         held = held_of(factors, lambda keys: self._first_values(keys, values))
         moved = renewed(list(self._held.items())[-WATCHED_STEPS:], self.read)
         return self._update(contained(factors, held), values, held, moved)
@@ -58,6 +64,7 @@ class IncrementalTree:
     def settle(self, most_rounds: int = 5) -> list[str]:
         """Renew the Python factors whose states have moved since, until none has; return what was recovered."""
         log = []
+        self._resting = Resting(FLUID_FRAMES)
         for _ in range(most_rounds):
             moved = renewed(self._held.items(), self.read)
             log += self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, moved)
@@ -126,7 +133,7 @@ class IncrementalTree:
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
         self._slot_count += factors.size()
         try:
-            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors))
+            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._resting.keys)
         except RuntimeError as refusal:
             return self._recovered(refusal)
         return []

@@ -2,8 +2,8 @@
 
 GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
 state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
-then the landmarks, then the states in the order of time. The newest state is in the root, its marginal is nearly
-free, and the update is no dearer.
+then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
+root: what the window says in the end of the one and first of the other is nearly free, and the update is no dearer.
 
 A variable that makes the system indeterminate is held weakly where it is. A state that does so the first time is a
 matter of rounding in the normal equations, as in seconds of an accurate IMU alone: the window is then solved by QR,
@@ -28,34 +28,34 @@ RELINEARISE_BEYOND = 0.01
 class LagWindow:
     """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
 
-    def __init__(self, lag_s: float) -> None:
-        self._lag_s = lag_s
-        self._by_qr_from_s: float | None = None
+    def __init__(self, lag_ns: int) -> None:
+        self._lag_ns = lag_ns
+        self._by_qr_from_ns: int | None = None
         self._isam = self._empty_tree()
-        self._state_stamps_s: dict[int, float] = {}
-        self._landmark_stamps_s: dict[int, float] = {}
+        self._state_stamps_ns: dict[int, int] = {}
+        self._landmark_stamps_ns: dict[int, int] = {}
 
-    def add(self, grown: Grown, t_s: float) -> list[str]:
+    def add(self, grown: Grown, t_ns: int) -> list[str]:
         """Take in what a packet at a time adds, and solve; return what had to be recovered, a line each.
 
         Raises EstimatorError where the system stays indeterminate whatever is held.
         """
-        self._state_stamps_s |= dict.fromkeys(grown.state_keys, t_s)
-        self._landmark_stamps_s |= dict.fromkeys(map(L, grown.landmark_ids), t_s)
+        self._state_stamps_ns |= dict.fromkeys(grown.state_keys, t_ns)
+        self._landmark_stamps_ns |= dict.fromkeys(map(L, grown.landmark_ids), t_ns)
         factors, values = grown.factors, grown.values
-        if self._by_qr_from_s is not None and grown.landmark_ids and t_s > self._by_qr_from_s + self._lag_s:
-            self._by_qr_from_s = None
+        if self._by_qr_from_ns is not None and grown.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
+            self._by_qr_from_ns = None
             factors, values = self._emptied(factors, values)
         log: list[str] = []
         for _ in range(MOST_RECOVERIES):
             try:
-                self._update(factors, values, t_s - self._lag_s)
+                self._update(factors, values, t_ns - self._lag_ns)
             except RuntimeError as refusal:
                 # What was new is in the tree by now, but the tree is not to be used any more.
                 key, name = variable_named(refusal), gtsam.Symbol(variable_named(refusal)).string()
-                rounding = gtsam.Symbol(key).chr() != gtsam.Symbol(L(0)).chr() and self._by_qr_from_s is None
+                rounding = gtsam.Symbol(key).chr() != gtsam.Symbol(L(0)).chr() and self._by_qr_from_ns is None
                 if rounding:
-                    self._by_qr_from_s = t_s
+                    self._by_qr_from_ns = t_ns
                     log.append(f"{name} was indeterminate to rounding: solved by QR for some frames")
                 factors, values = self._emptied(gtsam.NonlinearFactorGraph(), gtsam.Values())
                 if not rounding:
@@ -73,20 +73,20 @@ class LagWindow:
         """Return the covariance of one state, in the order and on the side of an Estimate."""
         return state_cov(self._isam, keys, R_world_imu)
 
-    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, oldest_s: float) -> None:
-        old_states = [key for key, t_s in self._state_stamps_s.items() if t_s < oldest_s]
-        old_landmarks = [key for key, t_s in self._landmark_stamps_s.items() if t_s < oldest_s]
+    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, oldest_ns: int) -> None:
+        old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < oldest_ns]
+        old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < oldest_ns]
         # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it. The
         # states are at every step: CCOLAMD takes no place beyond the number of variables it orders.
-        moved = [*(self._landmark_stamps_s if old_states else old_landmarks), *self._state_stamps_s]
+        moved = [*(self._landmark_stamps_ns if old_states else old_landmarks), *self._state_stamps_ns]
         known = [key for key in moved if self._isam.valueExists(key)]
-        self._isam.update(factors, values, [], self._order(oldest_s), gtsam.KeyList(), _key_list(known))
+        self._isam.update(factors, values, [], self._order(oldest_ns), gtsam.KeyList(), _key_list(known))
         leaving = old_landmarks + old_states
         if leaving:
             self._isam.marginalizeLeaves(_key_list(leaving))
-        for stamps_s in (self._state_stamps_s, self._landmark_stamps_s):
-            for key in stamps_s.keys() & leaving:
-                del stamps_s[key]
+        for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns):
+            for key in stamps_ns.keys() & leaving:
+                del stamps_ns[key]
 
     def _emptied(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
@@ -103,25 +103,30 @@ class LagWindow:
         params.setRelinearizeThreshold(RELINEARISE_BEYOND)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True
-        params.setFactorization("CHOLESKY" if self._by_qr_from_s is None else "QR")
+        params.setFactorization("CHOLESKY" if self._by_qr_from_ns is None else "QR")
         return gtsam.ISAM2(params)
 
-    def _order(self, oldest_s: float) -> gtsam.KeyGroupMap:
+    def _order(self, oldest_ns: int) -> gtsam.KeyGroupMap:
         """Return the place of every variable in the elimination; those to leave have none, which is the first.
 
         Places must be consecutive: CCOLAMD, unchecked, wants fewer of them than variables.
         """
-        landmarks = [key for key, t_s in self._landmark_stamps_s.items() if t_s >= oldest_s]
-        states = [(key, t_s) for key, t_s in self._state_stamps_s.items() if t_s >= oldest_s]
-        some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_s) + len(self._state_stamps_s)
+        landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns >= oldest_ns]
+        states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= oldest_ns]
+        some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_ns) + len(self._state_stamps_ns)
         groups, place = gtsam.KeyGroupMap(), int(some_leave)
         for key in landmarks:
             groups.insert2(key, place)
         place += bool(landmarks)
-        place_of = {t_s: place + i for i, t_s in enumerate(dict.fromkeys(t_s for _, t_s in states))}
-        for key, t_s in states:
-            groups.insert2(key, place_of[t_s])
+        stamps_ns = _oldest_beside_newest(list(dict.fromkeys(t_ns for _, t_ns in states)))
+        place_of = {t_ns: place + i for i, t_ns in enumerate(stamps_ns)}
+        for key, t_ns in states:
+            groups.insert2(key, place_of[t_ns])
         return groups
+
+
+def _oldest_beside_newest(stamps_ns: list[int]) -> list[int]:
+    return [*stamps_ns[1:-1], *stamps_ns[:1], *stamps_ns[1:][-1:]]
 
 
 def _key_list(keys: Iterable[int]) -> gtsam.KeyList:

@@ -1,24 +1,19 @@
-"""A window of states held by motion factors and a linear prior, with structureless vision: solve it, shorten it.
+"""A window of states held by motion factors and a linear prior, with structureless vision, as normal equations.
 
-Everything is dense: a window has a few hundred unknowns. What leaves is marginalised by a Schur complement, with the
-whole of every track it saw, so that each sighting counts once (Dong-Si & Mourikis 2011, "Motion tracking with
-fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
+Everything is dense: a window has a few hundred unknowns.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cholesky
 
-from filters.graph import structureless
-from filters.graph.structureless import Sightings
-from toolkit.errors import EstimatorError
-from toolkit.geometry import Array, IntArray
+from filters.graph.structureless import Reduced, Sightings, Vision
+from toolkit.geometry import Array
 from toolkit.sequence import StereoRig
-
-MOST_ITERATIONS, RELATIVE_DECREASE, ABSOLUTE_DECREASE = 5, 1e-3, 1e-12
-_FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,145 +50,104 @@ class Window:
         return np.array([self.values.atPose3(keys[0]).matrix() for keys in self.keys])
 
     @property
+    def all_keys(self) -> list[int]:
+        """Return the keys of all states, in the order of the unknowns."""
+        return [key for keys in self.keys for key in keys]
+
+    @property
     def size(self) -> int:
         """Return the unknowns of one state."""
-        return int(sum(self.values.dims()[key] for key in self.keys[0]))
+        return int(self.values.extract(list(self.keys[0])).dim())
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class System:
     """The normal equations (D, D), (D,) of a window and the elimination of its landmarks."""
 
     information: Array
     vector: Array
-    vision: structureless.Reduced
+    vision: Reduced
+
+    @cached_property
+    def root(self) -> Array:
+        """The lower Cholesky factor (D, D) of the information; raises LinAlgError where there is none."""
+        return _lower_factor(self.information)
+
+    def damped_root(self, damping: float) -> Array:
+        """Return the lower Cholesky factor with a share of the diagonal added; raises LinAlgError as ``root``."""
+        if damping == 0.0:
+            return self.root
+        damped = self.information.copy()
+        damped.flat[:: len(damped) + 1] *= 1.0 + damping
+        return _lower_factor(damped)
 
 
-def solved(window: Window, rig: StereoRig) -> tuple[Window, Array]:
-    """Return the window at its minimum, by Levenberg-Marquardt, and the covariance (d, d) of its newest state.
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """A window and what it costs where it is: half the squared errors, Huber's losses, the prior's."""
 
-    The covariance is in GTSAM's spaces and of the last linearisation, a step short of the minimum. Raises
-    EstimatorError where the error is not a number or the states are not determined.
-    """
-    error, damping = _error(window, rig), _FIRST_DAMPING
-    if not np.isfinite(error):
-        raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
-    system = _linearised(window, rig)
-    for _ in range(MOST_ITERATIONS):
-        moved, error_moved = _tried(window, system, damping, rig)
-        while not error_moved <= error and damping < _MOST_DAMPING:
-            damping *= 10.0
-            moved, error_moved = _tried(window, system, damping, rig)
-        if not error_moved <= error:
-            break
-        decrease, window, error = error - error_moved, moved, error_moved
-        if decrease <= RELATIVE_DECREASE * error + ABSOLUTE_DECREASE:
-            break
-        damping = max(damping / 10.0, _FIRST_DAMPING)
-        system = _linearised(window, rig)
-    return window, _newest_cov(system, window.size)
+    window: Window
+    motion: gtsam.GaussianFactorGraph
+    off_prior: Array
+    vision: Vision
 
+    @classmethod
+    def of(cls, window: Window, rig: StereoRig) -> "Evaluated":
+        """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
+        vision = Vision.at(window.poses, window.points, window.sightings, rig)
+        return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
 
-def without_oldest(window: Window, rig: StereoRig) -> tuple[Window, IntArray]:
-    """Marginalise the oldest state with every track it saw; return the shorter window and those tracks' rows (M,).
+    @cached_property
+    def error(self) -> float:
+        """What the window costs."""
+        prior, off = self.window.prior, self.off_prior
+        held = float(0.5 * off @ prior.information @ off - prior.vector @ off)
+        return held + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
 
-    The rows of the other points stay as they are.
-    """
-    spoken = np.unique(window.sightings.point[window.sightings.pose == 0])
-    told = replace(window, sightings=window.sightings.of_points(spoken))
-    graph = gtsam.NonlinearFactorGraph(window.motion[0])
-    if len(window.motion) > 1:
-        graph.push_back(window.motion[1])
-    system, d = _linearised(replace(told, motion=(graph,)), rig), window.size
-    factor = cho_factor(system.information[:d, :d])
-    across = system.information[d:, :d]
-    information = system.information[d:, d:] - across @ cho_solve(factor, across.T)
-    vector = system.vector[d:] - across @ cho_solve(factor, system.vector[:d])
-    values = gtsam.Values(window.values)
-    for key in window.keys[0]:
-        values.erase(key)
-    left = ~np.isin(window.sightings.point, spoken)
-    seen = window.sightings
-    kept = Sightings(seen.pose[left] - 1, seen.point[left], seen.uv_px[left])
-    prior = Prior(0.5 * (information + information.T), vector, values)
-    motion = (gtsam.NonlinearFactorGraph(), *window.motion[2:])
-    return Window(window.keys[1:], values, motion, prior, kept, window.points), spoken
+    def linearised(self) -> System:
+        """Return the normal equations."""
+        window, count, held = self.window, len(self.window.keys), len(self.off_prior)
+        d = window.size
+        information, vector = self._of_motion(count * d)
+        information[:held, :held] += window.prior.information
+        vector[:held] += window.prior.vector - window.prior.information @ self.off_prior
+        vision = self.vision.reduced()
+        information.reshape(count, d, count, d)[:, :6, :, :6] += vision.information.reshape(count, 6, count, 6)
+        vector.reshape(count, d)[:, :6] += vision.vector.reshape(count, 6)
+        return System(information, vector, vision)
+
+    def _of_motion(self, size: int) -> tuple[Array, Array]:
+        """Return the normal equations of the motion, which ties the first states of the window, or all."""
+        tied, ordering = set(self.motion.keyVector()), gtsam.Ordering()
+        for key in self.window.all_keys:
+            if key in tied:
+                ordering.push_back(key)
+        information, vector = np.zeros((0, 0)), np.zeros(0)
+        if tied:
+            # Symmetric, and in GTSAM's order of columns: its transpose is the same and in NumPy's.
+            augmented = self.motion.augmentedHessian(ordering).T
+            information, vector = augmented[:-1, :-1], augmented[-1, :-1]
+        rest = size - len(vector)
+        return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
 
 
-def _linearised(window: Window, rig: StereoRig) -> _System:
-    count, d = len(window.keys), window.size
-    information, vector = _of_motion(window)
-    held = len(window.prior.vector)
-    information[:held, :held] += window.prior.information
-    vector[:held] += window.prior.vector - window.prior.information @ _off_prior(window)
-    vision = structureless.reduced(window.poses, window.points, window.sightings, rig)
-    rows = (d * np.arange(count)[:, None] + np.arange(6)).ravel()
-    information[np.ix_(rows, rows)] += vision.information
-    vector[rows] += vision.vector
-    return _System(information, vector, vision)
-
-
-def _of_motion(window: Window) -> tuple[Array, Array]:
-    dims, flat = window.values.dims(), [key for keys in window.keys for key in keys]
-    starts = dict(zip(flat, np.cumsum([0, *(dims[key] for key in flat)]).tolist(), strict=False))
-    size = sum(dims[key] for key in flat)
-    information, vector = np.zeros((size, size)), np.zeros(size)
-    for graph in window.motion:
-        if graph.size() == 0:
-            continue
-        ordering = gtsam.Ordering()
-        involved = sorted(graph.keyVector(), key=starts.__getitem__)
-        for key in involved:
-            ordering.push_back(key)
-        block, part = graph.linearize(window.values).hessian(ordering)
-        rows = np.concatenate([starts[key] + np.arange(dims[key]) for key in involved])
-        information[np.ix_(rows, rows)] += block
-        vector[rows] += np.ravel(part)
-    return information, vector
+def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
+    whole = gtsam.NonlinearFactorGraph()
+    for graph in graphs:
+        whole.push_back(graph)
+    return whole
 
 
 def _off_prior(window: Window) -> Array:
     """Return how far (D,) the prior's states are from the values it is about."""
     about = window.prior.about
-    held = [key for keys in window.keys for key in keys if about.exists(key)]
+    held = [key for key in window.all_keys if about.exists(key)]
     if not held:
         return np.zeros(0)
     delta = about.localCoordinates(window.values.extract(held))
     return np.concatenate([delta.at(key) for key in held])
 
 
-def _error(window: Window, rig: StereoRig) -> float:
-    off, prior = _off_prior(window), window.prior
-    held = float(0.5 * off @ prior.information @ off - prior.vector @ off)
-    motion = sum(graph.error(window.values) for graph in window.motion)
-    return held + motion + structureless.loss(window.poses, window.points, window.sightings, rig)
-
-
-def _tried(window: Window, system: _System, damping: float, rig: StereoRig) -> tuple[Window, float]:
-    """Return the window one damped step on, and its error; infinite where the step cannot be computed."""
-    d = window.size
-    scale = damping * np.diagonal(system.information)
-    try:
-        step = cho_solve(cho_factor(system.information + np.diag(scale)), system.vector)
-    except (np.linalg.LinAlgError, ValueError):
-        return window, np.inf
-    delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
-    for keys in window.keys:
-        for key in keys:
-            delta.insert(key, step[start : start + dims[key]])
-            start += dims[key]
-    pose_steps = step.reshape(-1, d)[:, :6].ravel()
-    points = window.points + system.vision.point_steps(pose_steps)
-    moved = replace(window, values=window.values.retract(delta), points=points)
-    return moved, _error(moved, rig)
-
-
-def _newest_cov(system: _System, d: int) -> Array:
-    size = len(system.vector)
-    last = np.zeros((size, d))
-    last[size - d :] = np.eye(d)
-    try:
-        cov: Array = cho_solve(cho_factor(system.information), last)[size - d :]
-    except (np.linalg.LinAlgError, ValueError) as refusal:
-        raise EstimatorError(f"the window does not determine its newest state ({refusal})") from refusal
-    return 0.5 * (cov + cov.T)
+def _lower_factor(matrix: Array) -> Array:
+    # LAPACK takes columns where NumPy has rows: of a symmetric matrix the transpose is the same and need not be copied.
+    return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))

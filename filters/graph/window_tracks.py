@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from filters.graph.landmarks import restricted
-from filters.graph.structureless import Sightings
+from filters.graph.structureless import Sightings, seen_from
 from filters.graph.window import Window
 from filters.kalman.landmarks import LEAST_DISPARITY_PX
-from toolkit.geometry import Array, IntArray, se3_inverse, transform
+from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -51,9 +51,8 @@ class Tracked:
     def in_front(self, rig: StereoRig) -> tuple["Tracked", IntArray]:
         """Let the points go that are behind a camera that saw them; return the rest and the ids of those that went."""
         seen = self.window.sightings
-        T_cam_world = se3_inverse(self.window.poses[seen.pose] @ rig.T_imu_cam)
-        depth_m = transform(T_cam_world, self.window.points[seen.point])[:, 2]
-        behind = np.unique(seen.point[~(depth_m > 0.0)])
+        in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
+        behind = np.unique(seen.point[~in_front])
         if not behind.size:
             return self, self.track_ids[behind]
         left = seen.of_points(np.setdiff1d(seen.point, behind))

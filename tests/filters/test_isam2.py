@@ -1,21 +1,24 @@
 """iSAM2: the incremental answer is that of the whole problem, and the tree survives what would end GTSAM's."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
 
+from filters.graph import incremental
 from filters.graph.held_linear import MOVED, Held, contained, held_of, renewed
-from filters.graph.incremental import MOST_RECOVERIES, IncrementalTree
+from filters.graph.incremental import FLUID_FRAMES, MOST_RECOVERIES, IncrementalTree
 from filters.graph.levenberg_marquardt import Stopping, solve
+from filters.graph.resting import Resting
 from filters.isam2 import Isam2
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models import twist
 from toolkit.models.factors import B, L, V, X, twist_factor
-from toolkit.sequence import TwistMotion
+from toolkit.sequence import Sequence, TwistMotion
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
@@ -141,12 +144,48 @@ def test_without_vision_it_solves_by_qr_and_returns_to_cholesky_with_vision(run_
     assert sum("solved by QR" in line for line in run.log) == 1
 
 
+def test_what_none_of_the_last_frames_concerned_rests():
+    resting = Resting(frames=2)
+    for keys in ([X(0), L(0), L(1)], [X(1), L(1)], [X(2)]):
+        resting.concerns(keys)
+    assert list(resting.keys) == [L(0), X(0)]
+    for keys in ([X(3), L(2)], [X(4)], [X(5)]):
+        resting.concerns(keys)
+    assert list(resting.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
+
+
+def test_a_state_at_rest_is_linearised_where_it_was_until_the_end(monkeypatch):
+    """What a frame may linearise anew is bounded, however far the past moves; in the end all of it is.
+
+    With thresholds that any motion passes: what is not at rest is linearised anew in every frame.
+    """
+    for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "LANDMARK_THRESHOLD_BASELINES"):
+        monkeypatch.setattr(incremental, name, 1e-9)
+    sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
+    estimator, points = isam2_of(sequence), []
+    for packet in sequence.packets():
+        estimator.step(packet)
+        points.append(gtsam.Values(estimator._tree.isam.getLinearizationPoint()))
+    for k in range(1, len(points) - FLUID_FRAMES - 1):
+        linearised_at = [values.atPose3(X(k)).matrix() for values in points[k:]]
+        moved = [not np.array_equal(now, then) for then, now in pairwise(linearised_at)]
+        # The step to the next frame concerns it, too, and its last turn comes in the frame it goes to rest.
+        assert any(moved[: FLUID_FRAMES + 1])
+        assert not any(moved[FLUID_FRAMES + 1 :])
+    estimator.finish()
+    now = estimator._tree.isam.getLinearizationPoint()
+    assert not now.atPose3(X(1)).equals(points[-1].atPose3(X(1)), 1e-9)
+
+
+def isam2_of(sequence: Sequence) -> Isam2:
+    return Isam2(Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
+
+
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
 def test_its_latest_states_are_the_optimum_of_the_whole_problem(scenario):
     """Up to its thresholds: a state is off the optimum by a fraction of its standard deviation at most."""
-    sequence = simulate(replace(scenario, duration_s=3.0), 1)
-    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-    estimator, said = Isam2(setup), []
+    sequence = simulate(replace(scenario, duration_s=4.0), 1)
+    estimator, said = isam2_of(sequence), []
     for packet in sequence.packets():
         said.append(estimator.step(packet))
     final = estimator.finish().trajectory

@@ -7,8 +7,7 @@ import gtsam_unstable
 import numpy as np
 import pytest
 
-from filters.graph import structureless
-from filters.graph.structureless import Sightings
+from filters.graph.structureless import HUBER_THRESHOLD, Sightings, Vision
 from filters.smart import Smart
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
@@ -50,7 +49,7 @@ def ordering(*kinds_and_counts):
     return result
 
 
-def projection_factors(seen, huber=structureless.HUBER_THRESHOLD):
+def projection_factors(seen, huber=HUBER_THRESHOLD):
     graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, gtsam.noiseModel.mEstimator.Huber.Create(huber))
     for k in range(POSES):
         rows = seen.pose == k
@@ -66,7 +65,7 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
     information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
     n = 6 * POSES
     across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
-    reduced = structureless.reduced(poses, points, outlying, RIG)
+    reduced = Vision.at(poses, points, outlying, RIG).reduced()
     # Rounding, relative to the largest entry.
     scale = np.abs(reduced.information).max()
     np.testing.assert_allclose(
@@ -78,7 +77,7 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
 def test_its_loss_is_that_of_gtsam_projection_factors(scene):
     poses, points, seen = scene
     expected = projection_factors(seen).error(gtsam_values(poses, points))
-    assert structureless.loss(poses, points, seen, RIG) == pytest.approx(expected, rel=1e-9)
+    assert Vision.at(poses, points, seen, RIG).loss == pytest.approx(expected, rel=1e-9)
 
 
 def test_point_steps_complete_the_step_of_the_whole_system(scene):
@@ -87,7 +86,7 @@ def test_point_steps_complete_the_step_of_the_whole_system(scene):
     information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
     held = information + np.eye(len(information)) * np.repeat([1.0, 0.0], [6 * POSES, 3 * POINTS])
     step = np.linalg.solve(held, vector.ravel())
-    reduced = structureless.reduced(poses, points, seen, RIG)
+    reduced = Vision.at(poses, points, seen, RIG).reduced()
     np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
 
 
@@ -106,14 +105,14 @@ def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
             factor.add(gtsam.StereoPoint2(*exact[row]), X(int(seen.pose[row])), calibration)
         graph.add(factor)
     expected = graph.linearize(gtsam_values(poses, [])).hessian(ordering((X, POSES)))[0]
-    reduced = structureless.reduced(poses, points, replace(seen, uv_px=exact), rig)
+    reduced = Vision.at(poses, points, replace(seen, uv_px=exact), rig).reduced()
     # GTSAM triangulates linearly: the point is exact to rounding times the condition of that problem.
     np.testing.assert_allclose(reduced.information, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_global_position_and_rotation_gain_no_information(scene):
     poses, points, seen = scene
-    information = structureless.reduced(poses, points, seen, RIG).information
+    information = Vision.at(poses, points, seen, RIG).reduced().information
     rigid = np.concatenate([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
     assert np.abs(information @ rigid).max() < 1e-9 * np.abs(information).max()
 
@@ -123,9 +122,9 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     behind = points.copy()
     behind[0] = transform(RIG.T_imu_cam, np.array([0.0, 0.0, -4.0]))
     others = seen.of_points(np.arange(1, POINTS))
-    one, other = (structureless.reduced(poses, behind, s, RIG) for s in (seen, others))
+    one, other = (Vision.at(poses, behind, s, RIG).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
-    assert structureless.loss(poses, behind, seen, RIG) > structureless.loss(poses, behind, others, RIG)
+    assert Vision.at(poses, behind, seen, RIG).loss > Vision.at(poses, behind, others, RIG).loss
 
 
 def blacked_out(sequence):

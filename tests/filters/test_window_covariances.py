@@ -1,0 +1,170 @@
+"""The final covariance of a state is the one the window had for it when it was last in there."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters import smart
+from filters.fixed_lag import FixedLag
+from filters.graph.indeterminate import without_gaps
+from filters.graph.lag_window import LagWindow
+from filters.graph.marginals import state_cov
+from filters.graph.motion import motion_graph
+from filters.graph.structureless import Sightings
+from filters.graph.window_solver import Solution, without_oldest
+from filters.smart import Smart
+from toolkit.cutting import NS_PER_S
+from toolkit.errors import EstimatorError
+from toolkit.estimator import Setup
+from toolkit.sequence import Observations, Sequence
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+
+FEW_TRACKS = {"max_tracks": 25}
+SCENARIOS = [
+    replace(s, duration_s=d, camera=replace(s.camera, **FEW_TRACKS))
+    for s, d in ((DRIVE, 3.0), (DRIVE_IMU, 3.0), (FLIGHT, 1.5))
+]
+LAG_S = 0.5
+GAP = (12, 25)
+
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
+
+
+def setup_of(sequence: Sequence) -> Setup:
+    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+
+
+def with_gap(sequence: Sequence) -> Sequence:
+    """Return a recording that lacks more than a lag of frames: the whole window leaves at once."""
+    kept = np.setdiff1d(np.arange(sequence.frame_count), np.arange(*GAP))
+    seen = sequence.observations.select(np.isin(sequence.observations.frame, kept))
+    renumbered = Observations.sorted(np.searchsorted(kept, seen.frame), seen.track_id, seen.uv_px)
+    return replace(sequence, frames_t_ns=sequence.frames_t_ns[kept], observations=renumbered)
+
+
+def from_zero(sequence: Sequence) -> Sequence:
+    """Return a recording whose clock starts at zero: differences of its stamps in seconds are rounded."""
+    start_ns = sequence.frames_t_ns[0]
+    motion = replace(sequence.motion, t_ns=sequence.motion.t_ns - start_ns)
+    return replace(sequence, frames_t_ns=sequence.frames_t_ns - start_ns, motion=motion, truth=None)
+
+
+def run_through(estimator, sequence):
+    for packet in sequence.packets():
+        estimator.step(packet)
+    return estimator.finish().trajectory
+
+
+def assert_covs_agree(covs, expected, relative):
+    """Compare covariances (K, d, d) in units of the standard deviations: their entries span many orders."""
+    sigmas = np.sqrt(np.diagonal(expected, axis1=1, axis2=2))
+    scale = sigmas[:, :, None] * sigmas[:, None, :]
+    np.testing.assert_allclose(covs / scale, expected / scale, atol=relative)
+
+
+@every_scenario
+@pytest.mark.parametrize("changed", [lambda s: s, with_gap, from_zero], ids=["whole", "gap", "from-zero"])
+def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(scenario, changed, monkeypatch):
+    sequence = changed(simulate(scenario, 3))
+    motion, last = motion_graph(setup_of(sequence)), {}
+    add = LagWindow.add
+
+    def spied(window, grown, t_ns):
+        log, tree = add(window, grown, t_ns), window._isam
+        marginals = gtsam.Marginals(without_gaps(tree.getFactorsUnsafe()), tree.getLinearizationPoint())
+        for k, stamp_ns in enumerate(sequence.frames_t_ns.tolist()):
+            if t_ns - round(LAG_S * NS_PER_S) <= stamp_ns <= t_ns:
+                R_world_imu = window.values().atPose3(motion.keys(k)[0]).rotation().matrix()
+                last[k] = state_cov(marginals, motion.keys(k), R_world_imu)
+        return log
+
+    monkeypatch.setattr(LagWindow, "add", spied)
+    final = run_through(FixedLag(setup_of(sequence), LAG_S), sequence)
+    # Both invert the same normal equations, whose rounding grows with their condition.
+    assert_covs_agree(final.cov, np.array([last[k] for k in range(len(final))]), 1e-5)
+
+
+@every_scenario
+@pytest.mark.parametrize("changed", [lambda s: s, with_gap, from_zero], ids=["whole", "gap", "from-zero"])
+def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario, changed, monkeypatch):
+    sequence, last = changed(simulate(scenario, 3)), {}
+    taken_in, solved = [], smart.solved
+
+    def spied(window, rig):
+        solution = solved(window, rig)
+        taken_in.append(solution)
+        inverse = np.linalg.inv(solution.root @ solution.root.T)
+        count, d = len(window.keys), window.size
+        for i in range(count):
+            last[len(taken_in) - count + i] = inverse[i * d : (i + 1) * d, i * d : (i + 1) * d]
+        return solution
+
+    monkeypatch.setattr(smart, "solved", spied)
+    final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
+    expected = np.array([last[k] for k in range(len(final))])
+    if sequence.motion_kind == "imu":
+        to_body = np.tile(np.eye(15), (len(final), 1, 1))
+        to_body[:, 6:9, 6:9] = np.swapaxes(final.T_world_imu[:, :3, :3], 1, 2)
+        expected = to_body @ expected @ np.swapaxes(to_body, 1, 2)
+    assert_covs_agree(final.cov, expected, 1e-5)
+
+
+@every_scenario
+@pytest.mark.parametrize("kind", [FixedLag, Smart])
+def test_with_an_infinite_lag_they_are_the_marginals_of_the_whole_problem(scenario, kind, oracle):
+    """Errors a hundredth of those stated: all linearise at the truth, and no robust loss weighs anything down.
+
+    A hundredth of a sigma on a Jacobian is what is left, and the landmarks that the oracle does not leave out.
+    """
+    recording = oracle.recorded(scenario, 0.01)
+    final = run_through(kind(recording.setup, 10.0 * recording.sequence.duration_s), recording.sequence)
+    whole = oracle.batch(recording, recording.track_ids)
+    assert_covs_agree(final.cov, np.array([whole.state(k)[1] for k in range(len(final))]), 0.02)
+
+
+def test_states_that_leave_together_leave_as_one_by_one(monkeypatch):
+    sequence, windows = simulate(SCENARIOS[2], 3), []
+    monkeypatch.setattr(smart, "without_oldest", lambda *a: windows.append(a) or without_oldest(*a))
+    run_through(Smart(setup_of(sequence), LAG_S), sequence)
+    window, _, rig = windows[-1]
+    together, one_by_one = without_oldest(window, 3, rig), window
+    for _ in range(3):
+        one_by_one = without_oldest(one_by_one, 1, rig)
+    assert together.keys == one_by_one.keys
+    scale = np.abs(together.prior.information).max()
+    np.testing.assert_allclose(together.prior.information, one_by_one.prior.information, atol=1e-9 * scale)
+    scale = np.abs(together.prior.vector).max()
+    np.testing.assert_allclose(together.prior.vector, one_by_one.prior.vector, atol=1e-6 * scale)
+    np.testing.assert_array_equal(together.sightings.point, one_by_one.sightings.point)
+
+
+def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
+    rng = np.random.default_rng(0)
+    square = rng.standard_normal((18, 18))
+    root = np.linalg.cholesky(square @ square.T + np.eye(18))
+    values, keys = gtsam.Values(), tuple((gtsam.symbol("x", k),) for k in range(3))
+    for (key,) in keys:
+        values.insert(key, gtsam.Pose3())
+    none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    window = smart.Window(keys, values, (), smart.Prior.nothing(), none, np.empty((0, 3)))
+    inverse = np.linalg.inv(root @ root.T)
+    for i in range(3):
+        np.testing.assert_allclose(Solution(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])
+
+
+def test_a_window_started_afresh_leaves_no_state_without_a_covariance(monkeypatch):
+    sequence, solved, refused = simulate(SCENARIOS[2], 3), smart.solved, []
+
+    def refusing_once(window, rig):
+        if len(window.keys) == 8 and not refused:
+            refused.append(window)
+            raise EstimatorError("nothing determines it")
+        return solved(window, rig)
+
+    monkeypatch.setattr(smart, "solved", refusing_once)
+    estimator = Smart(setup_of(sequence), LAG_S)
+    final = run_through(estimator, sequence)
+    assert refused
+    assert np.linalg.eigvalsh(final.cov).min() > 0.0
