@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import pytest
 
+from toolkit.audit import Audit, audit
 from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.sequence import Observations, Sequence, TwistSamples
@@ -28,6 +29,11 @@ class Plant:
     fault: str
     planted: Sequence
     count: int
+
+    @cached_property
+    def audited(self) -> Audit:
+        """What the audit makes of it."""
+        return audit(self.planted)
 
 
 def with_observations(sequence: Sequence, rows: object = slice(None), **columns: Array | IntArray) -> Sequence:
@@ -169,7 +175,7 @@ CASES = [
 ]
 
 
-@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
+@pytest.fixture(scope="session", params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
 def plant(request: pytest.FixtureRequest) -> Plant:
     """Return each fault planted in each kind of recording that can have it."""
     scenario, fault = request.param

@@ -22,12 +22,12 @@ def test_a_clean_recording_raises_no_finding_and_is_left_as_it_is(
 
 
 def test_a_planted_fault_is_found_counted_and_repaired(plant: Any) -> None:
-    findings = audit(plant.planted).findings
+    findings = plant.audited.findings
     assert [(f.fault, f.count, f.repaired, f.blocking) for f in findings] == [(plant.fault, plant.count, True, False)]
 
 
 def test_a_repaired_recording_runs_and_does_not_have_the_fault_again(plant: Any) -> None:
-    repaired = audit(plant.planted).sequence
+    repaired = plant.audited.sequence
     check_runnable(repaired)
     # A track that lost a sighting to a repair looks, to a second audit, like one that went and came back.
     assert {f.fault for f in audit(repaired).findings} <= {"returning-tracks"} - {plant.fault}
