@@ -59,7 +59,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     if not len(joint.landmark_ids):
         return
     seen = joint_landmarks.look(joint, frame, at, rig)
-    accepted = joint_landmarks.admitted(joint, joint_landmarks.spread(joint, seen), innovation)
+    accepted = joint_landmarks.admitted(joint, seen, innovation)
     measurement = Measurement(joint, frame, at, rig, accepted & (seen.depth_m > 0.0))
     if not measurement.rows.any():
         return

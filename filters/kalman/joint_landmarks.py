@@ -44,9 +44,10 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     if not len(joint.landmark_ids):
         return
-    said = spread(joint, look(joint, frame, at, rig))
-    accepted = admitted(joint, said, innovation)
+    seen = look(joint, frame, at, rig)
+    accepted = admitted(joint, seen, innovation)
     if accepted.any():
+        said = spread(joint, seen)
         H, residuals = said.H[accepted], said.residuals[accepted]
         joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
 
@@ -77,14 +78,22 @@ def columns(joint: JointBelief) -> slice:
     return slice(joint.clone_columns.start, joint.cov.shape[0])
 
 
-def admitted(joint: JointBelief, said: Innovations, innovation: Innovation) -> BoolArray:
+def admitted(joint: JointBelief, seen: Seen, innovation: Innovation) -> BoolArray:
     """Return which landmarks' residuals (L,) pass the gate, and count them."""
-    part = columns(joint)
-    predicted = said.H @ joint.cov[part, part] @ np.swapaxes(said.H, 1, 2)
-    nis = mahalanobis_squared(said.residuals, predicted + np.eye(3))
+    H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
+    predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
+    nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
     accepted = np.asarray(nis < STEREO_GATE)
     innovation.add(nis, np.full(len(nis), 3), accepted)
     return accepted
+
+
+def _pose_and_landmark_cov(joint: JointBelief) -> Array:
+    """Return the covariance (L, 9, 9) of the newest clone and each landmark."""
+    newest = np.arange(joint.clone_columns.stop - 6, joint.clone_columns.stop)
+    own = np.arange(joint.landmark_columns.start, joint.landmark_columns.stop).reshape(-1, 3)
+    rows = np.concatenate([np.tile(newest, (len(own), 1)), own], axis=1)
+    return np.asarray(joint.cov[rows[:, :, None], rows[:, None, :]])
 
 
 def keep(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
