@@ -16,6 +16,7 @@ from filters.graph.indeterminate import variable_named, weak_hold
 from filters.graph.resting import Resting
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
+from toolkit.models.factors import kind_of
 
 # The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
 # states left out of the order make the tree ever denser.
@@ -97,7 +98,7 @@ class IncrementalTree:
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
 
     def _state_variable(self, key: int) -> gtsam.Pose3 | gtsam.imuBias.ConstantBias | Array:
-        kind = _kind(key)
+        kind = kind_of(key)
         if kind == "x":
             return self.isam.calculateEstimatePose3(key)
         if kind == "b" and self._bias_size == 6:
@@ -129,7 +130,7 @@ class IncrementalTree:
         for place in range(factors.size()):
             keys: list[int] = factors.at(place).keys()
             for key in keys:
-                if _kind(key) == "l":
+                if kind_of(key) == "l":
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
         self._slot_count += factors.size()
         try:
@@ -156,7 +157,7 @@ class IncrementalTree:
             key = variable_named(refusal)
             factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
             values = self.isam.getLinearizationPoint()
-            if _kind(key) == "l":
+            if kind_of(key) == "l":
                 log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
                 for slot in self._sightings.pop(key):
                     factors.remove(slot)
@@ -177,7 +178,7 @@ class IncrementalTree:
 
     def _return_to_cholesky(self, new: gtsam.Values) -> None:
         """Go back from QR, ten times dearer, once vision has been back for some frames."""
-        sees = any(_kind(key) == "l" for key in list(new.keys()))
+        sees = any(kind_of(key) == "l" for key in list(new.keys()))
         self._frames_by_qr += sees
         if self._frames_by_qr <= QR_FRAMES:
             return
@@ -214,7 +215,3 @@ class IncrementalTree:
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)
         return gtsam.ISAM2(params)
-
-
-def _kind(key: int) -> str:
-    return chr(gtsam.Symbol(key).chr())

@@ -19,7 +19,7 @@ from filters.graph.indeterminate import variable_named, weak_hold, without_gaps
 from filters.graph.marginals import state_cov
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
-from toolkit.models.factors import L
+from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
 RELINEARISE_BEYOND = 0.01
@@ -52,15 +52,15 @@ class LagWindow:
                 self._update(factors, values, t_ns - self._lag_ns)
             except RuntimeError as refusal:
                 # What was new is in the tree by now, but the tree is not to be used any more.
-                key, name = variable_named(refusal), gtsam.Symbol(variable_named(refusal)).string()
-                rounding = gtsam.Symbol(key).chr() != gtsam.Symbol(L(0)).chr() and self._by_qr_from_ns is None
+                key = variable_named(refusal)
+                rounding = kind_of(key) != "l" and self._by_qr_from_ns is None
                 if rounding:
                     self._by_qr_from_ns = t_ns
-                    log.append(f"{name} was indeterminate to rounding: solved by QR for some frames")
                 factors, values = self._emptied(gtsam.NonlinearFactorGraph(), gtsam.Values())
                 if not rounding:
                     factors.add(weak_hold(key, values))
-                    log.append(f"{name} was indeterminate and is held weakly where it was")
+                remedy = "to rounding: solved by QR for some frames" if rounding else "and is held weakly where it was"
+                log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
             else:
                 return log
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")

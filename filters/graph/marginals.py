@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.kalman.belief import IMU_LAYOUT
 from toolkit.geometry import Array
-from toolkit.models.factors import V
+from toolkit.models.factors import kind_of
 
 
 class EliminatedGraph(Protocol):
@@ -33,7 +33,7 @@ def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
 
 def state_cov(tree: EliminatedGraph, keys: list[int], R_world_imu: Array) -> Array:
     """Return the covariance of the keys of one state [pose, (velocity,) bias] in the order and side of an Estimate."""
-    if len(keys) == len("XVB") and gtsam.Symbol(keys[1]).chr() != gtsam.Symbol(V(0)).chr():
+    if len(keys) == len("XVB") and kind_of(keys[1]) != "v":
         raise ValueError("a state of three keys is pose, velocity, bias, in this order")
     return in_estimate_order(joint_cov(tree, keys), R_world_imu)
 

@@ -18,7 +18,7 @@ from filters.graph.levenberg_marquardt import Solution, Stopping, solve
 from filters.kalman.gate import mahalanobis_squared
 from toolkit.geometry import Array
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.factors import L, StereoFactors, X, kind_of
 from toolkit.sequence import StereoFrame, StereoRig
 
 
@@ -89,8 +89,7 @@ def _with_sightings(
 def _only_seen(values: gtsam.Values, frames: list[StereoFrame]) -> gtsam.Values:
     """Return the values of all states and of the landmarks that some frame sees."""
     landmarks = {L(i) for i in seen_ids(frames)}
-    kind = gtsam.Symbol(L(0)).chr()
-    return values.extract([key for key in values.keys() if gtsam.Symbol(key).chr() != kind or key in landmarks])  # noqa: SIM118 - not a mapping
+    return values.extract([key for key in values.keys() if kind_of(key) != "l" or key in landmarks])  # noqa: SIM118 - not a mapping
 
 
 def _residuals(

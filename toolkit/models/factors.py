@@ -14,6 +14,11 @@ from toolkit.sequence import StereoFrame, StereoRig, TwistNoise
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 
 
+def kind_of(key: int) -> str:
+    """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark."""
+    return chr(gtsam.Symbol(key).chr())
+
+
 class StereoFactors:
     """Makes one projection factor per sighting: the measurement, noise and extrinsic the filters use."""
 
