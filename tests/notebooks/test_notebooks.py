@@ -67,7 +67,7 @@ def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[s
         'read "/home/somebody/drive.npz"',
         "<module '/Users/somebody/my filters.py'>",
         "file:///home/somebody/figure.png",
-        "(/tmp/ipykernel_123/456.py:1)",
+        "(/var/folders/ab/ipykernel_123/456.py:1)",
         r"C:\Users\somebody\drive.npz",
         json.dumps(r"C:\Users\somebody"),
     ],
