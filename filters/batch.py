@@ -8,14 +8,14 @@ mapped along that, for a start that has run off, dead-reckoned or too sure of it
 import gtsam
 import numpy as np
 
-from filters.graph.covariance_recovery import with_covariances
-from filters.graph.landmarks import restricted, worth_smoothing
-from filters.graph.motion import motion_graph
-from filters.graph.robust import seen_ids, solve_in_stages
 from filters.kalman.belief import initial_belief
+from filters.kalman.known_pose_mapping import MapAlong
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.mapped import MapAlong
 from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from filters.smoothing.covariance_recovery import with_covariances
+from filters.smoothing.landmarks import restricted, worth_smoothing
+from filters.smoothing.motion import motion_graph
+from filters.smoothing.robust import seen_ids, solve_in_stages
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray

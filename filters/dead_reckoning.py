@@ -1,8 +1,8 @@
 """Prediction alone: the measured motion integrated from the start, vision unused (Kang, III-A, eqs. 1-2)."""
 
 from filters.kalman.belief import initial_belief
+from filters.kalman.online_output import Speaker
 from filters.kalman.prediction import predicted, predictor
-from filters.kalman.speaker import Speaker
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.sequence import Packet

@@ -1,7 +1,7 @@
 """The report's decoupled EKF made sound: gates, landmark noise in the innovation, biases (Kang, III-C)."""
 
 from filters.kalman.decoupled import DecoupledEkf
-from filters.kalman.speaker import Speaker
+from filters.kalman.online_output import Speaker
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 20, "+ gates, landmark noise in the innovation"

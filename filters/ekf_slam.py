@@ -7,7 +7,7 @@ global position and heading stay exactly unobservable (Huang, Mourikis & Roumeli
 
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.speaker import Speaker
+from filters.kalman.online_output import Speaker
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 30, "+ cross-covariances"

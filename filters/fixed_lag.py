@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import gtsam
 
-from filters.graph.growth import Growth
-from filters.graph.lag_window import LagWindow
-from toolkit.cutting import NS_PER_S
+from filters.smoothing.graph_builder import Growth
+from filters.smoothing.lag_window import LagWindow
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.factors import L
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 90, "+ relinearisation"

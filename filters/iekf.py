@@ -15,7 +15,7 @@ from filters.kalman import iterated
 from filters.kalman.anchored import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.speaker import Speaker
+from filters.kalman.online_output import Speaker
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 50, "+ iterated update"

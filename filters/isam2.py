@@ -11,10 +11,10 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from filters.graph.covariance_recovery import with_covariances
-from filters.graph.growth import Grown, Growth
-from filters.graph.incremental import IncrementalTree
-from filters.graph.marginals import state_cov
+from filters.smoothing.covariance_recovery import with_covariances
+from filters.smoothing.graph_builder import Grown, Growth
+from filters.smoothing.incremental import IncrementalTree
+from filters.smoothing.marginals import state_cov
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array, se3_inverse, transform

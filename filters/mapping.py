@@ -5,8 +5,8 @@ import numpy as np
 from filters.kalman.belief import initial_belief
 from filters.kalman.correction import correct_landmarks
 from filters.kalman.landmarks import TrackedMap
+from filters.kalman.online_output import Speaker
 from filters.kalman.prediction import predicted, predictor
-from filters.kalman.speaker import Speaker
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.sequence import Packet

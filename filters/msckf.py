@@ -1,8 +1,8 @@
 """Sliding window of cloned poses tied by tracks (Mourikis & Roumeliotis 2007)."""
 
 from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.online_output import Speaker
 from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
-from filters.kalman.speaker import Speaker
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 60, "+ window of past poses"

@@ -13,8 +13,8 @@ import numpy as np
 from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
 from filters.kalman.landmarks import LandmarkMap, TrackedMap
+from filters.kalman.online_output import Speaker
 from filters.kalman.prediction import predicted, predictor
-from filters.kalman.speaker import Speaker
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array

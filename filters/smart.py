@@ -13,21 +13,21 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from filters.graph.landmarks import restricted
-from filters.graph.marginals import in_estimate_order
-from filters.graph.motion import motion_graph
-from filters.graph.slips import bound_to_its_map, slipped
-from filters.graph.structureless import Sightings
-from filters.graph.window import Prior, Window
-from filters.graph.window_solver import Solution, solved, without_oldest
-from filters.graph.window_tracks import Tracked
 from filters.kalman.belief import initial_belief
 from filters.kalman.prediction import predicted, predictor
-from toolkit.cutting import NS_PER_S
+from filters.smoothing.landmarks import restricted
+from filters.smoothing.marginals import in_estimate_order
+from filters.smoothing.motion import motion_graph
+from filters.smoothing.outlier_check import bound_to_its_map, slipped
+from filters.smoothing.structureless import Sightings
+from filters.smoothing.window import Prior, Window
+from filters.smoothing.window_solver import Solution, solved, without_oldest
+from filters.smoothing.window_tracks import Tracked
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration"

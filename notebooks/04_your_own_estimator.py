@@ -26,14 +26,14 @@ from IPython import get_ipython
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
 from toolkit.estimator import Setup, find
+from toolkit.gate.baseline import Case
+from toolkit.gate.checking import How, check, new_baseline
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
 from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
-from toolkit.regression.baseline import Case
-from toolkit.regression.checking import How, check, new_baseline
+from toolkit.progress import Silent
 from toolkit.report.gate_words import gate_text
 from toolkit.report.interactive import compare, compare_over_seeds, figures, table
-from toolkit.report.progress import Silent
 from toolkit.runner import run
 from toolkit.sequence import Packet, StereoFrame
 

@@ -10,11 +10,11 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
-from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.estimate import Output, Run
+from toolkit.initialization import start_from_measurements
 from toolkit.metrics import score_run
 from toolkit.sequence import Prior, Sequence
-from toolkit.start import start_from_measurements
 
 
 class Case(NamedTuple):

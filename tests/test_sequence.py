@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from toolkit.cutting import NS_PER_S, Pairing
 from toolkit.errors import DataError
 from toolkit.geometry import se3, se3_exp
+from toolkit.resampling import NS_PER_S, Pairing
 from toolkit.sequence import (
     ImuNoise,
     ImuSamples,

@@ -16,11 +16,11 @@ from typing import Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from toolkit.divergence import contradiction, deafness
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.plausibility import contradiction, deafness
 from toolkit.sequence import Packet, Prior, Sequence
 
 

@@ -13,7 +13,6 @@ from typing import Literal, Self
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S, Pairing, cut_at
 from toolkit.errors import DataError
 from toolkit.geometry import (
     Array,
@@ -24,6 +23,7 @@ from toolkit.geometry import (
     rotation_from_quaternion,
     se3,
 )
+from toolkit.resampling import NS_PER_S, Pairing, cut_at
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, TwistSamples
 from toolkit.simulation import SCENARIOS, simulate
 

@@ -24,8 +24,8 @@ from toolkit import runner
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.estimator import find
+from toolkit.initialization import start_from_measurements
 from toolkit.sequence import Sequence
-from toolkit.start import start_from_measurements
 
 DATA = Path(__file__).parents[2] / os.environ.get("VISLAM_DATA", "../shared/data")
 RECORDINGS = ("drive", "drive-imu", "kitti00", str(DATA / "ucsd" / "03.npz"))

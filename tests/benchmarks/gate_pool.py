@@ -23,13 +23,13 @@ from toolkit import runner
 from toolkit.audit import audit
 from toolkit.estimate import Run, Trajectory
 from toolkit.estimator import find
+from toolkit.gate.reference import reference_s
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
-from toolkit.metrics import Judged, ate, held_out, nees
-from toolkit.metrics.common.scores import Unavailable
-from toolkit.regression.reference import reference_s
+from toolkit.initialization import start_from_measurements
+from toolkit.metrics import Evaluation, ate, held_out, nees
+from toolkit.metrics._shared.scores import Unavailable
 from toolkit.sequence import ImuSamples, Observations, Sequence, TwistNoise, TwistSamples
 from toolkit.simulation import SCENARIOS, simulate
-from toolkit.start import start_from_measurements
 
 DITHER = 0.05
 LEVELS_PERCENT = (0.0, 2.0, 5.0, 10.0)
@@ -79,7 +79,7 @@ def scores(run: Run, sequence: Sequence, percent: float) -> dict[str, dict[str, 
             found[output] = {}
             for file in files:
                 with suppress(Unavailable):
-                    found[output] |= file.score(Judged(run, output, sequence)).values
+                    found[output] |= file.score(Evaluation(run, output, sequence)).values
     return found
 
 

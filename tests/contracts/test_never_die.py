@@ -17,8 +17,8 @@ from toolkit.estimator import discover, find
 from toolkit.geometry import Array, about_z, se3_inverse, so3_exp
 from toolkit.sequence import Observations, Sequence, TwistNoise
 from toolkit.simulation import FLIGHT, Scenario, simulate
+from toolkit.simulation.scenes import Stage
 from toolkit.simulation.sensors import Odometer
-from toolkit.simulation.stages import Stage
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
 from toolkit.simulation.world import room
 

@@ -11,8 +11,8 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.datasets import euroc, formats, load_sequence
-from toolkit.datasets.parts.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
-from toolkit.datasets.parts.opencv_yaml import read_fields
+from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
+from toolkit.datasets.io.opencv_yaml import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import ImuMotion, ImuNoise, ImuSamples, Sequence

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import kitti00, load_sequence
-from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import interpolate_poses, se3_inverse, transform
+from toolkit.models.noise import white_sigma
 from toolkit.models.stereo import project, triangulate
-from toolkit.noise import white_sigma
 from toolkit.sequence import ImuNoise, ImuSamples, Sequence
 
 

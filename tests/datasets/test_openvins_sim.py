@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.cutting import NS_PER_S
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuNoise, ImuSamples
 
 Refused = Callable[..., None]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import course_npz
-from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import (
     Array,
@@ -20,7 +20,7 @@ from toolkit.geometry import (
     se3_exp,
     so3_exp,
 )
-from toolkit.noise import pixel_covariance
+from toolkit.models.noise import pixel_covariance
 from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
 
 Refused = Callable[..., None]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scipy.io
 
-from toolkit.cutting import NS_PER_S
 from toolkit.datasets import load_sequence, utias_mat
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, TwistNoise, TwistSamples
 
 Refused = Callable[..., None]

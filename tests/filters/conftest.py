@@ -12,9 +12,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.graph.landmarks import restricted
-from filters.graph.motion import motion_graph
 from filters.kalman.belief import Belief, initial_belief
+from filters.smoothing.landmarks import restricted
+from filters.smoothing.motion import motion_graph
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from filters import fixed_lag
-from filters.graph import covariance_recovery
-from filters.graph.covariance_recovery import state_covs
-from filters.graph.marginals import state_cov
+from filters.smoothing import covariance_recovery
+from filters.smoothing.covariance_recovery import state_covs
+from filters.smoothing.marginals import state_cov
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=1.5)}

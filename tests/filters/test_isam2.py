@@ -7,12 +7,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.graph import incremental
-from filters.graph.held_linear import MOVED, Held, contained, held_of, renewed
-from filters.graph.incremental import FLUID_FRAMES, MOST_RECOVERIES, IncrementalTree
-from filters.graph.levenberg_marquardt import Stopping, solve
-from filters.graph.resting import Resting
 from filters.isam2 import Isam2
+from filters.smoothing import incremental
+from filters.smoothing.cached_linearisation import MOVED, Held, contained, held_of, renewed
+from filters.smoothing.frozen_variables import Resting
+from filters.smoothing.incremental import FLUID_FRAMES, MOST_RECOVERIES, IncrementalTree
+from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log

@@ -7,9 +7,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.graph.levenberg_marquardt import Stopping, solve
-from filters.graph.motion import motion_graph
 from filters.kalman.belief import initial_belief
+from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.motion import motion_graph
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup

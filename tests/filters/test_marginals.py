@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.graph.marginals import joint_cov, state_cov
+from filters.smoothing.marginals import joint_cov, state_cov
 from toolkit.models.factors import B, V, X
 
 

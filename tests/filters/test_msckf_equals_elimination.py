@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.graph.landmarks import restricted
 from filters.kalman import joint_landmarks, multiview
 from filters.kalman.belief import initial_belief
 from filters.kalman.joint import JointBelief
@@ -21,6 +20,7 @@ from filters.kalman.prediction import predictor
 from filters.kalman.sliding_window import SlidingWindowFilter, WindowSize
 from filters.kalman.tracks import WindowTracks
 from filters.kalman.triangulation import triangulate
+from filters.smoothing.landmarks import restricted
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.simulation import DRIVE, FLIGHT

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit
+from toolkit.initialization import start_from_measurements
 from toolkit.metrics import score_run
 from toolkit.simulation import FLIGHT, simulate
-from toolkit.start import start_from_measurements
 
 # A hand-held rig as they are: biases unknown before the start and drifting fast, few tracks that end soon.
 ROUGH = replace(

@@ -12,10 +12,10 @@ from scipy.linalg import expm
 
 from toolkit.estimate import Run
 from toolkit.geometry import Array
+from toolkit.initialization import GYRO_BIAS_SIGMA
 from toolkit.models import twist
 from toolkit.sequence import Prior, Sequence, StereoFrame, StereoRig, TwistMotion, TwistNoise
 from toolkit.simulation import DRIVE, simulate
-from toolkit.start import GYRO_BIAS_SIGMA
 
 SIGMA_PX = 1.0
 V = SIGMA_PX**2 * np.eye(4)

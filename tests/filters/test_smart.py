@@ -7,8 +7,8 @@ import gtsam_unstable
 import numpy as np
 import pytest
 
-from filters.graph.structureless import HUBER_THRESHOLD, Sightings, Vision
 from filters.smart import Smart
+from filters.smoothing.structureless import HUBER_THRESHOLD, Sightings, Vision
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo

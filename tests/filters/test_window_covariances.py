@@ -8,16 +8,16 @@ import pytest
 
 from filters import smart
 from filters.fixed_lag import FixedLag
-from filters.graph.indeterminate import without_gaps
-from filters.graph.lag_window import LagWindow
-from filters.graph.marginals import state_cov
-from filters.graph.motion import motion_graph
-from filters.graph.structureless import Sightings
-from filters.graph.window_solver import Solution, without_oldest
 from filters.smart import Smart
-from toolkit.cutting import NS_PER_S
+from filters.smoothing.indeterminate import without_gaps
+from filters.smoothing.lag_window import LagWindow
+from filters.smoothing.marginals import state_cov
+from filters.smoothing.motion import motion_graph
+from filters.smoothing.structureless import Sightings
+from filters.smoothing.window_solver import Solution, without_oldest
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 

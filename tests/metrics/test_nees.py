@@ -7,8 +7,8 @@ import pytest
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse, so3_exp
-from toolkit.metrics import Judged, score_run
-from toolkit.metrics.common.consistency import chi2_quantile, nees_band, nees_over_time
+from toolkit.metrics import Evaluation, score_run
+from toolkit.metrics._shared.consistency import chi2_quantile, nees_band, nees_over_time
 from toolkit.sequence import Prior, Truth
 
 POSES = 4000
@@ -111,8 +111,8 @@ def test_a_truth_with_other_stamps_is_interpolated(make_sequence, make_run, driv
     between = np.concatenate([t_ns[:1], t_ns[:-1] + 30_000_000])
     truth = Truth(between, interpolate_poses(t_ns, sequence.truth.T_world_imu, between))
     run = stating(make_run, sequence, drive(100), np.broadcast_to(COV, (100, 6, 6)))
-    judged = Judged(run, "causal", replace(sequence, truth=truth))
-    found = nees_over_time(judged)
+    evaluation = Evaluation(run, "causal", replace(sequence, truth=truth))
+    found = nees_over_time(evaluation)
     assert found.t_ns.tolist() == t_ns[:-1].tolist()  # the last frame is behind the truth's end
     assert found.pose.max() < 0.05
 

@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 
 from toolkit.estimate import Landmarks
 from toolkit.geometry import se3_exp, se3_inverse, transform
-from toolkit.metrics import Judged, held_out, in_sample, score_run
-from toolkit.metrics.common.leave_one_out import predict_left_out
-from toolkit.metrics.common.reprojection import CAP_PX
+from toolkit.metrics import Evaluation, held_out, in_sample, score_run
+from toolkit.metrics._shared.leave_one_out import predict_left_out
+from toolkit.metrics._shared.reprojection import CAP_PX
 from toolkit.models import stereo
 
 HUBER_SIGMAS = 2.796
@@ -36,7 +36,7 @@ def test_in_sample_error_equals_a_loop_over_gtsams_camera(make_sequence, make_ru
         predicted = camera.project(points[int(track)])
         residual = uv - [predicted.uL(), predicted.uR(), predicted.v()]
         expected.append(np.sqrt(np.mean(residual**2)))
-    errors_px = in_sample.errors(Judged(make_run(sequence.frames_t_ns, poses, landmarks), "final", sequence))
+    errors_px = in_sample.errors(Evaluation(make_run(sequence.frames_t_ns, poses, landmarks), "final", sequence))
     assert max(expected) < CAP_PX
     np.testing.assert_allclose(errors_px, expected, atol=1e-9)  # 1e3 px from products of a few doubles
     values = score_run(make_run(sequence.frames_t_ns, poses, landmarks), "final", sequence).values
@@ -51,7 +51,7 @@ def test_a_point_behind_the_camera_or_not_finite_counts_as_the_cap(make_sequence
     points[0] = transform(sequence.truth.T_world_imu[0], np.array([-500.0, 0.0, 0.0]))
     points[1] = np.nan
     run = make_run(sequence.frames_t_ns, sequence.truth.T_world_imu, Landmarks(landmarks.track_ids, points))
-    errors_px = in_sample.errors(Judged(run, "final", sequence))
+    errors_px = in_sample.errors(Evaluation(run, "final", sequence))
     lost = np.isin(sequence.visible.track_id, landmarks.track_ids[:2])
     assert (errors_px[lost] == CAP_PX).all()
     assert errors_px[~lost].max() < 1e-9  # exact points, rounding only

@@ -8,7 +8,7 @@ import pytest
 
 from toolkit import metrics
 from toolkit.metrics import Scores, score_run
-from toolkit.metrics.common.scores import Unavailable, evaluate
+from toolkit.metrics._shared.scores import Unavailable, evaluate
 
 
 @pytest.fixture
@@ -96,14 +96,14 @@ def test_one_missing_metric_leaves_the_others_their_values():
 def test_a_defect_in_a_metric_passes_through(case, monkeypatch):
     from toolkit.metrics import drift
 
-    monkeypatch.setattr(drift, "score", lambda judged: 1 / 0)
+    monkeypatch.setattr(drift, "score", lambda evaluation: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         case()
 
 
 def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case):
     source = 'from toolkit.metrics import Scores\nORDER = 99\nMETRICS = {"answer": "the answer (1)"}\n'
-    (tmp_path / "dropped_in.py").write_text(source + "def score(judged):\n    return Scores({'answer': 42.0})\n")
+    (tmp_path / "dropped_in.py").write_text(source + "def score(evaluation):\n    return Scores({'answer': 42.0})\n")
     monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
     metrics._metric_files.cache_clear()
     try:

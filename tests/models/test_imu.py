@@ -14,11 +14,11 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
+from toolkit.initialization import start_from_measurements
 from toolkit.models import factors, imu
 from toolkit.models.factors import B, V, X
 from toolkit.sequence import GRAVITY_WORLD, ImuMotion
 from toolkit.simulation import FLIGHT, noise_free, simulate
-from toolkit.start import start_from_measurements
 
 PARAMS = imu.preintegration_params(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
 BIAS = np.array([0.05, -0.08, 0.03, 0.004, -0.006, 0.002])

@@ -16,11 +16,11 @@ from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.geometry import Array, se3_exp
+from toolkit.initialization import start_from_measurements
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
 from toolkit.simulation import DRIVE, FLIGHT
-from toolkit.start import start_from_measurements
 
 # Pixels are of the order of 1e3 and Jacobian entries of 1e4 (px / rad at 40 m): 1e-9 of the largest entry of a
 # sighting is a thousand times what double precision costs and a millionth of what any modelling slip would show.

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, so3_exp
 from toolkit.models import stereo
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuMotion, ImuNoise, ImuSamples, Sequence, Truth, TwistMotion, TwistSamples
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
 from toolkit.simulation.sensors import Imu

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log
-from toolkit.simulation.stages import hall, road
+from toolkit.simulation.scenes import hall, road
 from toolkit.simulation.trajectory import (
     RotationSpline,
     Trajectory,

@@ -9,8 +9,8 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.frames import keep_frames
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import IntArray
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # A step this many times the usual one is a hole; one missing stamp makes 2, two make 3.

@@ -14,8 +14,8 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
 from toolkit.audit.parts.robust import Scalar, slope
-from toolkit.cutting import Pairing
 from toolkit.geometry import BoolArray, IntArray
+from toolkit.resampling import Pairing
 from toolkit.sequence import Sequence, TwistSamples
 
 LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}

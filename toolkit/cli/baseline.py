@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from toolkit.cli.arguments import Subcommands
-    from toolkit.regression.baseline import Baseline, Case
+    from toolkit.gate.baseline import Baseline, Case
 
 SEEDS, FEWEST_SEEDS = 24, 5
 
@@ -75,12 +75,12 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Measure, write and return 1 where an estimator diverged or failed; the baseline is written then, too."""
-    from toolkit.regression.baseline_json import to_text
-    from toolkit.regression.checking import new_baseline
-    from toolkit.regression.releases import label
+    from toolkit.experiment.workers import usable_cpus
+    from toolkit.gate.baseline_json import to_text
+    from toolkit.gate.checking import new_baseline
+    from toolkit.gate.releases import label
+    from toolkit.progress import progress_on
     from toolkit.report.gate_files import check_writable, made_here, write_text
-    from toolkit.report.progress import progress_on
-    from toolkit.sweep.processes import usable_cpus
 
     cases = _cases(options)
     out = options.out or Path(f"baseline_{label()}.json")
@@ -112,8 +112,8 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     """Return the cases the command line asks for."""
     from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.estimator import find_all
-    from toolkit.regression.baseline import Case
-    from toolkit.regression.case_work import located
+    from toolkit.gate.baseline import Case
+    from toolkit.gate.case_work import located
 
     estimators = tuple(find_all(options.estimators))
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)

@@ -48,12 +48,12 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Check, print and return 1 where anything got worse or is missing."""
-    from toolkit.regression.baseline_reader import check_releases, load_baseline
-    from toolkit.regression.checking import How, check
+    from toolkit.experiment.workers import usable_cpus
+    from toolkit.gate.baseline_reader import check_releases, load_baseline
+    from toolkit.gate.checking import How, check
+    from toolkit.progress import progress_on
     from toolkit.report.gate_files import check_writable, write_check
     from toolkit.report.gate_words import gate_text
-    from toolkit.report.progress import progress_on
-    from toolkit.sweep.processes import usable_cpus
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
     for path in files.values():

@@ -31,7 +31,7 @@ def add_to(subcommands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     """Print the audit and return 1 where a fault stays that must not."""
     from toolkit.audit import faults
-    from toolkit.datasets.parts.truth_file import load_truth
+    from toolkit.datasets.io.truth_file import load_truth
     from toolkit.report.session import load_audited
     from toolkit.report.terminal import audit_text
 

@@ -127,7 +127,7 @@ def _trajectories(options: argparse.Namespace) -> dict[str, Path]:
 
 def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
     """Yield each comparison as text, where its results are, and whether every run ended well."""
-    from toolkit.report.progress import progress_on
+    from toolkit.progress import progress_on
     from toolkit.report.session import compare_all
     from toolkit.report.terminal import comparison_text
 
@@ -139,10 +139,10 @@ def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple
     """Yield the same for each comparison over seeds; what cannot be repeated over seeds is a UsageError."""
     from toolkit.cli.arguments import UsageError
     from toolkit.datasets import is_drawn_from_a_seed
-    from toolkit.report.progress import progress_on
+    from toolkit.experiment.workers import usable_cpus
+    from toolkit.progress import progress_on
     from toolkit.report.seeds_md import seeds_text
     from toolkit.report.seeds_session import OverSeedsRequest, compare_over_seeds
-    from toolkit.sweep.processes import usable_cpus
 
     if options.seeds == 1:
         raise UsageError("--workers goes with --seeds of 2 and more (see vislam compare --help)")

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
-from toolkit.datasets.parts.asl_table import columns_of, read_stamps, read_table
-from toolkit.datasets.parts.euroc_calibration import (
+from toolkit.datasets.io.asl_table import columns_of, read_stamps, read_table
+from toolkit.datasets.io.euroc_calibration import (
     ACCEL_FACTOR,
     GYRO_FACTOR,
     PIXEL_SIGMA_PX,
@@ -26,11 +25,12 @@ from toolkit.datasets.parts.euroc_calibration import (
     published,
     read_calibration,
 )
-from toolkit.datasets.parts.euroc_truth import choose_truth
-from toolkit.datasets.parts.fields import check_frame_count
-from toolkit.datasets.parts.tracks_along import tracks_in_a_room
+from toolkit.datasets.io.euroc_truth import choose_truth
+from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, interpolate_poses
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuSamples, Provenance, Sequence, Truth
 from toolkit.simulation.world import Camera
 

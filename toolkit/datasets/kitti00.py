@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.io.stamps import stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_inverse
-from toolkit.noise import pixel_covariance
+from toolkit.models.noise import pixel_covariance
 from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig
 
 # The first IMU sample is followed by a gap of 1.92 s, which covers frames 0 to 13.

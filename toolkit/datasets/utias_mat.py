@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.cutting import NS_PER_S
-from toolkit.datasets.parts.fields import Fields, check_frame_count, check_rigid
-from toolkit.datasets.parts.stamps import stamps_ns
-from toolkit.datasets.parts.stereo_rows import observations
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid
+from toolkit.datasets.io.stamps import stamps_ns
+from toolkit.datasets.io.stereo_rows import observations
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
-from toolkit.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
+from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
 
 _NOT_SEEN = -1.0

@@ -15,9 +15,9 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from toolkit.cutting import Pairing
 from toolkit.errors import DataError, OutputError
 from toolkit.geometry import Array
+from toolkit.resampling import Pairing
 from toolkit.sequence import (
     ImuNoise,
     ImuSamples,

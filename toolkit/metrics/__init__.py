@@ -1,8 +1,8 @@
 """Judge a run: every module here is one file of metrics, discovered by being here.
 
 A metric file defines ``METRICS`` (key -> one line with the unit, in the order of a table), ``ORDER`` (where
-its keys stand among those of other files) and ``score(judged) -> Scores``. What several files need lives in
-:mod:`toolkit.metrics.common`.
+its keys stand among those of other files) and ``score(evaluation) -> Scores``. What several files need lives in
+:mod:`toolkit.metrics._shared`.
 What each number means and what it is blind to: docs/metrics.md.
 """
 
@@ -14,11 +14,11 @@ from typing import Protocol, cast
 import numpy as np
 
 from toolkit.estimate import Output, Run
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores, Unavailable
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores, Unavailable
 from toolkit.sequence import Sequence
 
-__all__ = ["Judged", "Scores", "describe", "score_run"]
+__all__ = ["Evaluation", "Scores", "describe", "score_run"]
 
 
 class MetricFile(Protocol):
@@ -27,7 +27,7 @@ class MetricFile(Protocol):
     METRICS: dict[str, str]
     ORDER: int
 
-    def score(self, judged: Judged) -> Scores:
+    def score(self, evaluation: Evaluation) -> Scores:
         """Return a value, or None and the reason, for each key of METRICS.
 
         Raises Unavailable where none of them can be computed.
@@ -53,12 +53,12 @@ def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
     A metric that cannot be computed, or is not finite, is None and has its reason in the notes. Raises
     ValueError where the run has no output of that kind; an error inside a metric is a defect and passes through.
     """
-    judged = Judged(run, output, sequence)
+    evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
         for file in _metric_files():
-            scores = _score_file(file, judged)
+            scores = _score_file(file, evaluation)
             if list(scores.values) != list(file.METRICS):
                 raise ValueError(f"{file} scored {list(scores.values)}, it promises {list(file.METRICS)}")
             values |= scores.values
@@ -66,9 +66,9 @@ def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
     return Scores(values, notes)
 
 
-def _score_file(file: MetricFile, judged: Judged) -> Scores:
+def _score_file(file: MetricFile, evaluation: Evaluation) -> Scores:
     """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
     try:
-        return file.score(judged)
+        return file.score(evaluation)
     except Unavailable as reason:
         return Scores(dict.fromkeys(file.METRICS), dict.fromkeys(file.METRICS, str(reason)))

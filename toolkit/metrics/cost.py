@@ -4,8 +4,8 @@ import numpy as np
 
 from toolkit.estimate import Timings
 from toolkit.geometry import Array
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 
 ORDER = 90
 METRICS = {
@@ -18,9 +18,9 @@ METRICS = {
 }
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score the run's timings; the same for both kinds of output, which come from one run."""
-    timings = judged.run.timings
+    timings = evaluation.run.timings
     if timings is None:
         raise Unavailable("not run here")
     return evaluate(

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 
 ORDER = 80
 METRICS = {
@@ -12,12 +12,14 @@ METRICS = {
 }
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score coverage and count the matched pairs."""
-    return evaluate({"coverage_percent": lambda: _coverage_percent(judged), "pairs": lambda: len(judged.matched)})
+    return evaluate(
+        {"coverage_percent": lambda: _coverage_percent(evaluation), "pairs": lambda: len(evaluation.matched)}
+    )
 
 
-def _coverage_percent(judged: Judged) -> float:
-    if not judged.counted_frames.any():
+def _coverage_percent(evaluation: Evaluation) -> float:
+    if not evaluation.counted_frames.any():
         raise Unavailable("no frame lies in the time range of the ground truth")
-    return 100.0 * float(np.mean(judged.has_pose[judged.counted_frames]))
+    return 100.0 * float(np.mean(evaluation.has_pose[evaluation.counted_frames]))

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 
 ORDER = 40
 METRICS = {
@@ -11,14 +11,14 @@ METRICS = {
 }
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score the drift at the last matched pair."""
-    return evaluate({"end_drift_percent": lambda: _end_drift_percent(judged)})
+    return evaluate({"end_drift_percent": lambda: _end_drift_percent(evaluation)})
 
 
-def _end_drift_percent(judged: Judged) -> float:
-    matched = judged.compared
+def _end_drift_percent(evaluation: Evaluation) -> float:
+    matched = evaluation.compared
     length_m = float(matched.path_m[-1] - matched.path_m[0])
     if length_m == 0.0:
         raise Unavailable("the matched path has no length")
-    return 100.0 * float(np.linalg.norm(judged.placed[-1, :3, 3] - matched.truth[-1, :3, 3])) / length_m
+    return 100.0 * float(np.linalg.norm(evaluation.placed[-1, :3, 3] - matched.truth[-1, :3, 3])) / length_m

@@ -6,10 +6,10 @@ Needs no ground truth and cannot be won by overfitting: the points come from the
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.leave_one_out import predict_left_out
-from toolkit.metrics.common.reprojection import median_px, observation_errors_px, remark, rmse_px
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.leave_one_out import predict_left_out
+from toolkit.metrics._shared.reprojection import median_px, observation_errors_px, remark, rmse_px
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 
 ORDER = 60
 METRICS = {
@@ -20,9 +20,9 @@ METRICS = {
 FEWEST_VIEWS = 3
 
 
-def score(judged: Judged) -> Scores:
-    """Score how well the judged poses predict the withheld tracks."""
-    errors_px = errors(judged)
+def score(evaluation: Evaluation) -> Scores:
+    """Score how well the evaluated poses predict the withheld tracks."""
+    errors_px = errors(evaluation)
     scores = evaluate(
         {
             "heldout_reproj_median_px": lambda: median_px(errors_px),
@@ -30,18 +30,18 @@ def score(judged: Judged) -> Scores:
         }
     )
     lacking = f"belong to frames without a pose or to tracks with fewer than {FEWEST_VIEWS} posed views"
-    return scores.remarked(METRICS, remark(errors_px, len(judged.sequence.held_out), lacking))
+    return scores.remarked(METRICS, remark(errors_px, len(evaluation.sequence.held_out), lacking))
 
 
-def errors(judged: Judged) -> Array:
+def errors(evaluation: Evaluation) -> Array:
     """Return the leave-one-view-out error (N,) px of every sighting of a withheld track with enough posed views."""
-    posed = judged.sequence.held_out.select(judged.has_pose[judged.sequence.held_out.frame])
+    posed = evaluation.sequence.held_out.select(evaluation.has_pose[evaluation.sequence.held_out.frame])
     by_track = posed.select(np.lexsort((posed.frame, posed.track_id)))
     _, track, views = np.unique(by_track.track_id, return_inverse=True, return_counts=True)
     enough = by_track.select(views[track] >= FEWEST_VIEWS)
     if not len(enough):
         raise Unavailable(f"no withheld track has {FEWEST_VIEWS} views from frames with a pose")
-    rig = judged.sequence.rig
-    T_world_cam = judged.poses_of_frames[enough.frame] @ rig.T_imu_cam
+    rig = evaluation.sequence.rig
+    T_world_cam = evaluation.poses_of_frames[enough.frame] @ rig.T_imu_cam
     predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
     return observation_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)

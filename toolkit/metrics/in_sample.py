@@ -3,9 +3,9 @@
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.reprojection import median_px, observation_errors_px, remark, rmse_px
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.reprojection import median_px, observation_errors_px, remark, rmse_px
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 from toolkit.models import stereo
 
 ORDER = 50
@@ -15,27 +15,27 @@ METRICS = {
 }
 
 
-def score(judged: Judged) -> Scores:
-    """Score the reprojection of the run's landmarks from the judged poses."""
-    errors_px = errors(judged)
+def score(evaluation: Evaluation) -> Scores:
+    """Score the reprojection of the run's landmarks from the evaluated poses."""
+    errors_px = errors(evaluation)
     scores = evaluate({"reproj_median_px": lambda: median_px(errors_px), "reproj_rmse_px": lambda: rmse_px(errors_px)})
     lacking = "lack a landmark, a second sighting or a pose of their frame"
-    return scores.remarked(METRICS, remark(errors_px, len(judged.sequence.visible), lacking))
+    return scores.remarked(METRICS, remark(errors_px, len(evaluation.sequence.visible), lacking))
 
 
-def errors(judged: Judged) -> Array:
+def errors(evaluation: Evaluation) -> Array:
     """Return the reprojection error (N,) px of every visible observation that has a landmark and a pose.
 
     Tracks seen only once are left out: a landmark started from one sighting reprojects onto it exactly.
     """
-    landmarks, rig = judged.run.landmarks, judged.sequence.rig
+    landmarks, rig = evaluation.run.landmarks, evaluation.sequence.rig
     if not len(landmarks):
         raise Unavailable("the estimator has no landmarks")
-    observations = judged.sequence.visible
+    observations = evaluation.sequence.visible
     row = np.minimum(np.searchsorted(landmarks.track_ids, observations.track_id), len(landmarks) - 1)
-    known = (landmarks.track_ids[row] == observations.track_id) & judged.has_pose[observations.frame]
+    known = (landmarks.track_ids[row] == observations.track_id) & evaluation.has_pose[observations.frame]
     known &= _seen_again(observations.track_id)
-    T_cam_world = se3_inverse(judged.poses_of_frames @ rig.T_imu_cam)
+    T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)
     return observation_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)

@@ -8,9 +8,9 @@ and their errors are divided by the nominal length; the mean is over all segment
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.relative import angles_deg, lengths, relative_errors
-from toolkit.metrics.common.scores import Scores, Unavailable
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.relative import angles_deg, lengths, relative_errors
+from toolkit.metrics._shared.scores import Scores, Unavailable
 
 ORDER = 30
 METRICS = {
@@ -21,15 +21,15 @@ SEGMENT_LENGTHS_M = np.arange(100.0, 801.0, 100.0)
 START_EVERY = 10
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score both figures of the benchmark."""
-    t_per_m, r_deg_per_m = _errors_per_m(judged)
+    t_per_m, r_deg_per_m = _errors_per_m(evaluation)
     return Scores({"kitti_t_percent": 100.0 * float(t_per_m.mean()), "kitti_r_deg_per_m": float(r_deg_per_m.mean())})
 
 
-def _errors_per_m(judged: Judged) -> tuple[Array, Array]:
+def _errors_per_m(evaluation: Evaluation) -> tuple[Array, Array]:
     """Return translation (s,) m/m and rotation (s,) deg/m of every segment."""
-    matched = judged.compared
+    matched = evaluation.compared
     starts = np.arange(0, len(matched), START_EVERY)
     first, length_m = (grid.ravel() for grid in np.meshgrid(starts, SEGMENT_LENGTHS_M, indexing="ij"))
     last = np.searchsorted(matched.path_m, matched.path_m[first] + length_m, side="right")

@@ -5,9 +5,9 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 
 import numpy as np
 
-from toolkit.metrics.common.consistency import POSE_DOF, nees_band, nees_over_time
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores
+from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores
 
 ORDER = 75
 METRICS = {
@@ -19,9 +19,9 @@ METRICS = {
 _PLACED = "the estimate's world is its own: its first pose was placed on the truth's, whose noise there counts in full"
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score the stated covariances of poses against the truth."""
-    nees = nees_over_time(judged)
+    nees = nees_over_time(evaluation)
     low, high = nees_band(POSE_DOF)
     scores = Scores(
         {

@@ -5,22 +5,22 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 
 import numpy as np
 
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
 
 ORDER = 70
 METRICS = {"nis_mean": "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent"}
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score the innovations a causal output reports."""
-    return evaluate({"nis_mean": lambda: _nis_per_dof(judged)})
+    return evaluate({"nis_mean": lambda: _nis_per_dof(evaluation)})
 
 
-def _nis_per_dof(judged: Judged) -> float:
-    if judged.output != "causal":
+def _nis_per_dof(evaluation: Evaluation) -> float:
+    if evaluation.output != "causal":
         raise Unavailable("innovations belong to the causal output")
-    nis, dof = judged.run.info.get("nis"), judged.run.info.get("nis_dof")
+    nis, dof = evaluation.run.info.get("nis"), evaluation.run.info.get("nis_dof")
     if nis is None or dof is None:
         raise Unavailable("the estimator reports no innovations")
     given = np.isfinite(nis) & np.isfinite(dof) & (dof > 0.0)

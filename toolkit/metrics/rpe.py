@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics.common.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
-from toolkit.metrics.common.judged import Judged
-from toolkit.metrics.common.relative import angles_deg, lengths, relative_errors, rmse
-from toolkit.metrics.common.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.relative import angles_deg, lengths, relative_errors, rmse
+from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.resampling import NS_PER_S
 
 ORDER = 20
 METRICS = {
@@ -35,19 +35,25 @@ class _Intervals(NamedTuple):
     last: IntArray
 
 
-def score(judged: Judged) -> Scores:
+def score(evaluation: Evaluation) -> Scores:
     """Score drift over one second and over 100 m."""
     return evaluate(
         {
-            "rpe_1s_m": lambda: rmse(lengths(_errors(judged, _one_second)[:, :3, 3])),
-            "rpe_1s_deg": lambda: rmse(angles_deg(_errors(judged, _one_second)[:, :3, :3])),
-            "rpe_100m_percent": lambda: rmse(lengths(_errors(judged, _hundred_metres)[:, :3, 3])) / INTERVAL_M * 100.0,
+            "rpe_1s_m": lambda: rmse(lengths(_errors(evaluation, _one_second)[:, :3, 3])),
+            "rpe_1s_deg": lambda: rmse(angles_deg(_errors(evaluation, _one_second)[:, :3, :3])),
+            "rpe_100m_percent": lambda: (
+                rmse(lengths(_errors(evaluation, _hundred_metres)[:, :3, 3])) / INTERVAL_M * 100.0
+            ),
         }
     )
 
 
-def _errors(judged: Judged, choose: Callable[[Matched], _Intervals]) -> Array:
-    return relative_errors(judged.compared, *choose(judged.compared))
+def _percent(error_m: float) -> float:
+    return error_m / INTERVAL_M * 100.0
+
+
+def _errors(evaluation: Evaluation, choose: Callable[[Matched], _Intervals]) -> Array:
+    return relative_errors(evaluation.compared, *choose(evaluation.compared))
 
 
 def _one_second(matched: Matched) -> _Intervals:

@@ -5,7 +5,7 @@ from pathlib import Path
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError
 from toolkit.estimate import Output, Trajectory
-from toolkit.report.atomic import replaced_file
+from toolkit.files import replaced_file
 from toolkit.report.html.run_files import Document, read_run
 
 TRUTH = "truth"

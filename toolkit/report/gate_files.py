@@ -6,8 +6,8 @@ from pathlib import Path
 
 import toolkit
 from toolkit.errors import OutputError
-from toolkit.regression.verdict import Check
-from toolkit.report.atomic import check_parent, replaced_file
+from toolkit.files import check_parent, replaced_file
+from toolkit.gate.verdict import Check
 from toolkit.report.gate_json import gate_json
 from toolkit.report.gate_junit import gate_junit
 from toolkit.report.gate_words import gate_markdown

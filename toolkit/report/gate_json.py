@@ -3,7 +3,7 @@
 import math
 from dataclasses import asdict
 
-from toolkit.regression.verdict import Check, Verdict
+from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.metrics_json import Json
 
 SCHEMA = "vislam.check/1"

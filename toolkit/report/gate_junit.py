@@ -6,7 +6,7 @@ The format is what the common readers agree on: https://github.com/testmoapp/jun
 from itertools import groupby
 from xml.etree import ElementTree
 
-from toolkit.regression.verdict import Check, Verdict
+from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.gate_words import about
 
 

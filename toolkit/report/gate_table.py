@@ -1,7 +1,7 @@
 """A check of the gate as a table: a row a comparison, the same cells for plain text and for Markdown."""
 
-from toolkit.regression.bounded import SHOWN
-from toolkit.regression.verdict import Check, Verdict
+from toolkit.gate.bounded import SHOWN
+from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.table import Table, number
 
 _MISSING = "-"

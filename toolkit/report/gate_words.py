@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Iterable, Iterator
 
-from toolkit.regression.verdict import Check, Verdict
+from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.gate_table import failures_table, gate_table
 from toolkit.report.table import as_markdown, as_text
 

@@ -12,21 +12,21 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from toolkit.audit import audit
-from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import VislamError
 from toolkit.estimator import Build, find_all
+from toolkit.experiment.monte_carlo import OverSeeds
+from toolkit.experiment.workers import usable_cpus
+from toolkit.initialization import start_from_measurements
+from toolkit.progress import Silent
 from toolkit.report import session
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures import drawn, over_seeds
-from toolkit.report.progress import Silent
 from toolkit.report.seeds_session import OverSeedsRequest, run_over_seeds
 from toolkit.report.seeds_table import seeds_table
 from toolkit.report.session import Request, changes_of, load_audited
 from toolkit.report.table import COLUMNS, Table, as_markdown, as_text, comparison_table
 from toolkit.sequence import Sequence
-from toolkit.start import start_from_measurements
-from toolkit.sweep.over_seeds import OverSeeds
-from toolkit.sweep.processes import usable_cpus
 
 NOTHING_OF_ITS_OWN: Mapping[str, Build] = {}
 _NOWHERE = Path()

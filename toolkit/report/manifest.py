@@ -8,11 +8,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import toolkit
+from toolkit.experiment.monte_carlo import OverSeeds
+from toolkit.experiment.workers import usable_cpus
 from toolkit.report.comparison import Comparison
 from toolkit.report.metrics_json import Json
 from toolkit.sequence import Sequence
-from toolkit.sweep.over_seeds import OverSeeds
-from toolkit.sweep.processes import usable_cpus
 
 SCHEMA = "vislam.manifest/1"
 _PACKAGES = {

@@ -5,19 +5,19 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.estimate import Output, Run
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics import Judged
-from toolkit.metrics.common.consistency import POSE_DOF, nees_band, nees_over_time
-from toolkit.metrics.common.scores import Unavailable
+from toolkit.metrics import Evaluation
+from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
+from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.comparison import Comparison, Row, plain_name
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
 from toolkit.report.figures.top_view import last_word
+from toolkit.report.messages import missing_lines, outcome, remark_lines, sequence_line, status_lines, truth_lines
 from toolkit.report.metrics_json import Json
-from toolkit.report.words import missing_lines, outcome, remark_lines, sequence_line, status_lines, truth_lines
+from toolkit.resampling import NS_PER_S
 
 SCHEMA = "vislam.report/1"
 TRUTH_FILE = "trajectories/truth.tum"
@@ -145,7 +145,7 @@ def _told_or_why(series: Callable[[Row, Comparison], Json], row: Row, comparison
 
 
 def _nees(row: Row, comparison: Comparison) -> Json:
-    nees = nees_over_time(Judged(row.run, row.output, comparison.sequence))
+    nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
     return {
         "t_s": _seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
         "pose": numbers(nees.pose),

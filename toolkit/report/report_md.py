@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.report.comparison import Comparison
+from toolkit.report.messages import finding_lines, missing_lines, remark_lines, sequence_line, status_lines, truth_lines
 from toolkit.report.table import as_markdown, comparison_table
-from toolkit.report.words import finding_lines, missing_lines, remark_lines, sequence_line, status_lines, truth_lines
 
 _HOW_TO_READ = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 from toolkit.estimate import Trajectory
+from toolkit.files import check_replaceable, replaced_directory
 from toolkit.report import manifest, metrics_json, report_json
-from toolkit.report.atomic import check_replaceable, replaced_directory
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures import write_figures
 from toolkit.report.figures.alignment import truth_during

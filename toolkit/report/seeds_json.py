@@ -6,10 +6,10 @@ from dataclasses import fields
 
 import numpy as np
 
+from toolkit.experiment.monte_carlo import Group, OverSeeds, Spread
 from toolkit.metrics import describe
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.metrics_json import METRIC_KEYS, Json
-from toolkit.sweep.over_seeds import Group, OverSeeds, Spread
 
 SCHEMA = "vislam.seeds/1"
 STATUSES = ("ok", "diverged", "failed")

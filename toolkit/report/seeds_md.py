@@ -3,9 +3,9 @@
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
+from toolkit.experiment.monte_carlo import OverSeeds
 from toolkit.report.seeds_table import consistency_lines, seeds_table, status_lines
 from toolkit.report.table import as_markdown, as_text
-from toolkit.sweep.over_seeds import OverSeeds
 
 _WIDTH = 118
 _OUTSIDE_BY_DESIGN = """\

@@ -2,13 +2,13 @@
 
 import numpy as np
 
+from toolkit.experiment.monte_carlo import Group, OverSeeds
 from toolkit.geometry import Array
 from toolkit.report.contract import field_violations, schema_violations
 from toolkit.report.metrics_json import Json
 from toolkit.report.report_json import SCHEMA, numbers
 from toolkit.report.seeds_md import headline
 from toolkit.report.seeds_table import consistency_lines, status_lines
-from toolkit.sweep.over_seeds import Group, OverSeeds
 
 _FIELDS: dict[str, tuple[type, ...]] = {"t_s": (list,), "runs": (list,), "words": (dict,)}
 

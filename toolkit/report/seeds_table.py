@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
+from toolkit.experiment.monte_carlo import Group, OverSeeds
 from toolkit.report.table import Table, number
-from toolkit.sweep.over_seeds import Group, OverSeeds
 
 _MISSING = "-"
 # Key, name, what of it, unit, decimals; "mean" and "std" are over the seeds.

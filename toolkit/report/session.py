@@ -8,18 +8,18 @@ from pathlib import Path
 from toolkit import runner
 from toolkit.audit import Audit, audit
 from toolkit.datasets import load_references, load_sequence
-from toolkit.datasets.parts.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.datasets.trajectories import read_poses
 from toolkit.estimate import Output, Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
+from toolkit.files import check_parent
+from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.metrics import Scores, describe, score_run
-from toolkit.report.atomic import check_parent
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of, plain_name
 from toolkit.report.references import check_names, external_runs, reference_runs
 from toolkit.report.run_directory import check_run_directory, write_run
 from toolkit.runner import Progress
 from toolkit.sequence import Prior, Sequence, Truth
-from toolkit.start import start_from_measurements, start_from_truth
 
 ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 STARTS: dict[Start, Callable[[Sequence], Prior]] = {

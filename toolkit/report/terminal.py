@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.audit import Audit
 from toolkit.report.comparison import Comparison
+from toolkit.report.messages import finding_lines, missing_lines, outcome, sequence_line, status_lines, truth_lines
 from toolkit.report.table import as_text, comparison_table
-from toolkit.report.words import finding_lines, missing_lines, outcome, sequence_line, status_lines, truth_lines
 
 _WIDTH = 118
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3, so3_exp
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import (
     GRAVITY_WORLD,
     ImuNoise,
@@ -25,8 +25,8 @@ from toolkit.sequence import (
     TwistNoise,
 )
 from toolkit.simulation import sensors, world
+from toolkit.simulation.scenes import Stage, hall, road
 from toolkit.simulation.sensors import Imu, Measured, Odometer
-from toolkit.simulation.stages import Stage, hall, road
 from toolkit.simulation.trajectory import Kinematics, Trajectory
 from toolkit.simulation.world import Camera
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
 from toolkit.models.stereo import project
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuNoise, ImuSamples, MotionSamples, Observations, StereoRig, TwistNoise, TwistSamples
 from toolkit.simulation.trajectory import Trajectory
 from toolkit.simulation.world import Camera, Tracks

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.vision import CameraMotion
-from toolkit.cutting import NS_PER_S
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, TwistSamples, check_runnable
 
 # With fewer intervals than this the camera has no say.

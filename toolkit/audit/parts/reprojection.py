@@ -4,9 +4,9 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.audit.parts.vision import usable_pairs
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, se3_exp, se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 

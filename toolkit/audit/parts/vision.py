@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.neighbours import Neighbours, neighbours
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log, skew
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
 
 # After so many the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of where it would end.

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.datasets.trajectories.poses import OtherOrder
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
-from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.io.stamps import stamps_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.estimate import Trajectory
 from toolkit.geometry import quaternion_from_rotation
+from toolkit.resampling import NS_PER_S
 
 COLUMNS = "t qx qy qz qw x y z vx vy vz bgx bgy bgz bax bay baz"
 RECORDED_COLUMNS = "t x y z qx qy qz qw Pr11 ... Pt33"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
+from toolkit.resampling import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1
 

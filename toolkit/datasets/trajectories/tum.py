@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
-from toolkit.datasets.parts.stamps import stamps_ns
+from toolkit.datasets.io.stamps import stamps_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import quaternion_from_rotation
+from toolkit.resampling import NS_PER_S
 
 COLUMNS = "t x y z qx qy qz qw"
 KIND = "a TUM file is text, one pose a line"

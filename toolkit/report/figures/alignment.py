@@ -10,10 +10,10 @@ import numpy as np
 
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, IntArray, yaw_of
-from toolkit.metrics import Judged
-from toolkit.metrics.common.alignment import Alignment, fit_se3, fit_yaw
-from toolkit.metrics.common.association import associate, median_period_ns
-from toolkit.metrics.common.scores import Unavailable
+from toolkit.metrics import Evaluation
+from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_yaw
+from toolkit.metrics._shared.association import associate, median_period_ns
+from toolkit.metrics._shared.scores import Unavailable
 from toolkit.sequence import Sequence, Truth
 
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
@@ -41,7 +41,7 @@ def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
     """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
     fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
     try:
-        pairs = Judged(run, output, sequence).compared
+        pairs = Evaluation(run, output, sequence).compared
         return fit(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
     except Unavailable:
         return NOT_ALIGNED

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from toolkit.cutting import NS_PER_S
 from toolkit.geometry import Array
-from toolkit.metrics.common.alignment import Alignment
+from toolkit.metrics._shared.alignment import Alignment
 from toolkit.report.comparison import Comparison, Row
 from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, alignment_words, errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet, width_of
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
 
 # A run that is not ok is drawn up to this many times the largest error of the runs that are.

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from toolkit.estimate import Output
+from toolkit.experiment.monte_carlo import Group, OverSeeds
 from toolkit.geometry import Array
 from toolkit.report.figures.style import NamedFigure, line_of, new_figure, quiet
-from toolkit.sweep.over_seeds import Group, OverSeeds
 
 _COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}  # Okabe & Ito (2008)
 _BAND_COLOUR = "#cfd5da"

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 
 from toolkit.estimate import Run
 from toolkit.geometry import Array
-from toolkit.metrics import Judged, held_out, in_sample
-from toolkit.metrics.common.reprojection import CAP_PX
-from toolkit.metrics.common.scores import Unavailable
+from toolkit.metrics import Evaluation, held_out, in_sample
+from toolkit.metrics._shared.reprojection import CAP_PX
+from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
 from toolkit.report.figures.top_view import last_word
@@ -49,13 +49,13 @@ def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
     """Return the errors (n,) px by kind, without the kinds the run has none of."""
     if run.trajectory(last_word(run)) is None:
         return {}
-    judged = Judged(run, last_word(run), comparison.sequence)
-    kinds: dict[str, Callable[[Judged], Array]] = {"in-sample": in_sample.errors, "held-out": held_out.errors}
+    evaluation = Evaluation(run, last_word(run), comparison.sequence)
+    kinds: dict[str, Callable[[Evaluation], Array]] = {"in-sample": in_sample.errors, "held-out": held_out.errors}
     found = {}
     for kind, errors_of in kinds.items():
         try:
             with np.errstate(all="ignore"):  # a diverged run may overflow; the metrics cap what comes of it
-                found[kind] = errors_of(judged)
+                found[kind] = errors_of(evaluation)
         except Unavailable:
             continue
     return {kind: error_px for kind, error_px in found.items() if error_px.size}

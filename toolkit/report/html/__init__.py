@@ -7,7 +7,7 @@ itself is page.html, style.css and the scripts in ``scripts``, which :mod:`~tool
 from collections.abc import Sequence
 from pathlib import Path
 
-from toolkit.report.atomic import replaced_file
+from toolkit.files import replaced_file
 from toolkit.report.html.page import page_text
 from toolkit.report.html.payload import payload_of
 from toolkit.report.html.run_files import read_run

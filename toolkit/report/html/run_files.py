@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.cutting import NS_PER_S
 from toolkit.errors import DataError
 from toolkit.geometry import Array
 from toolkit.report import manifest, metrics_json, report_json, seeds_json, seeds_report_json
+from toolkit.resampling import NS_PER_S
 
 # A parsed JSON document of ours, after its validator had nothing to say.
 Document = dict[str, Any]

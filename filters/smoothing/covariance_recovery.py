@@ -1,0 +1,115 @@
+"""The covariance of every state of a solved graph: eliminate once forward in time, recover once backward.
+
+With the landmarks eliminated first and the states in the order of time, each state is a linear function of a few
+later ones plus noise: ``x = -R^-1 S x_S + n``. So the joint covariance of a short stretch of states, carried from
+the end to the beginning, yields every state's (Golub & Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery
+from a square root information matrix for data association"). GTSAM's Marginals asks its Bayes tree anew for each
+state, which takes a hundred times as long.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from filters.smoothing.indeterminate import variable_named
+from filters.smoothing.marginals import in_estimate_order
+from toolkit.estimate import Trajectory
+from toolkit.geometry import Array, IntArray
+
+
+def with_covariances(
+    trajectory: Trajectory,
+    linear: gtsam.GaussianFactorGraph,
+    landmark_keys: Sequence[int],
+    states: Sequence[Sequence[int]],
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Return the trajectory with the covariance of every state, or as it is and a line that says why."""
+    try:
+        covs = state_covs(linear, landmark_keys, states, trajectory.T_world_imu)
+    except RuntimeError as refusal:
+        name = gtsam.Symbol(variable_named(refusal)).string()
+        return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)
+    return replace(trajectory, cov=covs), ()
+
+
+def state_covs(
+    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]], poses: Array
+) -> Array:
+    """Return the covariance (K, d, d) of each state, in the order and on the side of an Estimate.
+
+    ``states`` names the keys of each state, in the order of time, as pose, (velocity,) bias; ``poses`` (K, 4, 4)
+    are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them.
+    """
+    _, reduced = linear.eliminatePartialSequential(_ordering(landmark_keys))
+    in_time = [key for keys in states for key in keys]
+    net = reduced.eliminateSequential(_ordering(in_time))
+    covs = list(_recovered([net.at(i) for i in range(net.size())], states))[::-1]
+    return np.stack([in_estimate_order(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
+
+
+def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
+class _Stretch:
+    """The joint covariance of the states that earlier ones still depend on."""
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        self._sizes: list[int] = []
+        self._cov = np.empty((0, 0))
+
+    def add(self, conditional: gtsam.GaussianConditional) -> None:
+        """Add the variable a conditional gives from variables that are here."""
+        key, *parents = conditional.keys()
+        root = np.linalg.inv(conditional.R())
+        gain = -root @ conditional.S()
+        cross = gain @ self._cov[self._rows(parents)]
+        own = root @ root.T + cross[:, self._rows(parents)] @ gain.T
+        self._cov = np.block([[self._cov, cross.T], [cross, own]])
+        self._keys.append(key)
+        self._sizes.append(len(root))
+
+    def joint(self, keys: Sequence[int]) -> Array:
+        """Return the joint covariance of some of the variables."""
+        rows = self._rows(keys)
+        return np.asarray(self._cov[np.ix_(rows, rows)])
+
+    def keep(self, needed: set[int]) -> None:
+        """Forget all other variables."""
+        kept = [i for i, key in enumerate(self._keys) if key in needed]
+        rows = self._rows([self._keys[i] for i in kept])
+        self._cov = self._cov[np.ix_(rows, rows)]
+        self._keys, self._sizes = [self._keys[i] for i in kept], [self._sizes[i] for i in kept]
+
+    def _rows(self, keys: Sequence[int]) -> IntArray:
+        ends = np.cumsum(self._sizes)
+        row_of = {key: range(end - size, end) for key, size, end in zip(self._keys, self._sizes, ends, strict=True)}
+        return np.array([row for key in keys for row in row_of[key]], dtype=np.int64)
+
+
+def _recovered(conditionals: list[gtsam.GaussianConditional], states: Sequence[Sequence[int]]) -> Iterator[Array]:
+    """Yield the covariance of each state from the last to the first."""
+    stretch, end = _Stretch(), len(conditionals)
+    needed_until = _first_dependents(conditionals)
+    for keys in reversed(states):
+        begin = end - len(keys)
+        for conditional in reversed(conditionals[begin:end]):
+            stretch.add(conditional)
+        yield stretch.joint(keys)
+        stretch.keep({key for key, first in needed_until.items() if first < begin})
+        end = begin
+
+
+def _first_dependents(conditionals: list[gtsam.GaussianConditional]) -> dict[int, int]:
+    """Return for each variable the first conditional that depends on it."""
+    first: dict[int, int] = {}
+    for place, conditional in enumerate(conditionals):
+        for parent in list(conditional.keys())[1:]:
+            first.setdefault(parent, place)
+    return first

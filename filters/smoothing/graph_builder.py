@@ -1,0 +1,98 @@
+"""How an incremental smoother's graph grows by one packet: new factors, first values, and what they concern.
+
+Sightings of tracks that have slipped to something else are left out.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from filters.kalman.belief import Belief, initial_belief
+from filters.kalman.gate import STEREO_GATE
+from filters.kalman.landmarks import LEAST_DISPARITY_PX
+from filters.kalman.prediction import predicted, predictor
+from filters.smoothing.landmarks import restricted
+from filters.smoothing.motion import MotionGraph, motion_graph
+from filters.smoothing.outlier_check import bound_to_its_map, slipped
+from toolkit.estimate import Estimate
+from toolkit.estimator import Setup
+from toolkit.geometry import Array
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors
+from toolkit.sequence import Packet, StereoFrame
+
+# Sightings that have not slipped but strain the filters' gate are weighed down from the gate's own bound.
+HUBER_THRESHOLD = float(np.sqrt(STEREO_GATE))
+
+
+@dataclass
+class Grown:
+    """New factors and values, and the keys of every state and landmark they concern."""
+
+    factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    state_keys: list[int] = field(default_factory=list)
+    landmark_ids: list[int] = field(default_factory=list)
+
+
+class Growth:
+    """Turns packets into what they add to a graph; remembers which landmarks the graph has."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._predictor = predictor(setup)
+        self._stereo = StereoFactors(setup.rig, gtsam.noiseModel.mEstimator.Huber.Create(HUBER_THRESHOLD))
+        self._points: dict[int, Array] = {}
+        self.motion: MotionGraph = motion_graph(setup)
+        self.belief: Belief = initial_belief(setup.prior, setup.motion_kind)
+
+    def by(self, packet: Packet) -> Grown:
+        """Return what a packet adds, the new state being predicted from the latest known."""
+        grown = Grown()
+        expected = self._add_state(packet, grown)
+        sound = ~slipped(packet.frame, self._points, expected, self._setup.rig)
+        self._add_sightings(restricted(packet.frame, sound), packet.index, grown)
+        return grown
+
+    def solved(self, newest: Estimate, points: Mapping[int, Array]) -> None:
+        """Take note of the newest state and of landmarks (3,) m as the smoother has them after a packet."""
+        self.belief = self.belief.at(newest)
+        self._points.update(points)
+
+    def forget(self, landmark_ids: set[int]) -> None:
+        """Take note that landmarks have left the graph; seen again, they start anew."""
+        for i in landmark_ids:
+            self._points.pop(i, None)
+
+    def _add_state(self, packet: Packet, grown: Grown) -> Belief:
+        """Add the new state; return it as expected against the map."""
+        expected = bound_to_its_map(self.belief)
+        if packet.motion is None:
+            new = self.motion.hold(self.belief, packet.index)
+        else:
+            new = self.motion.step(packet.motion, self.belief.bias, packet.index)
+            step = self._predictor.step(self.belief, packet.motion)
+            self.belief, expected = predicted(self.belief, step), predicted(expected, step)
+        for factor in new:
+            grown.factors.add(factor)
+        self._add_values(packet, grown)
+        return expected
+
+    def _add_values(self, packet: Packet, grown: Grown) -> None:
+        self.motion.insert(grown.values, self.belief.estimate(packet.frame.t_ns), packet.index)
+        grown.state_keys = list(grown.values.keys())
+
+    def _add_sightings(self, frame: StereoFrame, k: int, grown: Grown) -> None:
+        near = stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX
+        known = np.array([i in self._points for i in frame.track_ids.tolist()], dtype=bool)
+        used = restricted(frame, known | near)
+        new = restricted(frame, ~known & near)
+        points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._setup.rig)
+        for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
+            grown.values.insert(L(track_id), point)
+        for factor in self._stereo.of(used, k):
+            grown.factors.add(factor)
+        grown.landmark_ids = used.track_ids.tolist()
+        self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))

@@ -1,0 +1,217 @@
+"""iSAM2 that goes on where GTSAM's stops: it drops the landmark, or solves by QR, and says so.
+
+Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation.
+Landmarks are eliminated first and states in the order of time, the newest last: new sightings then reach few
+cliques, and the marginal of the newest state stands in the root.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+
+import gtsam
+import numpy as np
+
+from filters.smoothing.cached_linearisation import Held, contained, held_of, renewed
+from filters.smoothing.frozen_variables import Resting
+from filters.smoothing.indeterminate import variable_named, weak_hold
+from toolkit.errors import EstimatorError
+from toolkit.geometry import Array
+from toolkit.models.factors import kind_of
+
+# The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
+# states left out of the order make the tree ever denser.
+RECENT_FRAMES = 100
+# What none of so many frames concerns is linearised anew in the end only: a heading that turns by a hair moves the
+# whole past, and a frame would cost as much as the run is long.
+FLUID_FRAMES = 30
+# So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
+QR_FRAMES = 20
+# How far variables may stray from where they are linearised: rad, m/s, the biases' units; and for positions and
+# landmarks multiples of the baseline, the length that sets the scale of what stereo sees. Coarser thresholds mix
+# linearisation points: with five times these a flight of two minutes was five times less accurate.
+ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD_MPS, BIAS_THRESHOLD = 0.01, 0.01, 0.01
+POSITION_THRESHOLD_BASELINES, LANDMARK_THRESHOLD_BASELINES = 0.1, 0.5
+# Older states hardly move: their Python factors are looked at again in the end.
+WATCHED_STEPS = 40
+MOST_RECOVERIES = 20
+
+
+class IncrementalTree:
+    """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
+
+    def __init__(self, bias_size: int, baseline_m: float) -> None:
+        self._bias_size, self._baseline_m = bias_size, baseline_m
+        self._factorization, self._frames_by_qr = "CHOLESKY", 0
+        self.isam = self._empty_tree()
+        self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
+        self._resting = Resting(FLUID_FRAMES)
+        self._slot_count = 0
+        self._held: dict[int, Held] = {}
+        self._sightings: dict[int, list[int]] = {}
+
+    def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> list[str]:
+        """Take in a frame whose new state has the given keys; return what had to be recovered, a line each.
+
+        Raises EstimatorError where the system stays indeterminate whatever is dropped.
+        """
+        if self._factorization == "QR":
+            self._return_to_cholesky(values)
+        self._recent.append(state_keys)
+        self._resting.concerns(factors.keyVector())
+        held = held_of(factors, lambda keys: self._first_values(keys, values))
+        moved = renewed(list(self._held.items())[-WATCHED_STEPS:], self.read)
+        return self._update(contained(factors, held), values, held, moved)
+
+    def settle(self, most_rounds: int = 5) -> list[str]:
+        """Renew the Python factors whose states have moved since, until none has; return what was recovered."""
+        log = []
+        self._resting = Resting(FLUID_FRAMES)
+        for _ in range(most_rounds):
+            moved = renewed(self._held.items(), self.read)
+            log += self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, moved)
+            if not moved:
+                break
+        return log
+
+    def drop(self, landmarks: Iterable[int]) -> list[str]:
+        """Take landmarks out, with all their sightings; return what had to be recovered."""
+        slots = [slot for key in landmarks for slot in self._sightings.pop(key)]
+        return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
+
+    def has(self, key: int) -> bool:
+        """Say whether a variable is in the tree."""
+        return bool(self.isam.valueExists(key))
+
+    def landmarks(self) -> list[int]:
+        """Return the keys of the landmarks in the tree."""
+        return list(self._sightings)
+
+    def read(self, keys: list[int]) -> gtsam.Values:
+        """Return the latest values of the keys of states, without copying the others'."""
+        values = gtsam.Values()
+        for key in keys:
+            values.insert(key, self._state_variable(key))
+        return values
+
+    def points(self, landmarks: Iterable[int]) -> Array:
+        """Return the latest points (N, 3) of landmarks in the world."""
+        return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
+
+    def _state_variable(self, key: int) -> gtsam.Pose3 | gtsam.imuBias.ConstantBias | Array:
+        kind = kind_of(key)
+        if kind == "x":
+            return self.isam.calculateEstimatePose3(key)
+        if kind == "b" and self._bias_size == 6:
+            return self.isam.calculateEstimateConstantBias(key)
+        return self.isam.calculateEstimateVector(key)
+
+    def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
+        values = self.read([key for key in keys if not new.exists(key)])
+        values.insert(new.extract([key for key in keys if new.exists(key)]))
+        return values
+
+    def _update(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        held: dict[int, Held],
+        moved: dict[int, Held],
+        dropped_slots: Iterable[int] = (),
+    ) -> list[str]:
+        """Add factors, of which ``held`` stand at their places; replace those moved, by slot; take some out.
+
+        The slots of new factors follow those of the old, in every case: after a refusal they are known too.
+        """
+        for slot, renewal in moved.items():
+            del self._held[slot]
+            held[factors.size()] = renewal
+            factors.add(renewal.container())
+        self._held |= {self._slot_count + place: factor for place, factor in held.items()}
+        for place in range(factors.size()):
+            keys: list[int] = factors.at(place).keys()
+            for key in keys:
+                if kind_of(key) == "l":
+                    self._sightings.setdefault(key, []).append(self._slot_count + place)
+        self._slot_count += factors.size()
+        try:
+            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._resting.keys)
+        except RuntimeError as refusal:
+            return self._recovered(refusal)
+        return []
+
+    def _order(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
+        """Return the place of each recent state in the elimination; all else comes first.
+
+        CCOLAMD takes no place beyond the number of variables it orders, of which the new factors' are the least.
+        """
+        groups, places = gtsam.KeyGroupMap(), max(factors.keys().size() - 1, 0)
+        for place, keys in enumerate(list(self._recent)[max(len(self._recent) - places, 0) :], start=1):
+            for key in keys:
+                groups.insert2(key, place)
+        return groups
+
+    def _recovered(self, refusal: RuntimeError) -> list[str]:
+        """Build the tree anew without the landmarks GTSAM names, or with a weak hold on the states it names."""
+        log = []
+        for _ in range(MOST_RECOVERIES):
+            key = variable_named(refusal)
+            factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
+            values = self.isam.getLinearizationPoint()
+            if kind_of(key) == "l":
+                log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
+                for slot in self._sightings.pop(key):
+                    factors.remove(slot)
+                values.erase(key)
+            elif self._factorization == "CHOLESKY":
+                log.append(f"{gtsam.Symbol(key).string()} was indeterminate to rounding: solved by QR for some frames")
+                self._factorization, self._frames_by_qr = "QR", 0
+            else:
+                log.append(f"{gtsam.Symbol(key).string()} was indeterminate and is held weakly where it was")
+                factors.add(weak_hold(key, values))
+            try:
+                self._rebuild(factors, values)
+            except RuntimeError as again:
+                refusal = again
+            else:
+                return log
+        raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+
+    def _return_to_cholesky(self, new: gtsam.Values) -> None:
+        """Go back from QR, ten times dearer, once vision has been back for some frames."""
+        sees = any(kind_of(key) == "l" for key in list(new.keys()))
+        self._frames_by_qr += sees
+        if self._frames_by_qr <= QR_FRAMES:
+            return
+        values = self.isam.calculateBestEstimate()
+        for factorization in ("CHOLESKY", "QR"):
+            self._factorization, self._frames_by_qr = factorization, 0
+            try:
+                self._rebuild(gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe()), values)
+            except RuntimeError:
+                if factorization == "QR":
+                    raise
+            else:
+                return
+
+    def _rebuild(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        kept = [slot for slot in range(factors.size()) if factors.exists(slot)]
+        compact, slot_of = gtsam.NonlinearFactorGraph(), {old: new for new, old in enumerate(kept)}
+        for slot in kept:
+            compact.add(factors.at(slot))
+        self._slot_count = len(kept)
+        self._held = {slot_of[old]: factor for old, factor in self._held.items()}
+        self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
+        self.isam = self._empty_tree()
+        self.isam.update(compact, values, [], self._order(compact))
+
+    def _empty_tree(self) -> gtsam.ISAM2:
+        pose = [ROTATION_THRESHOLD_RAD] * 3 + [POSITION_THRESHOLD_BASELINES * self._baseline_m] * 3
+        params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
+        thresholds.insert(("x", np.array(pose)))
+        thresholds.insert(("v", np.full(3, VELOCITY_THRESHOLD_MPS)))
+        thresholds.insert(("b", np.full(self._bias_size, BIAS_THRESHOLD)))
+        thresholds.insert(("l", np.full(3, LANDMARK_THRESHOLD_BASELINES * self._baseline_m)))
+        params.setRelinearizeThreshold(thresholds)
+        params.relinearizeSkip = 1
+        params.setFactorization(self._factorization)
+        return gtsam.ISAM2(params)

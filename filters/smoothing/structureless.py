@@ -1,0 +1,152 @@
+"""Sightings of many landmarks from many poses as information on the poses alone: the landmarks are eliminated.
+
+Each track is a smart factor (Carlone, Kira, Beall, Indelman & Dellaert 2014, "Eliminating conditionally independent
+sets in factor graphs"; Forster et al. 2017, eqs. 47-50): its landmark's 3x3 block is eliminated by a Schur
+complement, for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does the same for one noise only, equal
+and independent in uL, uR and v; this takes the rig's whole covariance and weighs each sighting by Huber's loss.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csc_array
+
+from filters.smoothing.graph_builder import HUBER_THRESHOLD
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew
+from toolkit.models import stereo
+from toolkit.sequence import StereoRig
+
+# A sighting from behind the camera says nothing, but must not be the cheaper place to be: it costs a gross mismatch.
+_BEHIND_NORM = 100.0
+# Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
+_LEAST_INFORMATION_PER_M2 = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """N sightings: rows of their poses (N,), rows of their points (N,) and measurements (N, 3) px."""
+
+    pose: IntArray
+    point: IntArray
+    uv_px: Array
+
+    def of_points(self, points: IntArray) -> "Sightings":
+        """Return the sightings of some points (M,), which keep their rows."""
+        rows = np.isin(self.point, points)
+        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
+
+
+class Seen(NamedTuple):
+    """Where N sightings' points are: rotations (N, 3, 3) to the body, the points (N, 3) there and in the camera."""
+
+    R_imu_world: Array
+    points_imu: Array
+    points_cam: Array
+
+    @property
+    def in_front(self) -> BoolArray:
+        """Say which points (N,) are in front of the camera."""
+        front: BoolArray = self.points_cam[:, 2] > 0.0
+        return front
+
+
+class Reduced(NamedTuple):
+    """Information (6K, 6K) and its vector (6K,) on the poses, and what gives the points' step back."""
+
+    information: Array
+    vector: Array
+    coupling: Array
+    root: Array
+    point_vector: Array
+
+    def point_steps(self, pose_steps: Array) -> Array:
+        """Return the steps (M, 3) of the points that go with steps (6K,) of the poses."""
+        whitened = self.point_vector - (self.coupling.T @ pose_steps).reshape(-1, 3)
+        return (self.root @ whitened[..., None])[..., 0]
+
+
+def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> Seen:
+    """Return where the points (M, 3) of sightings are, seen from their poses (K, 4, 4) of the IMU in the world."""
+    T_imu_world = se3_inverse(poses)[sightings.pose]
+    R_imu_world, T_cam_imu = T_imu_world[:, :3, :3], se3_inverse(rig.T_imu_cam)
+    with np.errstate(invalid="ignore"):
+        points_imu = (R_imu_world @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
+        return Seen(R_imu_world, points_imu, points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class Vision:
+    """Sightings evaluated at poses (K, 4, 4) and points (M, 3): what they cost, and on demand what they say."""
+
+    counts: tuple[int, int]
+    sightings: Sightings
+    seen: Seen
+    rig: StereoRig
+
+    @classmethod
+    def at(cls, poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> "Vision":
+        """Evaluate sightings at poses of the IMU in the world and points in the world."""
+        return cls((len(poses), len(points)), sightings, seen_from(poses, points, sightings, rig), rig)
+
+    @property
+    def loss(self) -> float:
+        """The sum of Huber's losses of the whitened residuals, half a square each where small."""
+        norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
+        beyond = HUBER_THRESHOLD * (norm - HUBER_THRESHOLD / 2)
+        return float(np.where(norm <= HUBER_THRESHOLD, 0.5 * norm**2, beyond).sum())
+
+    def reduced(self) -> Reduced:
+        """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
+        weights = np.where(self.seen.in_front, np.sqrt(HUBER_THRESHOLD / np.maximum(self._norm, HUBER_THRESHOLD)), 0.0)
+        to_cam = self._root @ stereo.projection_jacobian(self._points_cam, self.rig)
+        J_body = weights[:, None, None] * (to_cam @ self.rig.T_imu_cam[:3, :3].T)
+        # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the body.
+        J_pose = np.concatenate([J_body @ skew(self.seen.points_imu), -J_body], axis=-1)
+        J_point = J_body @ self.seen.R_imu_world
+        return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
+
+    @cached_property
+    def _residual(self) -> Array:
+        """Measured less predicted, whitened (N, 3)."""
+        return (self.sightings.uv_px - stereo.project(self._points_cam, self.rig)) @ self._root.T
+
+    @cached_property
+    def _norm(self) -> Array:
+        return np.asarray(np.linalg.norm(self._residual, axis=1))
+
+    @property
+    def _points_cam(self) -> Array:
+        """The points in the camera; those behind it stand at a place that has an image."""
+        return np.where(self.seen.in_front[:, None], self.seen.points_cam, np.array([0.0, 0.0, 1.0]))
+
+    @property
+    def _root(self) -> Array:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.rig.cov_uv_px2)))
+
+
+def _eliminated(residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]) -> Reduced:
+    pose_count, point_count = counts
+    # Small matrix products are several times as fast on contiguous arrays.
+    to_pose, to_point = (np.ascontiguousarray(np.swapaxes(J, 1, 2)) for J in (J_pose, J_point))
+    per_pose, per_point = _summation(seen.pose, pose_count), _summation(seen.point, point_count)
+    information_point = (per_point @ (to_point @ J_point).reshape(-1, 9)).reshape(-1, 3, 3)
+    information_point += _LEAST_INFORMATION_PER_M2 * np.eye(3)
+    vector_point = per_point @ (to_point @ residual[..., None])[..., 0]
+    root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
+    whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
+    coupling = np.zeros((pose_count, 6, point_count, 3))
+    coupling[seen.pose, :, seen.point, :] = to_pose @ (J_point @ root[seen.point])
+    across = coupling.reshape(6 * pose_count, 3 * point_count)
+    information = -(across @ across.T)
+    diagonal = information.reshape(pose_count, 6, pose_count, 6)
+    blocks = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(-1, 6, 6)
+    diagonal[np.arange(pose_count), :, np.arange(pose_count), :] += blocks
+    vector = per_pose @ (to_pose @ residual[..., None])[..., 0]
+    return Reduced(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
+
+
+def _summation(groups: IntArray, count: int) -> csc_array:
+    """Return the matrix (count, N) that adds up the rows (N, d) of each group."""
+    return csc_array((np.ones(groups.size), groups, np.arange(groups.size + 1)), shape=(count, groups.size))

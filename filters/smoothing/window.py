@@ -1,0 +1,153 @@
+"""A window of states held by motion factors and a linear prior, with structureless vision, as normal equations.
+
+Everything is dense: a window has a few hundred unknowns.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.linalg import cholesky
+
+from filters.smoothing.structureless import Reduced, Sightings, Vision
+from toolkit.geometry import Array
+from toolkit.sequence import StereoRig
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Information (D, D) and vector (D,) on the first D unknowns of the window, about values of their states."""
+
+    information: Array
+    vector: Array
+    about: gtsam.Values
+
+    @classmethod
+    def nothing(cls) -> "Prior":
+        """Return the prior that says nothing."""
+        return cls(np.zeros((0, 0)), np.zeros(0), gtsam.Values())
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """States in the order of time, their keys (each [pose, velocity, bias] or [pose, bias]) and what holds them.
+
+    ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
+    """
+
+    keys: tuple[tuple[int, ...], ...]
+    values: gtsam.Values
+    motion: tuple[gtsam.NonlinearFactorGraph, ...]
+    prior: Prior
+    sightings: Sightings
+    points: Array
+
+    @property
+    def poses(self) -> Array:
+        """Return the poses (K, 4, 4) of the IMU in the world."""
+        return np.array([self.values.atPose3(keys[0]).matrix() for keys in self.keys])
+
+    @property
+    def all_keys(self) -> list[int]:
+        """Return the keys of all states, in the order of the unknowns."""
+        return [key for keys in self.keys for key in keys]
+
+    @property
+    def size(self) -> int:
+        """Return the unknowns of one state."""
+        return int(self.values.extract(list(self.keys[0])).dim())
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """The normal equations (D, D), (D,) of a window and the elimination of its landmarks."""
+
+    information: Array
+    vector: Array
+    vision: Reduced
+
+    @cached_property
+    def root(self) -> Array:
+        """The lower Cholesky factor (D, D) of the information; raises LinAlgError where there is none."""
+        return _lower_factor(self.information)
+
+    def damped_root(self, damping: float) -> Array:
+        """Return the lower Cholesky factor with a share of the diagonal added; raises LinAlgError as ``root``."""
+        if damping == 0.0:
+            return self.root
+        damped = self.information.copy()
+        damped.flat[:: len(damped) + 1] *= 1.0 + damping
+        return _lower_factor(damped)
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """A window and what it costs where it is: half the squared errors, Huber's losses, the prior's."""
+
+    window: Window
+    motion: gtsam.GaussianFactorGraph
+    off_prior: Array
+    vision: Vision
+
+    @classmethod
+    def of(cls, window: Window, rig: StereoRig) -> "Evaluated":
+        """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
+        vision = Vision.at(window.poses, window.points, window.sightings, rig)
+        return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
+
+    @cached_property
+    def error(self) -> float:
+        """What the window costs."""
+        prior, off = self.window.prior, self.off_prior
+        held = float(0.5 * off @ prior.information @ off - prior.vector @ off)
+        return held + float(self.motion.error(self.window.values.zeroVectors())) + self.vision.loss
+
+    def linearised(self) -> System:
+        """Return the normal equations."""
+        window, count, held = self.window, len(self.window.keys), len(self.off_prior)
+        d = window.size
+        information, vector = self._of_motion(count * d)
+        information[:held, :held] += window.prior.information
+        vector[:held] += window.prior.vector - window.prior.information @ self.off_prior
+        vision = self.vision.reduced()
+        information.reshape(count, d, count, d)[:, :6, :, :6] += vision.information.reshape(count, 6, count, 6)
+        vector.reshape(count, d)[:, :6] += vision.vector.reshape(count, 6)
+        return System(information, vector, vision)
+
+    def _of_motion(self, size: int) -> tuple[Array, Array]:
+        """Return the normal equations of the motion, which ties the first states of the window, or all."""
+        tied, ordering = set(self.motion.keyVector()), gtsam.Ordering()
+        for key in self.window.all_keys:
+            if key in tied:
+                ordering.push_back(key)
+        information, vector = np.zeros((0, 0)), np.zeros(0)
+        if tied:
+            # Symmetric, and in GTSAM's order of columns: its transpose is the same and in NumPy's.
+            augmented = self.motion.augmentedHessian(ordering).T
+            information, vector = augmented[:-1, :-1], augmented[-1, :-1]
+        rest = size - len(vector)
+        return (information, vector) if rest == 0 else (np.pad(information, (0, rest)), np.pad(vector, (0, rest)))
+
+
+def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFactorGraph:
+    whole = gtsam.NonlinearFactorGraph()
+    for graph in graphs:
+        whole.push_back(graph)
+    return whole
+
+
+def _off_prior(window: Window) -> Array:
+    """Return how far (D,) the prior's states are from the values it is about."""
+    about = window.prior.about
+    held = [key for key in window.all_keys if about.exists(key)]
+    if not held:
+        return np.zeros(0)
+    delta = about.localCoordinates(window.values.extract(held))
+    return np.concatenate([delta.at(key) for key in held])
+
+
+def _lower_factor(matrix: Array) -> Array:
+    # LAPACK takes columns where NumPy has rows: of a symmetric matrix the transpose is the same and need not be copied.
+    return np.asarray(cholesky(matrix.T, lower=True, check_finite=False))

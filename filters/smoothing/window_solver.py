@@ -1,0 +1,126 @@
+"""The minimum of a window of states, the covariance of each of them, and the window without its oldest.
+
+What leaves is marginalised by a Schur complement, with the whole of every track it saw, so that each sighting counts
+once (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag smoothing"; Leutenegger et al. 2015, section 3.4).
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from filters.smoothing.structureless import Sightings
+from filters.smoothing.window import Evaluated, Prior, System, Window
+from toolkit.errors import EstimatorError
+from toolkit.geometry import Array, IntArray
+from toolkit.sequence import StereoRig
+
+MOST_ITERATIONS = 5
+# Newton's method doubles its digits: after a step of so few sigmas of all states together the next is of a tenth of
+# one, and is taken with the next frame. Where a step gains hardly anything, the rest gain nothing.
+LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
+# Only for a step that fails: a millionth of what the sightings say of one pose, given the rest, is more than is known
+# of position and heading in the world, and would hold them where they were.
+_FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A window at its minimum and the root of the information it was last linearised to, a step short of that."""
+
+    window: Window
+    root: Array
+
+    def cov(self, i: int) -> Array:
+        """Return the marginal covariance (d, d) of state i, in GTSAM's spaces.
+
+        With the root's rows in the order of time, those before the state say nothing of it.
+        """
+        d = self.window.size
+        later = self.root[i * d :, i * d :]
+        half = solve_triangular(later, np.eye(len(later), d), lower=True, check_finite=False)
+        return np.asarray(half.T @ half)
+
+
+def solved(window: Window, rig: StereoRig) -> Solution:
+    """Return the window at its minimum, by Levenberg-Marquardt.
+
+    Raises EstimatorError where the error is not a number or the states are not determined.
+    """
+    here, damping = Evaluated.of(window, rig), 0.0
+    if not np.isfinite(here.error):
+        raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
+    for _ in range(MOST_ITERATIONS):
+        system = here.linearised()
+        step = _descent(here, system, damping, rig)
+        decrease, here = here.error - step.there.error, step.there
+        if step.sigmas <= LAST_STEP_SIGMAS or decrease <= RELATIVE_DECREASE * here.error:
+            break
+        damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
+    try:
+        return Solution(here.window, system.root)
+    except np.linalg.LinAlgError as refusal:
+        raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
+
+
+def without_oldest(window: Window, count: int, rig: StereoRig) -> Window:
+    """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
+    seen = window.sightings
+    spoken = np.unique(seen.point[seen.pose < count])
+    told = replace(_only(window, spoken), motion=window.motion[: count + 1])
+    system, gone = Evaluated.of(told, rig).linearised(), count * window.size
+    root = np.linalg.cholesky(system.information[:gone, :gone])
+    across = solve_triangular(root, system.information[:gone, gone:], lower=True)
+    information = system.information[gone:, gone:] - across.T @ across
+    vector = system.vector[gone:] - across.T @ solve_triangular(root, system.vector[:gone], lower=True)
+    values = gtsam.Values(window.values)
+    for keys in window.keys[:count]:
+        for key in keys:
+            values.erase(key)
+    left = ~np.isin(seen.point, spoken)
+    kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
+    prior = Prior(information, vector, values)
+    motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
+    return Window(window.keys[count:], values, motion, prior, kept, window.points)
+
+
+def _only(window: Window, points: IntArray) -> Window:
+    """Return the window with some points (M,), by their ascending rows, and their sightings."""
+    seen = window.sightings.of_points(points)
+    rows = np.searchsorted(points, seen.point).astype(np.int64)
+    return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
+
+
+class _Step(NamedTuple):
+    """Where a step leads, how long it is in standard deviations of all states together, and how it was damped."""
+
+    there: Evaluated
+    sigmas: float
+    damping: float
+
+
+def _descent(here: Evaluated, system: System, damping: float, rig: StereoRig) -> _Step:
+    """Return a step that costs no more, damped as far as that takes, or one of no length."""
+    while damping <= _MOST_DAMPING:
+        try:
+            step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
+            there = Evaluated.of(_moved(here.window, system, step), rig)
+            if there.error <= here.error:
+                return _Step(there, float(np.sqrt(step @ system.vector)), damping)
+        except np.linalg.LinAlgError:
+            pass
+        damping = max(10.0 * damping, _FIRST_DAMPING)
+    return _Step(here, 0.0, damping)
+
+
+def _moved(window: Window, system: System, step: Array) -> Window:
+    """Return the window a step (D,) of its states on, its landmarks with them."""
+    delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
+    for key in window.all_keys:
+        delta.insert(key, step[start : start + dims[key]])
+        start += dims[key]
+    pose_steps = step.reshape(len(window.keys), -1)[:, :6].ravel()
+    points = window.points + system.vision.point_steps(pose_steps)
+    return replace(window, values=window.values.retract(delta), points=points)

@@ -1,0 +1,131 @@
+"""What is said about many seeds: spreads over the runs that are ok, the NEES of all against the band of as many."""
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import is_drawn_from_a_seed
+from toolkit.experiment.monte_carlo import mean_nees, spread_of
+from toolkit.metrics import describe
+from toolkit.metrics._shared.consistency import nees_band
+from toolkit.report import seeds_json
+from toolkit.report.figures import over_seeds as figures
+from toolkit.report.metrics_json import to_text
+from toolkit.report.seeds_md import seeds_report, seeds_text
+
+
+def test_spread_is_numpys():
+    values = [3.0, 1.0, 2.0, 10.0]
+    spread = spread_of(values)
+    assert (spread.n, spread.mean, spread.median) == (4, 4.0, 2.5)
+    assert spread.std == pytest.approx(np.std(values, ddof=1))
+    assert (spread.least, spread.lower_quartile, spread.upper_quartile, spread.most) == (1.0, 1.75, 4.75, 10.0)
+
+
+def test_one_value_has_no_deviation_and_none_has_no_spread():
+    assert spread_of([2.0]).std is None
+    assert spread_of([]) is None
+
+
+@pytest.mark.parametrize("seeds", [1, 5, 40])
+def test_the_mean_nees_of_consistent_runs_is_in_its_band_at_95_percent(seeds):
+    frames = 20_000
+    nees = np.random.default_rng(7).chisquare(6, (seeds, frames)) / 6
+    assert mean_nees(nees).in_band_percent == pytest.approx(95.0, abs=4.0 * 100.0 * np.sqrt(0.95 * 0.05 / frames))
+
+
+def test_many_seeds_find_a_covariance_that_one_seed_does_not():
+    nees = 1.5 * np.random.default_rng(8).chisquare(6, (40, 2000)) / 6
+    assert mean_nees(nees[:1]).in_band_percent > 75.0
+    assert mean_nees(nees).in_band_percent < 10.0
+    assert mean_nees(nees).too_sure_percent > 90.0
+
+
+def test_the_band_is_for_the_runs_that_are_there():
+    nees = np.ones((3, 4))
+    nees[0, 1:] = nees[1, 2:] = nees[2, 3:] = np.nan
+    averaged = mean_nees(nees)
+    assert averaged.runs.tolist() == [3, 2, 1, 0]
+    assert (averaged.low[0], averaged.high[0]) == nees_band(6, 3)
+    assert (averaged.low[2], averaged.high[2]) == nees_band(6, 1)
+    assert np.isnan(averaged.mean[3])
+    assert averaged.in_band_percent == 100.0
+
+
+def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
+    astray = over.groups[2]
+    assert (astray.estimator, astray.counts) == ("astray", {"ok": 3, "diverged": 1, "failed": 0})
+    assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
+    assert astray.values("ate_none_m") == [3.0, 4.0, 5.0, 6.0]
+    assert not over.all_ok
+
+
+def test_an_estimator_without_any_answer_keeps_a_line(over):
+    assert [(g.estimator, g.output) for g in over.groups] == [
+        ("honest", "causal"),
+        ("honest", "final"),
+        ("astray", "causal"),
+        ("broken", "final"),
+    ]
+    assert over.groups[3].spread("ate_none_m") is None
+    assert over.groups[3].reason("ate_none_m") == "no run is ok"
+
+
+@pytest.fixture
+def document(over):
+    return json.loads(to_text(seeds_json.build(over)))
+
+
+def test_seeds_json_obeys_its_schema(document):
+    assert seeds_json.violations(document) == []
+    assert list(document["runs"][0]["metrics"]) == list(describe())
+    assert document["runs"][2]["status"] == ["ok", "diverged", "ok", "ok"]
+    assert document["runs"][0]["over_seeds"]["nees_pose_band"] == list(nees_band(6, 4))
+    assert document["hashes"] == ["hash3", "hash4", "hash5", "hash6"]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda d: d.update(schema="vislam.seeds/2"),
+        lambda d: d.pop("runs"),
+        lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"),
+        lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(),
+        lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"),
+        lambda d: d["runs"][0]["counts"].update(ok=9),
+        lambda d: d["runs"][0]["status"].__setitem__(0, "fine"),
+        lambda d: d["runs"][3]["notes"].clear(),
+    ],
+)
+def test_the_validator_notices(document, spoil):
+    spoiled = copy.deepcopy(document)
+    spoil(spoiled)
+    assert seeds_json.violations(spoiled)
+
+
+@pytest.mark.parametrize("document", [None, [], {"runs": [3], "seeds": [1]}])
+def test_the_validator_survives_anything(document):
+    assert seeds_json.violations(document)
+
+
+def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
+    for text in (seeds_text(over), seeds_report(over, {})):
+        assert "astray diverged under seed 4: left the road" in text
+        assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
+        assert "too sure of itself" in text
+    assert max(map(len, seeds_text(over).splitlines())) <= 118
+
+
+def test_both_figures_are_drawn(over, tmp_path):
+    drawn = list(figures.draw(over))
+    assert [figure.name for figure in drawn] == ["errors_over_seeds", "nees_over_seeds"]
+    for figure in drawn:
+        figure.figure.savefig(tmp_path / f"{figure.name}.png")
+
+
+def test_simulated_sequences_are_drawn_from_a_seed_and_recordings_are_not():
+    assert is_drawn_from_a_seed("drive")
+    assert not is_drawn_from_a_seed(str(Path(__file__).parents[2] / "data" / "drive_small"))

@@ -1,0 +1,94 @@
+"""A baseline made up for the tests, and ways to change what is measured against it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series
+from toolkit.gate.checking import judge_all
+from toolkit.gate.judging import Judged, judge_case
+from toolkit.gate.releases import installed
+from toolkit.gate.verdict import Check
+
+SEEDS = tuple(range(24))
+ESTIMATORS = ("one", "two", "three")
+SPREAD = 0.03
+
+Edit = Callable[[str, str, np.ndarray], np.ndarray]
+
+
+def series(rng: np.random.Generator, count: int, keys: tuple[str, ...]) -> Series:
+    values = {key: tuple(np.exp(rng.normal(-2.0, 0.4, count)).tolist()) for key in keys}
+    if "nees_pose_mean" in keys:
+        values["nees_pose_mean"] = tuple(np.exp(rng.normal(1.5, 0.3, count)).tolist())
+    values[COVERAGE] = (100.0,) * count
+    speed = tuple(rng.normal(5.0, 0.2, count).tolist())
+    return Series(("ok",) * count, speed, {"causal": values})
+
+
+@pytest.fixture
+def baseline() -> Baseline:
+    rng = np.random.default_rng(5)
+    simulated = Case("flight", True, SEEDS, ESTIMATORS, 2.5)
+    recorded = Case("data/drive_small", False, (0,), ESTIMATORS)
+    measured = []
+    for case, keys in ((simulated, DEFAULT_BOUNDS.simulated), (recorded, DEFAULT_BOUNDS.recorded)):
+        runs = {name: series(rng, len(case.seeds), tuple(keys)) for name in ESTIMATORS}
+        hashes = tuple(f"{case.source}-{seed:064d}" for seed in case.seeds)
+        measured.append((case, Measured(hashes, tuple(f"{seed:016d}" for seed in case.seeds), runs)))
+    return Baseline(installed(), tuple(measured))
+
+
+def edited(measured: Measured, edit: Edit) -> Measured:
+    """Return what is measured with every metric's values changed by ``edit(estimator, metric, values)``."""
+    runs = {
+        name: replace(
+            one,
+            outputs={
+                output: {
+                    key: tuple(edit(name, key, np.array(values)).tolist()) if key != COVERAGE else values
+                    for key, values in metrics.items()
+                }
+                for output, metrics in one.outputs.items()
+            },
+        )
+        for name, one in measured.runs.items()
+    }
+    return replace(measured, runs=runs)
+
+
+def judged(baseline: Baseline, now: list[Measured], *, speed: bool = True) -> Check:
+    """Judge measurements that were never made against a baseline."""
+    every = Judged()
+    for (case, before), after in zip(baseline.cases, now, strict=True):
+        one = judge_case(case, before, after, baseline.bounds, speed=speed)
+        every.verdicts += one.verdicts
+        every.tests += one.tests
+        every.notes += one.notes
+    return judge_all(every, baseline, "made-up.json", 1.0)
+
+
+def as_measured(baseline: Baseline) -> list[Measured]:
+    return [measured for _, measured in baseline.cases]
+
+
+def planted(percent: float, seed: int, estimator: str = "two", metric: str = "ate_se3_m") -> Edit:
+    """Return an edit: noise on everything, and one metric of one estimator worse by so many percent."""
+    rng = np.random.default_rng(seed)
+
+    def edit(name: str, key: str, values: np.ndarray) -> np.ndarray:
+        factor = 1.0 + percent / 100.0 if (name, key) == (estimator, metric) else 1.0
+        return np.asarray(values * factor * np.exp(rng.normal(0.0, SPREAD, values.size)))
+
+    return edit
+
+
+@pytest.fixture
+def gate() -> SimpleNamespace:
+    """Return the ways to change what is measured, and to judge it."""
+    return SimpleNamespace(
+        as_measured=as_measured, edited=edited, estimators=ESTIMATORS, judged=judged, planted=planted, seeds=SEEDS
+    )

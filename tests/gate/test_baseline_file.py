@@ -1,0 +1,142 @@
+"""A baseline is read back to the bit, and anything wrong with its file is told in one line."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from toolkit.gate.baseline import BaselineError
+from toolkit.gate.baseline_json import to_text
+from toolkit.gate.baseline_reader import check_releases, load_baseline
+from toolkit.gate.releases import differences, installed
+from toolkit.metrics import describe
+
+
+@pytest.fixture
+def path(baseline, tmp_path):
+    file = tmp_path / "here.json"
+    file.write_text(to_text(baseline))
+    return file
+
+
+def test_a_baseline_is_read_back_to_the_bit(baseline, path):
+    assert load_baseline(path) == baseline
+
+
+def test_a_baseline_is_readable(baseline, path):
+    text = path.read_text()
+    json.loads(text)
+    rows = [line for line in text.splitlines() if '"ate_se3_m": [' in line]
+    assert len(rows) == 6  # an estimator and sequence a line, all of its seeds on it
+    assert all(line.endswith(("]", "],")) for line in rows)
+
+
+def test_not_a_number_is_never_written(baseline):
+    case, measured = baseline.cases[0]
+    bad = replace(measured.runs["one"], speed=(float("nan"),) * 24)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_text(replace(baseline, cases=((case, replace(measured, runs={"one": bad})),)))
+
+
+def _run(document):
+    return document["sequences"][0]["runs"]["one"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda d: d.pop("schema"), "is no baseline"),
+        (lambda d: d.update(schema="vislam.baseline/9"), "is no baseline"),
+        (lambda d: d.pop("releases"), "releases"),
+        (lambda d: d.update(false_alarm_rate=0.0), "false_alarm_rate"),
+        (lambda d: d.update(false_alarm_rate=1.5), "false_alarm_rate"),
+        (lambda d: d.update(sequences=[]), "no sequences"),
+        (lambda d: d.update(sequences=[3]), "no sequences"),
+        (lambda d: d["bounds"].pop("speed_ratio"), "speed_ratio"),
+        (lambda d: d["bounds"].update(speed_ratio=0.9), "speed_ratio"),
+        (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"), "smaller"),
+        (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(margin_percent="1"), "margin_percent"),
+        (lambda d: d["sequences"][0].update(seeds=[0, 0]), "seeds"),
+        (lambda d: d["sequences"][0].update(runs={}), "no runs"),
+        (lambda d: d["sequences"][0]["hashes"].pop(), "hashes"),
+        (lambda d: _run(d)["status"].__setitem__(0, "fine"), "status"),
+        (lambda d: _run(d)["causal"]["ate_se3_m"].pop(), "ate_se3_m"),
+        (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, float("nan")), "ate_se3_m"),
+        (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, "0.1"), "ate_se3_m"),
+        (lambda d: _run(d)["causal"].update(ate_se3_m=None), "ate_se3_m"),
+    ],
+)
+def test_a_spoilt_baseline_is_told_in_one_line_with_the_place(path, spoil, told):
+    document = json.loads(path.read_text())
+    spoil(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(BaselineError, match=told) as raised:
+        load_baseline(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '{"schema": "vislam.baseline/1"}', "\x00"])
+def test_a_file_that_is_no_baseline_is_told(path, text):
+    path.write_text(text)
+    with pytest.raises(BaselineError, match=r"here\.json"):
+        load_baseline(path)
+
+
+def test_a_file_cut_anywhere_is_told(path):
+    text = path.read_text()
+    for end in range(0, len(text) - 2, max(1, len(text) // 60)):
+        path.write_text(text[:end])
+        with pytest.raises(BaselineError):
+            load_baseline(path)
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(BaselineError, match="cannot be read"):
+        load_baseline(tmp_path / "missing.json")
+
+
+def test_other_releases_are_refused_with_the_way_out(baseline):
+    check_releases(baseline, "here.json")
+    with pytest.raises(BaselineError, match=r"gtsam 4\.2\.0, here .*--allow-other-releases") as raised:
+        check_releases(replace(baseline, releases=installed() | {"gtsam": "4.2.0"}), "here.json")
+    assert raised.value.exit_status == 3
+
+
+@pytest.mark.parametrize(("release", "same"), [("1.2.3", True), ("1.2.9", True), ("1.3.3", False), ("2.2.3", False)])
+def test_numpys_repairs_are_the_same_release(monkeypatch, release, same):
+    monkeypatch.setattr("toolkit.gate.releases.version", lambda name: {"gtsam": "4.3.0", "numpy": "1.2.3"}[name])
+    assert (not differences({"gtsam": "4.3.0", "numpy": release})) == same
+    assert differences({"gtsam": "4.3.1", "numpy": "1.2.3"})
+    assert differences({"numpy": "1.2.3"})
+
+
+def test_a_folder_gives_the_baseline_of_the_releases_installed(baseline, path):
+    older = replace(baseline, releases=installed() | {"gtsam": "4.2.0"})
+    (path.parent / "older.json").write_text(to_text(older))
+    assert load_baseline(path.parent) == baseline
+    shutil.copy(path, path.parent / "again.json")
+    with pytest.raises(BaselineError, match=r"again\.json, here\.json .* name one"):
+        load_baseline(path.parent)
+    for name in ("again.json", "here.json"):
+        (path.parent / name).unlink()
+    with pytest.raises(BaselineError, match="none of 1 baselines"):
+        load_baseline(path.parent)
+
+
+SHIPPED = sorted((Path(__file__).parents[1] / "baselines").glob("*.json"))
+
+
+@pytest.mark.parametrize("shipped", SHIPPED, ids=lambda path: path.name)
+def test_a_shipped_baseline_is_usable_and_named_by_its_releases(shipped):
+    baseline = load_baseline(shipped)
+    gtsam, numpy = (baseline.releases[name] for name in ("gtsam", "numpy"))
+    assert shipped.stem == f"gtsam-{gtsam}_numpy-{'.'.join(numpy.split('.')[:2])}"
+    assert {*baseline.bounds.simulated, *baseline.bounds.recorded} <= set(describe())
+    assert all(status == "ok" for _, m in baseline.cases for one in m.runs.values() for status in one.status)
+
+
+def test_a_baseline_is_shipped():
+    assert SHIPPED

@@ -1,0 +1,85 @@
+"""The fingerprint tells measurements apart, and not the processors that made them."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.gate.fingerprint import fingerprint
+from toolkit.sequence import ImuSamples, Observations
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+SHORT = replace(FLIGHT, duration_s=1.0)
+_PROGRAM = """
+from dataclasses import replace
+from toolkit.gate.fingerprint import fingerprint
+from toolkit.simulation import FLIGHT, simulate
+print(*(fingerprint(simulate(replace(FLIGHT, duration_s=1.0), seed)) for seed in range(4)))
+"""
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return simulate(SHORT, 0)
+
+
+def test_the_same_seed_has_the_same_fingerprint_and_another_has_another(flight):
+    assert fingerprint(simulate(SHORT, 0)) == fingerprint(flight)
+    assert len({fingerprint(simulate(SHORT, seed)) for seed in range(5)}) == 5
+
+
+def test_last_bits_do_not_change_it(flight):
+    motion, rng = flight.motion, np.random.default_rng(0)
+    nearly = ImuSamples(
+        motion.t_ns,
+        motion.accel_mps2 * (1.0 + 1e-15 * rng.standard_normal(motion.accel_mps2.shape)),
+        motion.gyro_radps * (1.0 + 1e-15 * rng.standard_normal(motion.gyro_radps.shape)),
+    )
+    other = replace(flight, motion=nearly)
+    assert other.content_hash() != flight.content_hash()
+    assert fingerprint(other) == fingerprint(flight)
+
+
+@pytest.mark.parametrize("scale", ["sighting", "track", "stamp", "noise", "truth", "prior"])
+def test_any_real_change_changes_it(flight, scale):
+    seen, uv_px = flight.observations, flight.observations.uv_px.copy()
+    uv_px[7, 1] += 0.01
+    ids, stamps = seen.track_id.copy(), flight.frames_t_ns.copy()
+    ids[3] += 1
+    stamps[-1] += 1
+    changed = {
+        "sighting": {"observations": Observations(seen.frame, seen.track_id, uv_px)},
+        "track": {"observations": Observations(seen.frame, ids, seen.uv_px)},
+        "stamp": {"frames_t_ns": stamps},
+        "noise": {"noise": replace(flight.noise, gyro_random_walk=1.001 * flight.noise.gyro_random_walk)},
+        "truth": {"truth": None},
+        "prior": {"prior": replace(flight.prior, cov=1.001 * flight.prior.cov)},
+    }[scale]
+    assert fingerprint(replace(flight, **changed)) != fingerprint(flight)
+
+
+def test_a_twist_recording_and_one_without_truth_have_one():
+    assert len(fingerprint(simulate(replace(DRIVE, duration_s=1.0), 0))) == 16
+    assert len(fingerprint(load_sequence("kitti00"))) == 16
+
+
+def test_a_processor_with_other_instructions_has_the_same_fingerprint():
+    """NumPy and OpenBLAS are told to do without their widest instructions, as on an older machine."""
+    lesser = {"NPY_DISABLE_CPU_FEATURES": "X86_V4", "OPENBLAS_CORETYPE": "Haswell"}
+    told = [
+        subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", _PROGRAM],
+            env=os.environ | given,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
+        ).stdout.split()
+        for given in ({}, lesser)
+    ]
+    assert told[0] == told[1]
+    assert len(told[0]) == 4

@@ -1,0 +1,162 @@
+"""The two commands together, on short simulations: what ``vislam baseline`` writes, ``vislam check`` judges."""
+
+import json
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.cli import main
+from toolkit.cli.baseline import command_to_keep
+from toolkit.gate.releases import installed
+
+Vislam = Callable[..., int]
+MAKE = ("baseline", "drive:1", "data-copy:4", "--estimators", "dead-reckoning,ekf", "--seeds", "5")
+PROJECT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The text of a baseline of a simulated and a recorded sequence."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("VISLAM_DATA", str(folder / "root"))
+        (folder / "root").mkdir()
+        (folder / "root/data-copy").symlink_to(PROJECT / "data/drive_small")
+        assert main([*MAKE, "--out", str(folder / "base.json")]) == 0
+    return (folder / "base.json").read_text()
+
+
+@pytest.fixture
+def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: str) -> Vislam:
+    """Return a function that runs ``vislam`` beside the baseline, with the recording under VISLAM_DATA."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VISLAM_DATA", str(tmp_path / "root"))
+    Path("root").mkdir()
+    Path("root/data-copy").symlink_to(PROJECT / "data/drive_small")
+    Path("base.json").write_text(made)
+
+    def run(*words: str) -> int:
+        try:
+            return main(words)
+        except SystemExit as left:
+            assert isinstance(left.code, int)
+            return left.code
+
+    return run
+
+
+def changed(change: Callable[[dict], object]) -> None:
+    document = json.loads(Path("base.json").read_text())
+    change(document)
+    Path("base.json").write_text(json.dumps(document))
+
+
+CHECK = ("check", "--baseline", "base.json", "--skip-speed")
+
+
+def test_a_baseline_says_by_which_command_it_was_made_but_not_in_which_folder(made: str) -> None:
+    assert json.loads(made)["made_by"]["command"] == f"vislam {shlex.join(MAKE)} --out base.json"
+
+
+@pytest.mark.parametrize("given", [("--out", "some/folder/new.json"), ("--out=/some/folder/new.json",)])
+def test_no_folder_is_kept_however_the_output_is_given(given: tuple[str, ...]) -> None:
+    kept = command_to_keep(["vislam", "baseline", "data/drive_small", *given, "--seeds", "5"])
+    assert kept.replace("--out=", "--out ") == "vislam baseline data/drive_small --out new.json --seeds 5"
+
+
+def test_the_same_code_passes_bit_for_bit(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam(*CHECK, "--json", "check.json", "--junit", "check.xml", "--markdown", "check.md") == 0
+    verdicts = json.loads(Path("check.json").read_text())["verdicts"]
+    assert {v["sequence"] for v in verdicts} == {"drive", "data-copy"}
+    assert all(v["before"] == v["after"] for v in verdicts)
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "the gate passes" in told.out
+    assert {path.name for path in Path().iterdir()} == {"root", "base.json", "check.json", "check.xml", "check.md"}
+
+
+def test_a_planted_regression_is_1(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    def plant(document: dict) -> None:
+        values = document["sequences"][0]["runs"]["ekf"]["causal"]["ate_se3_m"]
+        scatter = np.random.default_rng(0).normal(0.0, 0.005, 5)
+        values[:] = (np.array(values) / (1.10 * np.exp(scatter))).tolist()
+
+    changed(plant)
+    assert vislam(*CHECK, "--json", "check.json") == 1
+    failures = [v for v in json.loads(Path("check.json").read_text())["verdicts"] if v["fails"]]
+    assert [(v["sequence"], v["estimator"], v["metric"]) for v in failures] == [("drive", "ekf", "ate_se3_m")]
+    assert failures[0]["change_percent"] == pytest.approx(10.0, abs=1.5)
+    assert "the gate fails" in capsys.readouterr().out
+
+
+def test_what_is_missing_is_1_and_named(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    def lose(document: dict) -> None:
+        runs = document["sequences"][0]["runs"]
+        runs["oracle"] = runs.pop("ekf")
+
+    changed(lose)
+    Path("root/data-copy").unlink()
+    assert vislam(*CHECK) == 1
+    told = " ".join(capsys.readouterr().out.split())
+    assert "drive, oracle: estimator is missing: no estimator is called oracle" in told
+    assert "data-copy: sequence is missing: data-copy: no such file or directory" in told
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_another_release_is_3_in_one_line_unless_allowed(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], allowed: bool
+) -> None:
+    changed(lambda document: document.update(releases=installed() | {"gtsam": "4.2.0"}))
+    if allowed:
+        assert vislam(*CHECK, "--allow-other-releases") == 0
+        return
+    assert vislam(*CHECK) == 3
+    told = capsys.readouterr().err
+    assert told.startswith("vislam: error: base.json: made with gtsam 4.2.0, here ")
+    assert told.count("\n") == 1
+
+
+def test_a_spoilt_baseline_is_3_in_one_line(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("base.json").write_text("{")
+    assert vislam(*CHECK) == 3
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_output_that_cannot_be_written_is_4_before_anything_runs(vislam: Vislam) -> None:
+    Path("base.json").write_text("{")  # would be 3, were it read
+    assert vislam(*CHECK, "--json", "root") == 4
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("check",),
+        ("baseline",),
+        ("baseline", "drive", "--seeds", "4"),
+        ("baseline", "drive", "drive:2"),
+        ("baseline", "drive", "--truth", "gt.tum"),
+        ("baseline", "drive", "--truth", "kitti00=gt.tum"),
+        ("baseline", "drive", "--truth", "drive=gt.tum"),
+    ],
+)
+def test_a_wrong_command_line_is_2(vislam: Vislam, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+    assert vislam(*words) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        (("baseline", "nowhere.npz", "--out", "new.json"), 3),
+        (("baseline", "drive:soon", "--out", "new.json"), 3),
+        (("baseline", "drive", "--out", "root"), 4),
+        (("baseline", "drive", "--estimators", "oracle", "--out", "new.json"), 5),
+    ],
+)
+def test_trouble_with_a_new_baseline_leaves_nothing(vislam: Vislam, words: tuple[str, ...], status: int) -> None:
+    assert vislam(*words) == status
+    assert {path.name for path in Path().iterdir()} == {"root", "base.json"}

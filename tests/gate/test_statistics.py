@@ -1,0 +1,83 @@
+"""The statistics of the gate are those of the books: Student's, Holm's, and the rates they promise."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from toolkit.gate.statistics import holm, paired_p, rejected, smallest_seen
+
+
+@pytest.mark.parametrize("n", [2, 5, 24, 400])
+@pytest.mark.parametrize("shift", [-0.3, 0.0, 0.2])
+def test_the_paired_test_is_scipys(n, shift):
+    rng = np.random.default_rng(n)
+    before, after = rng.standard_normal(n), rng.standard_normal(n) + shift
+    expected = stats.ttest_rel(after, before, alternative="greater").pvalue
+    assert float(paired_p(after - before)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_margin_moves_the_hypothesis():
+    differences = np.random.default_rng(1).normal(0.05, 0.1, 30)
+    expected = stats.ttest_1samp(differences, 0.02, alternative="greater").pvalue
+    assert float(paired_p(differences, 0.02)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_many_checks_at_once_are_each_by_itself():
+    differences = np.random.default_rng(2).standard_normal((3, 4, 10))
+    at_once = paired_p(differences, 0.1)
+    assert at_once.shape == (3, 4)
+    assert at_once[2, 1] == pytest.approx(float(paired_p(differences[2, 1], 0.1)), rel=1e-12)
+
+
+@pytest.mark.parametrize(("value", "p"), [(0.0, 1.0), (-0.1, 1.0), (0.005, 1.0), (0.1, 0.0)])
+def test_differences_without_spread_are_certain(value, p):
+    assert float(paired_p(np.full(24, value), 0.005)) == p
+
+
+def test_one_difference_says_nothing():
+    assert float(paired_p(np.array([9.0]))) == 1.0
+
+
+def test_holm_is_the_closed_test_of_bonferroni():
+    """By definition: a hypothesis falls when every set of hypotheses that holds it falls by Bonferroni's test."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        p = rng.uniform(0.0, 1.0, 5) ** 3
+        sets = [s for size in range(1, 6) for s in combinations(range(5), size)]
+        closed = [max(min(len(s) * p[list(s)].min(), 1.0) for s in sets if i in s) for i in range(5)]
+        np.testing.assert_allclose(holm(p), closed, rtol=1e-12)
+
+
+def test_holm_by_hand():
+    np.testing.assert_allclose(holm(np.array([0.01, 0.04, 0.03, 0.005])), [0.03, 0.06, 0.06, 0.02])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_the_family_of_true_null_hypotheses_keeps_its_rate(correlation):
+    checks, tests, seeds, rate = 4000, 20, 24, 0.05
+    rng = np.random.default_rng(4)
+    shared = np.sqrt(correlation) * rng.standard_normal((checks, 1, seeds))
+    differences = shared + np.sqrt(1.0 - correlation) * rng.standard_normal((checks, tests, seeds))
+    alarms = rejected(paired_p(differences), rate).any(axis=1).mean()
+    # Three standard deviations of a count of 4000 above the promise; independent tests nearly use it up.
+    assert alarms <= rate + 3.0 * np.sqrt(rate * (1.0 - rate) / checks)
+    if correlation == 0.0:
+        assert alarms >= rate - 0.002 - 3.0 * np.sqrt(rate * (1.0 - rate) / checks)
+
+
+def test_the_smallest_change_seen_is_seen_as_often_as_promised():
+    rng = np.random.default_rng(6)
+    spread, seeds, rate, power = 0.04, 24, 0.001, 0.95
+    # From the true spread, of which every set of seeds has an estimate only.
+    exact = spread * rng.standard_normal(200_000)
+    n_over = np.sqrt(exact.size / seeds)
+    shift = smallest_seen(exact, rate, power) * n_over
+    caught = paired_p(rng.normal(shift, spread, (4000, seeds))) <= rate
+    # Large samples have normal quantiles where 24 seeds have Student's: a little less power than promised.
+    assert 0.80 < caught.mean() < 0.97
+    few = rng.normal(0.0, spread, (300, seeds))
+    shifts = np.array([smallest_seen(one, rate, power) for one in few])
+    caught = paired_p(rng.normal(np.median(shifts), spread, (4000, seeds))) <= rate
+    assert caught.mean() == pytest.approx(power, abs=0.03)

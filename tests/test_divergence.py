@@ -1,0 +1,125 @@
+"""A trajectory that contradicts the measured motion is told from one that works, without any truth."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.datasets import load_sequence
+from toolkit.divergence import MOST_FAR_STEPS, contradiction, deafness
+from toolkit.estimate import Trajectory
+from toolkit.geometry import Array, se3_exp, se3_inverse
+from toolkit.initialization import start_from_measurements
+from toolkit.sequence import Sequence
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+
+SCENARIOS = {"drive": DRIVE, "drive-imu": DRIVE_IMU, "flight": FLIGHT}
+every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
+
+
+def recording(scenario: str, seed: int = 0) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=10.0), seed)
+
+
+def jumping(trajectory: Trajectory, share: float, jump: Array) -> Trajectory:
+    """Return the trajectory with a jump (6,), in the body frame, at the end of a share of its steps."""
+    steps = se3_inverse(trajectory.T_world_imu[:-1]) @ trajectory.T_world_imu[1:]
+    struck = np.random.default_rng(3).uniform(size=len(steps)) < share
+    poses = [trajectory.T_world_imu[0]]
+    for step, jumps in zip(steps, struck, strict=True):
+        poses.append(poses[-1] @ step @ se3_exp(jump if jumps else np.zeros(6)))
+    return replace(trajectory, T_world_imu=np.stack(poses))
+
+
+@every_scenario
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf", "batch"])
+def test_a_run_that_works_contradicts_nothing(name, scenario, run_estimator):
+    sequence = recording(scenario)
+    assert contradiction(run_estimator(name, sequence).final, sequence) is None
+
+
+@every_scenario
+def test_the_truth_contradicts_nothing(scenario):
+    sequence = recording(scenario, seed=1)
+    truth = sequence.truth
+    assert contradiction(Trajectory(truth.t_ns, truth.T_world_imu, truth.v_world, truth.bias), sequence) is None
+
+
+# Fifty standard deviations of a drive's step (0.016 m) and of a flight's.
+JUMP_M = np.array([0.0, 0.0, 0.0, 0.0, 0.8, 0.0])
+TURN = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+
+
+@every_scenario
+@pytest.mark.parametrize("jump", [JUMP_M, TURN], ids=["position", "heading"])
+def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction(scenario, jump, run_estimator):
+    sequence = recording(scenario)
+    spoiled = jumping(run_estimator("ekf", sequence).causal, 0.2, jump)
+    reason = contradiction(spoiled, sequence)
+    assert reason is not None
+    assert "contradict the measured motion" in reason
+
+
+@every_scenario
+def test_a_few_jumps_are_not(scenario, run_estimator):
+    sequence = recording(scenario)
+    assert contradiction(jumping(run_estimator("ekf", sequence).causal, 0.02, JUMP_M), sequence) is None
+
+
+def test_the_reason_counts_the_far_steps(run_estimator):
+    sequence = recording("drive")
+    run = run_estimator("dead-reckoning", sequence)
+    poses = run.causal.T_world_imu.copy()
+    poses[1::2] = poses[1::2] @ se3_exp(JUMP_M)
+    reason = contradiction(replace(run.causal, T_world_imu=poses), sequence)
+    assert reason.startswith("100 % of its steps")
+    assert f"at most {100 * MOST_FAR_STEPS:.0f} %" in reason
+
+
+def test_a_pose_that_is_not_a_number_is_a_contradiction():
+    sequence = recording("drive")
+    poses = sequence.truth.T_world_imu.copy()
+    poses[17:, 0, 3] = np.inf
+    assert (
+        contradiction(Trajectory(sequence.truth.t_ns, poses), sequence)
+        == "its poses are not numbers from estimate 17 on"
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_trajectory_without_a_step_contradicts_nothing(count):
+    sequence = recording("drive")
+    truth = sequence.truth
+    assert contradiction(Trajectory(truth.t_ns[:count], truth.T_world_imu[:count]), sequence) is None
+
+
+@pytest.mark.parametrize(("name", "status"), [("seed-ekf", "diverged"), ("ekf", "ok"), ("dead-reckoning", "ok")])
+def test_on_03_the_reports_filter_is_seen_to_diverge(name, status, real: Callable[[str], Path], run_estimator):
+    sequence = audit(load_sequence(str(real("ucsd/03.npz")))).sequence
+    run = run_estimator(name, sequence, start_from_measurements(sequence))
+    assert run.status == status, run.log
+
+
+def heard(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, Array]:
+    tested_of = np.full(100, float(tested))
+    return {"gate_tested": tested_of, "gate_accepted": tested_of * np.repeat([share, share_in_the_end], [75, 25])}
+
+
+def test_a_filter_that_rejects_nearly_all_it_sees_has_lost_its_way():
+    assert deafness(heard(0.06, 0.06)).startswith("6 % of all it saw passed its own gate")
+
+
+def test_a_filter_that_went_deaf_in_the_end_has_lost_its_way():
+    assert deafness(heard(0.95, 0.1)).startswith("10 % of what it saw in the end")
+
+
+def test_a_filter_on_a_rough_recording_has_not():
+    assert deafness(heard(0.65, 0.5)) is None
+
+
+def test_a_few_rejections_are_no_sign():
+    assert deafness(heard(0.0, 0.0, tested=1)) is None
+    assert deafness({}) is None

@@ -1,0 +1,145 @@
+"""NumPy archives read member by member; a huge mostly-missing array is streamed and kept sparse.
+
+The dense features of a long drive take more than a gigabyte, their sightings a few megabytes. Nothing is
+ever unpickled. Format: numpy.lib.format, versions 1 to 3.
+"""
+
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from toolkit.datasets.io.fields import Fields, check_numeric, check_shape
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray
+
+# Small enough for the processor's cache, large enough that the Python around it does not show.
+_CHUNK_BYTES = 1 << 18
+_ZIP_MAGIC = b"PK\x03\x04"
+_ZIP_HEADER = struct.Struct("<26xHH")
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError, MemoryError)
+
+
+class SparseArray(NamedTuple):
+    """The entries of a dense array that differ from its filler: indices per axis, each (E,), and values (E,)."""
+
+    shape: tuple[int, ...]
+    indices: tuple[IntArray, ...]
+    value: Array
+
+
+class _Header(NamedTuple):
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[np.generic]
+
+
+@dataclass(frozen=True)
+class NpzArchive:
+    """An open archive; keys are member names without their ``.npy``."""
+
+    path: Path
+    archive: zipfile.ZipFile
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of all arrays."""
+        return _keys(self.archive)
+
+    def fields(self, *left_out: str) -> Fields:
+        """Read every array whole, but for the keys left out."""
+        return Fields(self.path, {key: self._dense(key) for key in self.keys if key not in left_out})
+
+    def sparse(self, key: str, shape: tuple[int | None, ...], filler: float) -> SparseArray:
+        """Stream one array of the given shape, in either memory order; keep what differs from the filler (NaN does)."""
+        with self.archive.open(f"{key}.npy") as stream:
+            header = self._header(key, stream)
+            check_shape(self.path, key, header.shape, shape)
+            size, position, value = _kept_entries(stream, header.dtype, filler)
+        if size != math.prod(header.shape):
+            raise DataError(f"{self.path}: {key} ends after {size} of {math.prod(header.shape)} values; save it again")
+        indices = np.unravel_index(position, header.shape, order="F" if header.fortran_order else "C")
+        return SparseArray(header.shape, indices, value)
+
+    def _dense(self, key: str) -> npt.NDArray[np.generic]:
+        with self.archive.open(f"{key}.npy") as stream:
+            try:
+                array: npt.NDArray[np.generic] = np.lib.format.read_array(stream, allow_pickle=False)
+            except ValueError as error:
+                pickled = "Object arrays" in str(error)
+                why = "it holds objects, which are never unpickled" if pickled else _first_line(error)
+                raise DataError(f"{self.path}: {key} cannot be read: {why}; save it as plain numbers") from error
+        return array
+
+    def _header(self, key: str, stream: IO[bytes]) -> _Header:
+        try:
+            version = np.lib.format.read_magic(stream)
+            # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            header = _Header(*read(stream))
+        except ValueError as error:
+            raise DataError(f"{self.path}: {key} has no valid .npy header: {_first_line(error)}") from error
+        check_numeric(self.path, key, header.dtype)
+        return header
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[NpzArchive]:
+    """Open an archive; damage met while it is open is raised as DataError."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield NpzArchive(path, archive)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except _DAMAGE as error:
+        raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
+
+
+def glance(path: Path) -> set[str]:
+    """Return the keys of an archive without reading arrays; of a damaged one its first key, of anything else none."""
+    if not path.is_file():
+        return set()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return set(_keys(archive))
+    except _DAMAGE:
+        return _first_key(path)
+
+
+def _keys(archive: zipfile.ZipFile) -> list[str]:
+    return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+
+
+def _first_key(path: Path) -> set[str]:
+    """Read the name in the first local header: a truncated archive has lost the directory at its end."""
+    with path.open("rb") as stream:
+        header = stream.read(_ZIP_HEADER.size)
+        if len(header) < _ZIP_HEADER.size or not header.startswith(_ZIP_MAGIC):
+            return set()
+        name_length, _ = _ZIP_HEADER.unpack(header)
+        return {stream.read(name_length).decode(errors="replace").removesuffix(".npy")}
+
+
+def _kept_entries(stream: IO[bytes], dtype: np.dtype[np.generic], filler: float) -> tuple[int, IntArray, Array]:
+    """Return how many values a stream holds, and the positions and values of those that differ from the filler."""
+    chunk_bytes = _CHUNK_BYTES // dtype.itemsize * dtype.itemsize
+    size, positions, kept_values = 0, [np.empty(0, dtype=np.int64)], [np.empty(0)]
+    while chunk := stream.read(chunk_bytes):
+        values = np.frombuffer(chunk, dtype=dtype, count=len(chunk) // dtype.itemsize)
+        kept = np.flatnonzero(values != filler)
+        positions.append(kept + size)
+        kept_values.append(values[kept].astype(np.float64))
+        size += values.size
+    return size, np.concatenate(positions), np.concatenate(kept_values)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__

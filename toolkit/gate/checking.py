@@ -1,0 +1,80 @@
+"""The whole of the gate: measure a new baseline, or measure an old one again and judge what became of it."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+from toolkit.estimator import find_all
+from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured
+from toolkit.gate.case_work import case_sequence, trials_of
+from toolkit.gate.judging import Judged, judge_case
+from toolkit.gate.measuring import measure, metrics_of
+from toolkit.gate.paired import judge_pairs
+from toolkit.gate.releases import installed
+from toolkit.gate.verdict import Check
+from toolkit.runner import Progress
+
+ProgressFor = Callable[[str], AbstractContextManager[Progress]]
+
+
+@dataclass(frozen=True)
+class How:
+    """How to run: so many processes, and whether time counts."""
+
+    workers: int
+    speed: bool = True
+
+
+def new_baseline(
+    cases: Sequence[Case], workers: int, made_by: Mapping[str, str], progress_for: ProgressFor
+) -> Baseline:
+    """Measure a baseline.
+
+    Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a sequence that cannot be
+    had; both before the first run.
+    """
+    for case in cases:
+        find_each(case.estimators)
+        case_sequence(trials_of(case)[0])
+    measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), workers, progress_for)) for case in cases)
+    return Baseline(installed(), measured, made_by=made_by)
+
+
+def find_each(estimators: Sequence[str]) -> None:
+    """Raise EstimatorError unless every estimator is there and can be used."""
+    for entry in find_all(estimators).values():
+        entry.load()
+
+
+def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
+    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error."""
+    began = time.monotonic()
+    judged = Judged()
+    for case, before in baseline.cases:
+        now = _measured(case, metrics_of(case, baseline.bounds), how.workers, progress_for)
+        one = judge_case(case, before, now, baseline.bounds, speed=how.speed)
+        judged.verdicts += one.verdicts
+        judged.tests += one.tests
+        judged.notes += one.notes
+    return judge_all(judged, baseline, name, time.monotonic() - began)
+
+
+def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float) -> Check:
+    """Test what awaits its test, all at once, and put the verdicts together."""
+    tested = judge_pairs(judged.tests, baseline.false_alarm_rate)
+    places = {
+        (case.source, name): (i, k)
+        for i, (case, before) in enumerate(baseline.cases)
+        for k, name in enumerate(("", *before.runs))
+    }
+    verdicts = sorted([*judged.verdicts, *tested], key=lambda v: (places[v.sequence, v.estimator], v.output))
+    return Check(
+        name, tuple(verdicts), tuple(judged.notes), baseline.false_alarm_rate, len(tested), installed(), seconds
+    )
+
+
+def _measured(case: Case, metrics: Sequence[str], workers: int, progress_for: ProgressFor) -> Measured:
+    runs = len(case.seeds) * len(case.estimators)
+    with progress_for(f"{case.source}: {runs} runs") as progress:
+        return measure(case, metrics, workers, progress.advance)

@@ -1,0 +1,129 @@
+"""A case as it was against the same case now: what is missing, what is tested, what is held to a bound."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from toolkit.estimate import Status
+from toolkit.gate.baseline import Bounds, Case, Criterion, Measured, Series, Values
+from toolkit.gate.bounded import SHOWN, judge_coverage, judge_recorded, judge_speed
+from toolkit.gate.paired import Pairs, Where
+from toolkit.gate.verdict import Verdict
+from toolkit.geometry import Array
+
+_NOTHING = ("", "")
+_SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
+
+
+@dataclass
+class Judged:
+    """What is decided about a case already, what awaits the tests of the whole check, and what is worth a note."""
+
+    verdicts: list[Verdict] = field(default_factory=list)
+    tests: list[Pairs] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, *, speed: bool) -> Judged:
+    """Judge one case; ``speed`` says whether its time counts."""
+    judged = Judged()
+    if now.unreadable:
+        judged.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
+        return judged
+    other = _other_measurements(case, before, now)
+    if other:
+        judged.verdicts.append(_missing(case, *_NOTHING, "sequence", other))
+        return judged
+    if before.hashes != now.hashes:
+        judged.notes.append(
+            f"{case.source}: the same measurements but for their last bits, which this processor rounds differently"
+        )
+    for estimator, was in before.runs.items():
+        if estimator in now.absent or estimator not in now.runs:
+            why = now.absent.get(estimator, "it was not run")
+            judged.verdicts.append(_missing(case, estimator, "", "estimator", why))
+        else:
+            _judge_series(case, estimator, was, now.runs[estimator], bounds, judged)
+            if speed:
+                judged.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
+    return judged
+
+
+def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
+    """Say under which seeds the estimators read something else than for the baseline; nothing where nowhere.
+
+    A seed without a hash had no run that lived to tell it; its statuses fail the check.
+    """
+    if len(now.fingerprints) != len(before.fingerprints):
+        return f"{len(now.fingerprints)} runs, the baseline has {len(before.fingerprints)}"
+    sides = zip(case.seeds, before.fingerprints, now.fingerprints, strict=True)
+    others = [str(seed) for seed, was, is_ in sides if was and is_ and was != is_]
+    if not others:
+        return ""
+    which = f" under seed {', '.join(others)}" if case.simulated else ""
+    return f"other measurements than the baseline's{which}: the two cannot be compared, make a new baseline"
+
+
+def _judge_series(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds, judged: Judged) -> None:
+    """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
+    judged.verdicts += _ends(case, estimator, before, now, judged)
+    usable = [i for i, (was, is_) in enumerate(zip(before.status, now.status, strict=True)) if was == is_ == "ok"]
+    if not usable:
+        judged.notes.append(f"{case.source}: {estimator} has no run that ended well on both sides, nothing is compared")
+        return
+    criteria = bounds.simulated if case.simulated else bounds.recorded
+    for output, metrics in before.outputs.items():
+        given = now.outputs.get(output, {})
+        for key, values in metrics.items():
+            where = Where(case.source, estimator, output, key)
+            lost = _lost(values, given.get(key), usable)
+            if lost:
+                judged.verdicts.append(_missing(case, estimator, output, key, lost))
+            elif key in criteria:
+                _judge_metric(case, where, criteria[key], _shared(values, given[key], usable), judged)
+    judged.verdicts += judge_coverage(case, estimator, before, now, bounds)
+
+
+def _judge_metric(case: Case, where: Where, criterion: Criterion, values: tuple[Array, Array], judged: Judged) -> None:
+    """Put a metric's values before and now (n,) among the tests, or hold them to their bound."""
+    was, is_ = values
+    if not was.size:
+        return
+    if case.simulated:
+        judged.tests.append(Pairs(where, criterion, was, is_))
+        return
+    if np.ptp(is_) > SHOWN * np.abs(is_).max():
+        judged.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
+    judged.verdicts.append(judge_recorded(where, criterion, float(np.median(was)), float(np.median(is_))))
+
+
+def _ends(case: Case, estimator: str, before: Series, now: Series, judged: Judged) -> Iterator[Verdict]:
+    """Fail where runs end worse than they did; note where they end well that did not."""
+    pairs = list(zip(case.seeds, before.status, now.status, strict=True))
+    worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
+    if worse:
+        runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if case.simulated else ""
+        words = f"{worse[0][1]} {runs}".strip() + (f": {now.why}" if now.why else "")
+        yield Verdict(case.source, estimator, "", "status", "regressed", words)
+    better = [seed for seed, was, is_ in pairs if is_ == "ok" and was != "ok"]
+    if better:
+        judged.notes.append(f"{case.source}: {estimator} ends well in {len(better)} runs in which it did not before")
+
+
+def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
+    """Say which values are there no more; nothing where all are."""
+    if now is None:
+        return "it has no value any more"
+    gone = [i for i in usable if before[i] is not None and now[i] is None]
+    return f"it has no value any more in {len(gone)} of {len(usable)} runs" if gone else ""
+
+
+def _shared(before: Values, now: Values, usable: list[int]) -> tuple[Array, Array]:
+    both = [(was, is_) for i in usable if (was := before[i]) is not None and (is_ := now[i]) is not None]
+    table = np.array(both, dtype=float).reshape(-1, 2)
+    return table[:, 0], table[:, 1]
+
+
+def _missing(case: Case, estimator: str, output: str, what: str, why: str) -> Verdict:
+    return Verdict(case.source, estimator, output, what, "missing", " ".join(why.split()))

@@ -1,0 +1,141 @@
+"""Estimation errors in the units of the covariance that was stated for them, and the band a consistent one keeps.
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
+the normalised estimation error squared (NEES) e^T P^-1 e of a consistent estimator is chi-square distributed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
+from toolkit.metrics._shared.alignment import place_pose, place_yaw
+from toolkit.metrics._shared.association import finite_poses, median_period_ns, truth_at
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Unavailable
+from toolkit.sequence import Sequence
+
+POSE_DOF = 6
+BAND_PROBABILITY = 0.95
+# A prior farther from the truth than one in a million draws is not about the truth's world.
+_OTHER_WORLD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BodyErrors:
+    """T_estimate^-1 T_truth (n, 4, 4) at the estimate's stamps (n,), which are its ``rows`` (n,).
+
+    ``placed`` tells that the estimate is in a world of its own and was brought into the truth's by its first pose.
+    """
+
+    t_ns: IntArray
+    rows: IntArray
+    T_estimate_truth: Array
+    placed: bool
+
+    @property
+    def distance_m(self) -> Array:
+        """Distances (n,) m between estimated and true positions."""
+        return np.asarray(np.linalg.norm(self.T_estimate_truth[:, :3, 3], axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Nees:
+    """NEES at stamps (n,) of the pose, the orientation and the position, each (n,) and over its degrees of freedom."""
+
+    t_ns: IntArray
+    pose: Array
+    orientation: Array
+    position: Array
+    placed: bool
+
+
+def nees_band(dof: int, runs: int = 1) -> tuple[float, float]:
+    """Return the two-sided 95 % band of the mean over ``runs`` of a NEES over its degrees of freedom.
+
+    The sum of N independent NEES is chi-square with N times their degrees of freedom.
+    """
+    tail = (1.0 - BAND_PROBABILITY) / 2.0
+    low, high = (chi2_quantile(p, dof * runs) / (dof * runs) for p in (tail, 1.0 - tail))
+    return low, high
+
+
+def chi2_quantile(probability: float, dof: int) -> float:
+    """Return the value a chi-square variable stays below with the probability."""
+    return 2.0 * float(gammaincinv(0.5 * dof, probability))
+
+
+def body_errors(evaluation: Evaluation) -> BodyErrors:
+    """Return the errors of the evaluated estimate in the body frame, wherever the truth has a pose.
+
+    In the truth's world as it is, if the sequence brings a prior about that world, as a simulated one does.
+    Otherwise every estimator starts in a world of its own and is placed by its first pose, as for ``ate_none_m``:
+    what is given away then is what the start pins without measuring it. Raises Unavailable without truth, or
+    where the truth begins after the estimate, for then there is no first pose to place.
+    """
+    truth, estimate = evaluation.sequence.truth, evaluation.estimate
+    if truth is None:
+        raise Unavailable("the sequence has no ground truth")
+    usable = np.flatnonzero(finite_poses(estimate.T_world_imu))
+    frame_period_ns = median_period_ns(evaluation.sequence.frames_t_ns)
+    reached, true_poses = truth_at(estimate.t_ns[usable], truth, frame_period_ns)
+    rows = usable[reached]
+    if not rows.size:
+        raise Unavailable("no pose has a true one at its time")
+    poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
+    if placed:
+        if rows[0] != 0:
+            raise Unavailable("the estimate's world is its own, and the truth has no pose for its first one")
+        place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
+        poses = place(true_poses[0], poses[0]).apply(poses)
+    return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, placed)
+
+
+def starts_in_the_truths_world(sequence: Sequence) -> bool:
+    """Say whether the sequence's own prior agrees with its truth within the covariance it states."""
+    truth, prior = sequence.truth, sequence.prior
+    if truth is None or prior is None:
+        return False
+    reached, true_poses = truth_at(sequence.frames_t_ns[:1], truth, median_period_ns(sequence.frames_t_ns))
+    if not reached.any():
+        return False
+    error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
+    return float(_normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - _OTHER_WORLD, POSE_DOF)
+
+
+def nees_over_time(evaluation: Evaluation) -> Nees:
+    """Return the NEES of every pose that has a covariance and a true pose.
+
+    Raises Unavailable where there is none, where the truth is not independent of the measurements, or where a
+    stated covariance is not positive definite.
+    """
+    truth, cov = evaluation.sequence.truth, evaluation.estimate.cov
+    if truth is None:
+        raise Unavailable("the sequence has no ground truth")
+    if not truth.independent:
+        raise Unavailable("the truth comes from the instrument that measured the motion, so agreement proves nothing")
+    if cov is None:
+        raise Unavailable("the estimator states no covariance")
+    errors = body_errors(evaluation)
+    stated = np.isfinite(cov[errors.rows, :POSE_DOF, :POSE_DOF]).all(axis=(1, 2))
+    if not stated.any():
+        raise Unavailable("no pose with a true one has a finite covariance")
+    pose_cov = cov[errors.rows[stated], :POSE_DOF, :POSE_DOF]
+    indefinite = int((np.linalg.eigvalsh(pose_cov)[:, 0] <= 0.0).sum())
+    if indefinite:
+        raise Unavailable(f"the covariance of {indefinite} of {len(pose_cov)} poses is not positive definite")
+    xi = se3_log(errors.T_estimate_truth[stated])
+    return Nees(
+        errors.t_ns[stated],
+        _normalised(xi, pose_cov) / POSE_DOF,
+        _normalised(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
+        _normalised(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
+        errors.placed,
+    )
+
+
+def _normalised(errors: Array, cov: Array) -> Array:
+    """Return e^T P^-1 e (n,) of errors (n, d) with covariances (n, d, d)."""
+    solved = np.linalg.solve(cov, errors[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("ni,ni->n", errors, solved))

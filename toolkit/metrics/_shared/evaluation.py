@@ -1,0 +1,89 @@
+"""What the metric files look at: one output of one run beside its sequence, with nothing computed twice."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from toolkit.estimate import Output, Run, Trajectory
+from toolkit.geometry import Array, BoolArray
+from toolkit.metrics._shared.alignment import Alignment, fit_se3, place_pose, place_yaw
+from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
+from toolkit.metrics._shared.scores import Unavailable
+from toolkit.sequence import Sequence
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One output of a run and the sequence it was made from.
+
+    The properties that need the truth, or a matched pair, raise Unavailable where there is none.
+    """
+
+    run: Run
+    output: Output
+    sequence: Sequence
+
+    @cached_property
+    def estimate(self) -> Trajectory:
+        """The trajectory that is evaluated."""
+        trajectory = self.run.trajectory(self.output)
+        if trajectory is None:
+            raise ValueError(f"{self.run.estimator} has no {self.output} output to score")
+        return trajectory
+
+    @cached_property
+    def matched(self) -> Matched:
+        """The pairs of true and estimated poses that are scored; there may be none."""
+        if self.sequence.truth is None:
+            raise Unavailable("the sequence has no ground truth")
+        return associate(self.estimate, self.sequence.truth, median_period_ns(self.sequence.frames_t_ns))
+
+    @cached_property
+    def compared(self) -> Matched:
+        """The matched pairs, of which there are at least two."""
+        if len(self.matched) < 2:
+            raise Unavailable(f"{len(self.matched)} pose(s) match the ground truth in time, a comparison needs 2")
+        return self.matched
+
+    @cached_property
+    def placed(self) -> Array:
+        """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
+
+        Every estimator starts in a world of its own. With an IMU the vertical is measured, so only heading
+        and position are given away; without one, the whole first pose.
+        """
+        place = place_yaw if self.sequence.motion_kind == "imu" else place_pose
+        pairs = self.compared
+        return place(pairs.truth[0], pairs.estimate[0]).apply(pairs.estimate)
+
+    @cached_property
+    def se3_alignment(self) -> Alignment:
+        """The rigid motion that fits the estimated positions to the true ones."""
+        pairs = self.compared
+        return fit_se3(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+
+    @cached_property
+    def poses_of_frames(self) -> Array:
+        """The estimated pose of every frame (K, 4, 4), NaN where there is none."""
+        frames_t_ns, estimate = self.sequence.frames_t_ns, self.estimate
+        poses = np.full((frames_t_ns.size, 4, 4), np.nan)
+        if len(estimate):
+            row = np.minimum(np.searchsorted(estimate.t_ns, frames_t_ns), len(estimate) - 1)
+            same = estimate.t_ns[row] == frames_t_ns
+            poses[same] = estimate.T_world_imu[row[same]]
+        return poses
+
+    @cached_property
+    def has_pose(self) -> BoolArray:
+        """Whether each frame (K,) has a finite pose."""
+        return finite_poses(self.poses_of_frames)
+
+    @cached_property
+    def counted_frames(self) -> BoolArray:
+        """Which frames (K,) an estimate is due for: those in the truth's time range, or all without a truth."""
+        frames_t_ns, truth = self.sequence.frames_t_ns, self.sequence.truth
+        if truth is None or truth.t_ns.size == 0:
+            return np.ones(frames_t_ns.size, dtype=bool)
+        begins = frames_t_ns >= truth.t_ns[0] - STAMP_TOLERANCE_NS
+        return np.asarray(begins & (frames_t_ns <= truth.t_ns[-1] + STAMP_TOLERANCE_NS))

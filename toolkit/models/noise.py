@@ -1,0 +1,51 @@
+"""Noise for files that state none: estimated from the samples, or a documented rule. Never a per-file constant."""
+
+import numpy as np
+
+from toolkit.geometry import Array, IntArray
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import TwistNoise
+
+# Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
+TRACKED_PIXEL_SIGMA_PX = 0.5
+# What a noise-free-looking odometer still gets wrong between frames: pairing, wheel slip, lever arm.
+LEAST_VELOCITY_SIGMA_MPS = 0.05
+LEAST_GYRO_SIGMA_RADPS = 0.005
+# Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: moves it by 2e-4 rad/s in 100 s.
+GYRO_RANDOM_WALK = 2e-5
+
+_MAD_TO_SIGMA = 1.4826
+
+
+def pixel_covariance(rows_averaged: int) -> Array:
+    """Return the covariance (3, 3) px^2 of (uL, uR, v), v being the mean of one or two image rows."""
+    return TRACKED_PIXEL_SIGMA_PX**2 * np.diag([1.0, 1.0, 1.0 / rows_averaged])
+
+
+def white_sigma(samples: Array) -> Array:
+    """Estimate the white-noise standard deviation (d,) of samples (S, d) of a smooth signal.
+
+    The second difference of white noise has six times its variance and that of a smooth motion is small; the
+    median absolute deviation ignores the few samples where it is not. Rows that are not finite are left out.
+    """
+    clean = samples[np.isfinite(samples).all(axis=1)]
+    if len(clean) < 3:
+        return np.zeros(samples.shape[1])
+    second = clean[2:] - 2.0 * clean[1:-1] + clean[:-2]
+    sigma: Array = _MAD_TO_SIGMA * np.median(np.abs(second), axis=0) / np.sqrt(6.0)
+    return sigma
+
+
+def twist_noise(t_ns: IntArray, v_mps: Array, w_radps: Array) -> TwistNoise:
+    """Estimate the noise of measured twists (S, 3), (S, 3) from their scatter, with a floor on each.
+
+    A sample held over dt with standard deviation s has the continuous density s sqrt(dt).
+    """
+    steps_s = np.diff(t_ns) / NS_PER_S
+    positive = steps_s[steps_s > 0.0]
+    root_dt = np.sqrt(np.median(positive)) if positive.size else 1.0
+    return TwistNoise(
+        np.maximum(white_sigma(v_mps), LEAST_VELOCITY_SIGMA_MPS) * root_dt,
+        np.maximum(white_sigma(w_radps), LEAST_GYRO_SIGMA_RADPS) * root_dt,
+        np.full(3, GYRO_RANDOM_WALK),
+    )
