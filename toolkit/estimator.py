@@ -10,8 +10,8 @@ import ast
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, Protocol, cast
@@ -19,7 +19,9 @@ from typing import Literal, Protocol, cast
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import MotionNoise, Packet, Prior, StereoRig
+from toolkit.settings import DEFAULTS, Scalar, Settings
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
@@ -28,13 +30,19 @@ LADDER = "ladder"
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2."""
+    """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
+
+    ``options`` are the settings of this estimator alone, by name; ``progress`` hears of a long ``finish``.
+    """
 
     rig: StereoRig
     noise: MotionNoise
     prior: Prior
     gravity_world: Array
     motion_kind: Literal["twist", "imu"]
+    settings: Settings = DEFAULTS
+    options: Mapping[str, Scalar] = field(default_factory=dict)
+    progress: Progress = SILENT
 
 
 class Estimator(Protocol):

@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -21,14 +20,8 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.progress import Progress
 from toolkit.sequence import Packet, Prior, Sequence
-
-
-class Progress(Protocol):
-    """Hears how many of all frames are done."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Take note."""
 
 
 @dataclass

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,11 +126,11 @@ def _trajectories(options: argparse.Namespace) -> dict[str, Path]:
 
 def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
     """Yield each comparison as text, where its results are, and whether every run ended well."""
-    from toolkit.progress import progress_on
+    from toolkit.progress import of_this_process
     from toolkit.report.session import compare_all
     from toolkit.report.terminal import comparison_text
 
-    for comparison, directory in compare_all(request, lambda label: progress_on(sys.stderr, label)):
+    for comparison, directory in compare_all(request, of_this_process()):
         yield comparison_text(comparison), directory, comparison.all_ok
 
 
@@ -140,7 +139,7 @@ def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple
     from toolkit.cli.arguments import UsageError
     from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.progress import progress_on
+    from toolkit.progress import of_this_process
     from toolkit.report.seeds_md import seeds_text
     from toolkit.report.seeds_session import OverSeedsRequest, compare_over_seeds
 
@@ -154,7 +153,7 @@ def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple
         if not is_drawn_from_a_seed(source):
             raise UsageError(f"--seeds repeats simulated sequences, and {source} is the same under every seed")
     asked = OverSeedsRequest(request, options.seeds, options.workers or usable_cpus())
-    for over, directory in compare_over_seeds(asked, lambda label: progress_on(sys.stderr, label)):
+    for over, directory in compare_over_seeds(asked, of_this_process()):
         yield seeds_text(over), directory, over.all_ok
 
 

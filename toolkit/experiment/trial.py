@@ -14,6 +14,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, score_run
 from toolkit.metrics._shared.consistency import body_errors, nees_over_time
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.progress import SILENT
 from toolkit.sequence import Prior, Sequence
 
 OUTPUTS: tuple[Output, ...] = ("causal", "final")
@@ -55,13 +56,6 @@ class Outcome:
     sequence_hash: str = ""
 
 
-class _Unwatched:
-    """Progress within a trial, which nobody sees."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
-
-
 def sequence_of(trial: Trial) -> Sequence:
     """Return the trial's recording as the estimators read it: audited and cut."""
     sequence = audit(load_sequence(trial.source, trial.seed), trial.keep).sequence
@@ -73,7 +67,7 @@ def run_trial(trial: Trial) -> Iterator[Outcome]:
     sequence = sequence_of(trial)
     prior, sequence_hash = trial.start(sequence), sequence.content_hash()
     for name in trial.estimators:
-        run = runner.run(name, find(name).load(), sequence, prior, _Unwatched())
+        run = runner.run(name, find(name).load(), sequence, prior, SILENT)
         outputs = {output: _scored(run, output, sequence) for output in OUTPUTS if run.trajectory(output) is not None}
         yield Outcome(trial.seed, name, run.status, outputs, run.log, sequence_hash)
 

@@ -17,6 +17,7 @@ from toolkit.gate.fingerprint import fingerprint
 from toolkit.gate.reference import reference_s
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import score_run
+from toolkit.progress import SILENT
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, simulate
@@ -39,13 +40,6 @@ class Timed(Outcome):
     metrics: tuple[tuple[Output, dict[str, float | None]], ...] = ()
     speed: float | None = None
     fingerprint: str = ""
-
-
-class _Unwatched:
-    """Progress within a process, which nobody sees."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
 
 
 def trials_of(case: Case) -> list[CaseTrial]:
@@ -96,7 +90,7 @@ def run_case(trial: CaseTrial) -> Iterator[Timed]:
     reference_s()  # warms up what every later one finds warm
     before_s = reference_s()
     for name in trial.estimators:
-        run = runner.run(name, find(name).load(), sequence, prior, _Unwatched())
+        run = runner.run(name, find(name).load(), sequence, prior, SILENT)
         after_s = reference_s()
         yield Timed(
             trial.seed, name, run.status, log=run.log, sequence_hash=content,

@@ -1,8 +1,7 @@
 """The whole of the gate: measure a new baseline, or measure an old one again and judge what became of it."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from toolkit.estimator import find_all
@@ -13,9 +12,7 @@ from toolkit.gate.measuring import measure, metrics_of
 from toolkit.gate.paired import judge_pairs
 from toolkit.gate.releases import installed
 from toolkit.gate.verdict import Check
-from toolkit.runner import Progress
-
-ProgressFor = Callable[[str], AbstractContextManager[Progress]]
+from toolkit.progress import ProgressFor
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from toolkit.estimator import Build, find_all
 from toolkit.experiment.monte_carlo import OverSeeds
 from toolkit.experiment.workers import usable_cpus
 from toolkit.initialization import start_from_measurements
-from toolkit.progress import Silent
+from toolkit.progress import silent
 from toolkit.report import session
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures import drawn, over_seeds
@@ -76,7 +76,7 @@ def compare(
     if max_frames is not None:
         audited = replace(audited, sequence=audited.sequence.truncated(max_frames))
     prior = start_from_measurements(audited.sequence)
-    compared = session.compare(audited, prior, builds, lambda _: Silent())
+    compared = session.compare(audited, prior, builds, silent)
     return replace(compared, changes=changes_of(Request((), names, _NOWHERE), entries))
 
 
@@ -95,7 +95,7 @@ def compare_over_seeds(
     """
     request = Request((source,), tuple(estimators), _NOWHERE, max_frames=max_frames, seed=first_seed)
     asked = OverSeedsRequest(request, seeds, workers or usable_cpus())
-    return run_over_seeds(source, asked, find_all(request.estimators), lambda _: Silent())[0]
+    return run_over_seeds(source, asked, find_all(request.estimators), silent)[0]
 
 
 def table(result: Comparison | OverSeeds, *columns: str) -> ShownTable:

@@ -11,13 +11,14 @@ from toolkit.experiment.monte_carlo import OverSeeds, in_order
 from toolkit.experiment.trial import Trial, sequence_of
 from toolkit.experiment.workers import outcomes_of
 from toolkit.files import check_parent, replaced_directory
+from toolkit.progress import ProgressFor
 from toolkit.report import manifest, seeds_json, seeds_report_json
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.figures import save
 from toolkit.report.metrics_json import to_text
 from toolkit.report.run_directory import MANIFEST, REPORT, check_run_directory, is_run_directory
 from toolkit.report.seeds_md import seeds_report
-from toolkit.report.session import STARTS, ProgressFor, Request, changes_of, unique_names
+from toolkit.report.session import STARTS, Request, changes_of, unique_names
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 

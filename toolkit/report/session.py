@@ -1,7 +1,6 @@
 """From sources to run directories: load, audit, start, run, score, write; what ``vislam compare`` does."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,13 +14,12 @@ from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.files import check_parent
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.metrics import Scores, describe, score_run
+from toolkit.progress import ProgressFor
 from toolkit.report.comparison import Comparison, Row, Start, outputs_of, plain_name
 from toolkit.report.references import check_names, external_runs, reference_runs
 from toolkit.report.run_directory import check_run_directory, write_run
-from toolkit.runner import Progress
 from toolkit.sequence import Prior, Sequence, Truth
 
-ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 STARTS: dict[Start, Callable[[Sequence], Prior]] = {
     "measurements": start_from_measurements,
     "truth": start_from_truth,
