@@ -23,6 +23,7 @@ from toolkit.models.factors import L
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 120, "+ the future"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

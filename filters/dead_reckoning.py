@@ -8,6 +8,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 0, "the measured motion alone"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

@@ -108,3 +108,14 @@ class _Log:
 def of_this_process() -> ProgressFor:
     """Return what shows progress on standard error."""
     return on_stream(sys.stderr)
+
+
+def print_above(text: str) -> None:
+    """Print a text on standard output, above the line that shows progress where there is one."""
+    if not sys.stderr.isatty():
+        print(text, flush=True)
+        return
+    from tqdm import tqdm
+
+    tqdm.write(text, file=sys.stdout)
+    sys.stdout.flush()

@@ -20,8 +20,9 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.progress import Progress
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, Sequence
+from toolkit.settings import DEFAULTS, Settings
 
 
 @dataclass
@@ -44,7 +45,14 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
+def run(
+    name: str,
+    build: Build,
+    sequence: Sequence,
+    prior: Prior,
+    progress: Progress = SILENT,
+    settings: Settings = DEFAULTS,
+) -> Run:
     """Run an estimator over a sequence from a prior.
 
     Linear algebra runs on one thread meanwhile, so that the same bits and comparable times come out wherever it
@@ -52,12 +60,21 @@ def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pro
     log says why. Raises DataError where the sequence itself cannot be run.
     """
     with threadpool_limits(limits=1, user_api="blas"):
-        return _run(name, build, sequence, prior, progress)
+        return _run(name, build, sequence, prior, progress, settings)
 
 
-def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
+def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress, settings: Settings) -> Run:
     packets = list(sequence.packets())
-    setup = Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind)
+    setup = Setup(
+        sequence.rig,
+        sequence.noise,
+        prior,
+        sequence.gravity_world,
+        sequence.motion_kind,
+        settings,
+        settings.options_of(name),
+        progress,
+    )
     clock, said = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)

@@ -6,7 +6,7 @@ its source.
 """
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -139,7 +139,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise SettingsError(f"{path}: is not TOML ({error})") from error
 
 
-def with_assignments(given: Mapping[str, Any], assignments: tuple[str, ...]) -> dict[str, Any]:
+def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
     """Return nested values with ``section.key=value`` put in, the value as TOML writes it or a bare word."""
     result: dict[str, Any] = {key: dict(v) if isinstance(v, Mapping) else v for key, v in given.items()}
     for text in assignments:

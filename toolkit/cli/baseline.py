@@ -112,7 +112,7 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.estimator import find_all
     from toolkit.gate.baseline import Case
-    from toolkit.gate.case_work import located
+    from toolkit.gate.measuring import located
 
     estimators = tuple(find_all(options.estimators))
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
