@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 
 from toolkit.audit import audit
 from toolkit.datasets.io.truth_file import load_truth, with_truth
-from toolkit.errors import VislamError
 from toolkit.estimator import Build, find_all
 from toolkit.experiment.monte_carlo import OverSeeds
 from toolkit.experiment.workers import usable_cpus
 from toolkit.initialization import start_from_measurements
+from toolkit.metrics import known_metrics
 from toolkit.progress import Silent
 from toolkit.report import session
 from toolkit.report.comparison import Comparison
@@ -25,7 +25,7 @@ from toolkit.report.figures import drawn, over_seeds
 from toolkit.report.seeds_session import OverSeedsRequest, run_over_seeds
 from toolkit.report.seeds_table import seeds_table
 from toolkit.report.session import Request, changes_of, load_audited
-from toolkit.report.table import COLUMNS, Table, as_markdown, as_text, comparison_table
+from toolkit.report.table import Table, as_markdown, as_text, comparison_table, shown_metrics
 from toolkit.sequence import Sequence
 
 NOTHING_OF_ITS_OWN: Mapping[str, Build] = {}
@@ -101,33 +101,21 @@ def compare_over_seeds(
 def table(result: Comparison | OverSeeds, *columns: str) -> ShownTable:
     """Return the table of a result, or only the columns named, in the order given; see :func:`columns_of`.
 
-    A column that has no value in any row is left out. Raises VislamError for a name that is no column.
+    Columns are metrics, by key or by name. Raises VislamError for a name that no metric has.
     """
-    whole = comparison_table(result) if isinstance(result, Comparison) else seeds_table(result)
-    unknown = [name for name in columns if name not in columns_of(result)]
-    if unknown:
-        raise VislamError(f"no column is called {', '.join(unknown)}; there are {', '.join(columns_of(result))}")
-    if not columns:
-        return ShownTable(whole)
-    place = {_name(heading): i for i, heading in enumerate(whole.headings)}
-    chosen = [*range(whole.labels), *(place[name] for name in columns if name in place)]
-    headings = tuple(whole.headings[i] for i in chosen)
-    return ShownTable(Table(headings, tuple(tuple(row[i] for i in chosen) for row in whole.rows), whole.labels))
+    chosen = columns or None
+    whole = comparison_table(result, chosen) if isinstance(result, Comparison) else seeds_table(result, chosen)
+    return ShownTable(whole)
 
 
 def columns_of(result: Comparison | OverSeeds) -> tuple[str, ...]:
-    """Return the names by which :func:`table` knows the columns of a result."""
+    """Return the names by which :func:`table` knows the metrics that have a value in a result."""
     if isinstance(result, Comparison):
-        return tuple(column.name for column in COLUMNS)
-    whole = seeds_table(result)
-    return tuple(_name(heading) for heading in whole.headings[whole.labels :])
+        return tuple(metric.name for metric in shown_metrics(result, "all"))
+    return tuple(m.name for m in known_metrics() if any(group.spread(m.key) for group in result.groups))
 
 
 def figures(result: Comparison | OverSeeds) -> dict[str, Figure]:
     """Draw every figure that there is data for; return them by name, as ``vislam compare`` names their files."""
     drawings = drawn(result) if isinstance(result, Comparison) else over_seeds.draw(result)
     return {name: figure for name, _, figure in drawings}
-
-
-def _name(heading: tuple[str, ...]) -> str:
-    return " ".join(filter(None, heading[:2]))

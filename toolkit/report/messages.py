@@ -4,15 +4,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 
 from toolkit.audit import Finding
+from toolkit.metrics import unavailable
 from toolkit.report.comparison import Comparison, Row
 from toolkit.report.metrics_json import path_length_m
-from toolkit.report.table import COLUMNS
+from toolkit.report.table import Columns, explained_metrics, shared_values
 from toolkit.sequence import Sequence
 
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
-# Remarks on these are told beside the table, the others at the end of the report only.
+# Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
 _STATUS = {
@@ -33,6 +34,14 @@ def sequence_line(sequence: Sequence) -> str:
     path = "no ground truth" if path_m is None else f"true path {path_m:.0f} m"
     motion = {"twist": "body twists", "imu": "raw IMU"}[sequence.motion_kind]
     return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
+
+
+def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield what stands above a table: the recording, then the matched pairs and the coverage the rows share."""
+    yield sequence_line(comparison.sequence)
+    shared = ", ".join(shared_values(comparison, columns))
+    if shared:
+        yield f"scored: {shared}"
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
@@ -68,22 +77,25 @@ def truth_lines(comparison: Comparison) -> Iterator[str]:
     return _remarks(comparison, lambda key: key.startswith(_AGAINST_TRUTH))
 
 
-def missing_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield, for each reason, the columns of the table that are empty for it, and whose where not everybody's.
+def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield, for each reason, the metrics of the table without a value for it, and whose where not everybody's.
 
-    A run without any answer is explained by its status already and left out here.
+    A run without any answer is explained by its status already and left out here. Last come metric files that
+    could not be imported.
     """
     rows = [row for row in comparison.lines if row.run.trajectory(row.output) is not None]
     empty: dict[tuple[str, str], list[str]] = {}
-    for column in COLUMNS:
+    for metric in explained_metrics(columns):
         by_reason: dict[str, list[Row]] = {}
         for row in rows:
-            if row.scores.values.get(column.key) is None:
-                by_reason.setdefault(row.scores.notes.get(column.key, "not computed"), []).append(row)
+            if row.scores.values.get(metric.key) is None:
+                by_reason.setdefault(row.scores.notes.get(metric.key, "not computed"), []).append(row)
         for reason, affected in by_reason.items():
-            empty.setdefault((_whose(affected, rows), reason), []).append(column.name)
+            empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
     for (whose, reason), names in empty.items():
         yield f"no {', '.join(names)}{whose}: {reason}"
+    for name, why in unavailable().items():
+        yield f"the metrics of {name} are unavailable: {why}"
 
 
 def _whose(affected: list[Row], rows: list[Row]) -> str:

@@ -7,7 +7,7 @@ from toolkit.experiment.monte_carlo import OverSeeds
 from toolkit.report.seeds_table import consistency_lines, seeds_table, status_lines
 from toolkit.report.table import as_markdown, as_text
 
-_WIDTH = 118
+_WIDTH = 100
 _OUTSIDE_BY_DESIGN = """\
 Some estimators may stay outside their band, and are compared all the same. A decoupled filter, like the seed report's,
 takes its map for exact when it corrects the pose and forgets that both share their errors: it counts the same
@@ -24,11 +24,12 @@ means over the runs that are ok; `seeds.json` has median, spread and each seed's
   over the seeds. **ATE yaw**: the same error after a fit of heading and position.
 - **NEES**: the squared error over what the stated covariance expects, of rotation, position and the whole pose, over
   their degrees of freedom; 1 where the covariance is honest, above where the estimator is too sure of itself.
-- **NEES in band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
+- **NEES band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
   95 % chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their
   errors, so the share itself scatters widely from one set of seeds to another.
 - **NIS**: normalised innovations squared over their degrees of freedom, likewise.
-- **frame, total**: wall clock of one step and of a run, with as many runs side by side as the manifest says.
+- **reproj held-out**: median leave-one-view-out reprojection error of withheld tracks.
+- **CPU frame**: processor time of all threads over the number of steps.
 
 {_OUTSIDE_BY_DESIGN}"""
 

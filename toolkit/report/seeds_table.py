@@ -1,51 +1,68 @@
 """The comparison over seeds as a table, and in words what its NEES columns say."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple
 
 from toolkit.experiment.monte_carlo import Group, OverSeeds
-from toolkit.report.table import Table, number
+from toolkit.metrics import Metric, known_metrics, metrics_called
+from toolkit.report.table import MISSING, Columns, Table, cell, change_lines, heading, number
 
-_MISSING = "-"
-# Key, name, what of it, unit, decimals; "mean" and "std" are over the seeds.
-_COLUMNS = (
-    ("ate_none_m", "ATE", "none", "m", 3),
-    ("ate_yaw_m", "ATE", "yaw", "m", 3),
-    ("nees_ori_mean", "NEES", "rot", "1", 2),
-    ("nees_pos_mean", "NEES", "pos", "1", 2),
-    ("nees_pose_mean", "NEES", "pose", "1", 2),
-)
-_COSTS = (("nis_mean", "NIS", "", "1", 2), ("frame_ms_mean", "frame", "", "ms", 2), ("total_s", "total", "", "s", 2))
-# A consistent estimator is in its band at 95 % of the frames on average; what is less than this is told.
+# The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
+_BANDED = "nees_pose_mean"
+# A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
 
 
-def seeds_table(over: OverSeeds) -> Table:
-    """Return one row for each kind of output: means over the runs that are ok, and the spread of the first error."""
-    labels = [("estimator", "", ""), ("output", "", ""), *([("change", "", "")] if over.changes else [])]
-    counts = ("ok", "of", str(len(over.seeds)))
-    spread = ("ATE", "std", "m")
-    in_band = ("NEES", "in band", "%")
-    heads = [tuple(column[1:4]) for column in _COLUMNS]
-    headings = (*labels, counts, heads[0], spread, *heads[1:], in_band, *(tuple(column[1:4]) for column in _COSTS))
-    rows = tuple(_row(group, over, first=i == 0 or over.groups[i - 1].estimator != group.estimator)
-                 for i, group in enumerate(over.groups))  # fmt: skip
-    return Table(headings, rows, labels=len(labels))
+class _Column(NamedTuple):
+    """Three lines of heading, and the cell of a row."""
+
+    heading: tuple[str, str, str]
+    cell: Callable[[Group], str]
 
 
-def _row(group: Group, over: OverSeeds, *, first: bool) -> tuple[str, ...]:
-    change = [over.changes.get(group.estimator, "") if first else ""] if over.changes else []
-    error = group.spread(_COLUMNS[0][0])
-    std = _MISSING if error is None or error.std is None else number(error.std, 3)
-    means = [_mean(group, key, decimals) for key, *_, decimals in _COLUMNS]
+def seeds_table(over: OverSeeds, columns: Columns = None) -> Table:
+    """Return one row for each kind of output: means over the runs that are ok, and the spread of the first metric.
+
+    Under the table of a ladder stands what each estimator changes. Raises VislamError for an unknown column.
+    """
+    chosen = tuple(_columns(over, columns))
+    rows = tuple((group.estimator, group.output, *(column.cell(group) for column in chosen)) for group in over.groups)
+    labels = (("estimator", "", ""), ("output", "", ""))
+    under = change_lines((name, over.changes.get(name, "")) for name in over.estimators)
+    return Table((*labels, *(column.heading for column in chosen)), rows, len(labels), tuple(under))
+
+
+def _columns(over: OverSeeds, columns: Columns) -> Iterator[_Column]:
+    yield _Column(("ok", "of", str(len(over.seeds))), lambda group: str(group.counts["ok"]))
+    for i, metric in enumerate(_metrics(over, columns)):
+        yield _Column(heading(metric), partial(_mean, metric=metric))
+        if i == 0:
+            yield _Column((metric.heading[0], "std", metric.unit), partial(_std, metric=metric))
+        if metric.key == _BANDED:
+            yield _Column(("NEES", "band", "%"), _in_band)
+
+
+def _metrics(over: OverSeeds, columns: Columns) -> tuple[Metric, ...]:
+    if columns is not None and columns != "all":
+        return metrics_called(columns)
+    known = known_metrics() if columns == "all" else (metric for metric in known_metrics() if metric.over_seeds)
+    return tuple(metric for metric in known if any(group.spread(metric.key) for group in over.groups))
+
+
+def _mean(group: Group, metric: Metric) -> str:
+    spread = group.spread(metric.key)
+    return cell(None if spread is None else spread.mean, metric)
+
+
+def _std(group: Group, metric: Metric) -> str:
+    spread = group.spread(metric.key)
+    return cell(None if spread is None else spread.std, metric)
+
+
+def _in_band(group: Group) -> str:
     nees = group.mean_nees
-    in_band = _MISSING if nees is None else number(nees.in_band_percent, 1)
-    costs = (_mean(group, key, decimals) for key, *_, decimals in _COSTS)
-    return (group.estimator, group.output, *change, str(group.counts["ok"]), means[0], std, *means[1:], in_band, *costs)
-
-
-def _mean(group: Group, key: str, decimals: int) -> str:
-    spread = group.spread(key)
-    return _MISSING if spread is None else number(spread.mean, decimals)
+    return MISSING if nees is None else number(nees.in_band_percent, 1)
 
 
 def status_lines(over: OverSeeds) -> Iterator[str]:
@@ -65,7 +82,7 @@ def status_lines(over: OverSeeds) -> Iterator[str]:
 
 def consistency_lines(over: OverSeeds) -> Iterator[str]:
     """Yield a verdict a row on whether its stated covariance is honest; equal verdicts of both outputs once."""
-    told: set[str] = set()
+    given: set[str] = set()
     for group in over.groups:
         nees = group.mean_nees
         if nees is None:
@@ -76,8 +93,8 @@ def consistency_lines(over: OverSeeds) -> Iterator[str]:
             above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
             how = "too sure of itself" if above >= below else "less sure of itself than it could be"
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
-        if verdict not in told:
-            told.add(verdict)
+        if verdict not in given:
+            given.add(verdict)
             same = sum(g.estimator == group.estimator and _equal(g, group) for g in over.groups) > 1
             yield verdict.format("" if same else f" {group.output}")
 
