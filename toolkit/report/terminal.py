@@ -3,6 +3,8 @@
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
+from tabulate import tabulate
+
 from toolkit.audit import Audit
 from toolkit.report.comparison import Comparison
 from toolkit.report.messages import (
@@ -17,6 +19,7 @@ from toolkit.report.messages import (
 from toolkit.report.table import Columns, Table, as_text, comparison_table
 
 _WIDTH = 100
+_INDENT = "  "
 
 
 def comparison_text(comparison: Comparison, columns: Columns = None) -> str:
@@ -63,9 +66,6 @@ def audit_text(audited: Audit) -> str:
 def listing_text(title: str, entries: Mapping[str, str]) -> str:
     """Return names with their one-line summaries under a title."""
     width = max((len(name) for name in entries), default=0)
-    lines = [f"{title}:"]
-    for name, summary in entries.items():
-        start = f"  {name:<{width}}  "
-        filled = textwrap.fill(summary, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start))
-        lines.append(filled or start.rstrip())
-    return "\n".join(lines)
+    columns = [None, _WIDTH - width - 2 * len(_INDENT)]
+    text = tabulate(entries.items(), tablefmt="plain", maxcolwidths=columns, disable_numparse=True)
+    return "\n".join([f"{title}:", *(f"{_INDENT}{line}".rstrip() for line in text.splitlines())])
