@@ -125,7 +125,7 @@ print(f"the least of all has {min(score, key=score.get)}")
 # %%
 SEEDS, FRAMES = 8, 25
 over = compare_over_seeds("flight", ["ladder"], SEEDS, max_frames=FRAMES)
-table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose", "NEES in band")
+table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
 figures(over)["nees_over_seeds"]

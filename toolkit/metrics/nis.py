@@ -6,10 +6,21 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 import numpy as np
 
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 70
-METRICS = {"nis_mean": "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent"}
+METRICS = (
+    Metric(
+        "nis_mean",
+        "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent",
+        "1",
+        ("NIS", "mean"),
+        best="one",
+        over_seeds=True,
+        gate_name="consistency (NIS)",
+        in_contract=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:
