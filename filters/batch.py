@@ -22,6 +22,7 @@ from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 120, "+ the future"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

@@ -7,6 +7,7 @@ from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 0, "the measured motion alone"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

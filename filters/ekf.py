@@ -5,6 +5,7 @@ from filters.kalman.online_output import Speaker
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 20, "+ gates, landmark noise in the innovation"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

@@ -31,7 +31,7 @@ from toolkit.gate.checking import How, check, new_baseline
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
 from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
-from toolkit.progress import Silent
+from toolkit.progress import SILENT, silent
 from toolkit.report.gate_words import gate_text
 from toolkit.report.interactive import compare, compare_over_seeds, figures, table
 from toolkit.runner import run
@@ -107,7 +107,7 @@ def build(setup: Setup) -> TwoView:
 
 # %%
 drive = load_sequence("drive").truncated(200)
-mine: Run = run("two-view", build, drive, drive.prior, Silent())
+mine: Run = run("two-view", build, drive, drive.prior, SILENT)
 scores = score_run(mine, "final", drive)
 print(f"{mine.status}: position error {scores.values['ate_se3_m']:.2f} m over {drive.duration_s:.0f} s")
 
@@ -188,12 +188,12 @@ print(f"ekf one of which it is {np.sqrt(nees['ekf']):.1f} times as large")
 
 # %%
 case = Case("drive", simulated=True, seeds=tuple(range(8)), estimators=("two-view",), duration_s=3.0)
-baseline = new_baseline([case], workers=2, made_by={}, progress_for=lambda _: Silent())
+baseline = new_baseline([case], workers=2, made_by={}, progress_for=silent)
 
 
 def check_again() -> str:
     """Measure everything in the baseline again, and return what the gate says; time is not judged here."""
-    return gate_text(check(baseline, "the baseline", How(workers=2, speed=False), lambda _: Silent()))
+    return gate_text(check(baseline, "the baseline", How(workers=2, speed=False), silent))
 
 
 print(check_again())

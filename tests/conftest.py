@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from toolkit import runner
 from toolkit.estimate import Run
 from toolkit.estimator import find
+from toolkit.progress import SILENT
 from toolkit.sequence import Prior, Sequence
 
 PROJECT = Path(__file__).parents[1]
@@ -38,13 +39,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     one, other = longest[::2], together + longest[1::2]
     rest = max(round(_FIRST_SHARE * len(items)) - len(one), 0)
     items[:] = [*one, *others[:rest], *other, *others[rest:]]
-
-
-class Unheard:
-    """A progress nobody looks at."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
 
 
 @pytest.fixture(scope="session")
@@ -98,6 +92,6 @@ def run_estimator() -> Callable[..., Run]:
     def run(name: str, sequence: Sequence, prior: Prior | None = None) -> Run:
         start = sequence.prior if prior is None else prior
         assert start is not None
-        return runner.run(name, find(name).load(), sequence, start, Unheard())
+        return runner.run(name, find(name).load(), sequence, start, SILENT)
 
     return run

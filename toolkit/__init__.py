@@ -1,4 +1,34 @@
 """Compare a handwritten stereo visual-inertial EKF with a GTSAM smoother on the same measurements.
 
-Reading order: sequence -> models -> filters/ekf -> filters/batch -> metrics -> report.
+``toolkit.compare("drive", ["ekf", "batch"])`` is the whole of it; what the package offers is imported when first used.
+
+Reading order: sequence -> models -> filters/ekf -> filters/batch -> metrics -> experiment -> report.
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from toolkit.api import Result, compare
+    from toolkit.datasets import load_sequence
+    from toolkit.settings import Settings
+
+__all__ = ["Result", "Settings", "compare", "load_sequence"]
+
+_HOME = {
+    "Result": "toolkit.api",
+    "Settings": "toolkit.settings",
+    "compare": "toolkit.api",
+    "load_sequence": "toolkit.datasets",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_HOME]

@@ -2,16 +2,17 @@
 
 An installed package announces, in the entry-point group ``toolkit.estimators``, a package whose modules are
 estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its
-summary and its function ``build(setup)`` makes one. A module may also stand on the ladder, in which every rung
-changes one thing: the constant ``RUNG`` is its place, ``CHANGE`` what it changes against the rung before.
+summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
+ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
+where no estimator is named; ``OPTIONS`` names the settings that it alone reads.
 """
 
 import ast
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Literal, Protocol, cast
@@ -19,7 +20,9 @@ from typing import Literal, Protocol, cast
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import MotionNoise, Packet, Prior, StereoRig
+from toolkit.settings import DEFAULTS, Scalar, Settings
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
@@ -28,13 +31,19 @@ LADDER = "ladder"
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2."""
+    """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
+
+    ``options`` are the settings of this estimator alone, by name; ``progress`` hears of a long ``finish``.
+    """
 
     rig: StereoRig
     noise: MotionNoise
     prior: Prior
     gravity_world: Array
     motion_kind: Literal["twist", "imu"]
+    settings: Settings = DEFAULTS
+    options: Mapping[str, Scalar] = field(default_factory=dict)
+    progress: Progress = SILENT
 
 
 class Estimator(Protocol):
@@ -67,10 +76,26 @@ class EstimatorEntry:
         rung = self._constants().get("RUNG")
         return rung if isinstance(rung, int) else None
 
+    def is_default(self) -> bool:
+        """Say whether the estimator is compared where none is named: its module's constant ``DEFAULT``."""
+        return self._constants().get("DEFAULT") is True
+
     def change(self) -> str:
         """Return what the estimator changes against the rung before it; empty where the module does not say."""
         change = self._constants().get("CHANGE")
         return change if isinstance(change, str) else ""
+
+    def options(self) -> frozenset[str]:
+        """Return the names of the settings that this estimator alone reads: its module's constant ``OPTIONS``."""
+        return frozenset(self._strings("OPTIONS"))
+
+    def check_usable(self, settings: Settings) -> None:
+        """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""
+        self.load()
+        for option in settings.options_of(self.name):
+            if option not in self.options():
+                known = ", ".join(sorted(self.options())) or "none"
+                raise EstimatorError(f"estimator {self.name} has no option {option}; it has {known}")
 
     def _tree(self) -> ast.Module:
         return ast.parse(self.path.read_text(encoding="utf-8"))
@@ -87,6 +112,15 @@ class EstimatorEntry:
                 continue
             found |= {t.id: v.value for t, v in pairs if isinstance(t, ast.Name) and isinstance(v, ast.Constant)}
         return found
+
+    def _strings(self, constant: str) -> list[str]:
+        """Return the words of a top-level tuple of literals; none where there is no such constant."""
+        for statement in self._tree().body:
+            if isinstance(statement, ast.Assign) and any(
+                isinstance(target, ast.Name) and target.id == constant for target in statement.targets
+            ):
+                return [str(word) for word in ast.literal_eval(statement.value)]
+        return []
 
     def load(self) -> Build:
         """Import the estimator and return its ``build``.
@@ -132,6 +166,12 @@ def ladder() -> tuple[EstimatorEntry, ...]:
     """Return every estimator that stands on the ladder, from the lowest rung up."""
     on_it = [(rung, name, entry) for name, entry in discover().items() if (rung := entry.rung()) is not None]
     return tuple(entry for _, _, entry in sorted(on_it, key=lambda placed: placed[:2]))
+
+
+def defaults() -> tuple[str, ...]:
+    """Return the names of the estimators that are compared where none is named, from the lowest rung up."""
+    chosen = [(entry.rung() or 0, name) for name, entry in discover().items() if entry.is_default()]
+    return tuple(name for _, name in sorted(chosen))
 
 
 def find_all(names: Iterable[str]) -> dict[str, EstimatorEntry]:

@@ -1,63 +1,121 @@
-"""Progress of long work: a bar on a terminal, nothing in a log; both look the same to the loop that reports it."""
+"""Progress of long work, with the time that is left: a bar on a terminal, a line now and then in a log.
 
+The loop that reports progress does not know who watches: nobody (``SILENT``) and a bar look the same to it.
+"""
+
+import sys
 import time
-from types import TracebackType
-from typing import Self, TextIO
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol, TextIO
 
-_WIDTH = 30
-_REDRAW_S = 0.1
-_ERASE_LINE = "\r\x1b[2K"
+# Seconds between two lines where the stream is a file or a pipe, and before the first.
+LOG_EVERY_S = 10.0
+_FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
+_LOG_FORMAT = "{desc} {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
+
+
+class Progress(Protocol):
+    """Hears how many of all steps are done."""
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        """Take note; ``stage`` names what is under way where that changes, as in a solver's iterations."""
 
 
 class Silent:
     """Progress nobody watches."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
-    def advance(self, done: int, total: int) -> None:
+    def advance(self, done: int, total: int, stage: str = "") -> None:
         """Take note of nothing."""
 
 
-class TerminalBar:
-    """One line that redraws itself and is gone when the work is done."""
+SILENT = Silent()
+# Begins a piece of work of some name; what it gives hears of its progress, and the work ends with the context.
+ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 
-    def __init__(self, stream: TextIO, label: str) -> None:
-        self._stream = stream
-        self._label = label
-        self._drawn_s = float("-inf")
 
-    def __enter__(self) -> Self:
-        self._draw("...")
-        return self
+@contextmanager
+def silent(_label: str) -> Iterator[Progress]:
+    """Begin a piece of work that nobody watches."""
+    yield SILENT
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._draw("")
-        self._stream.write(_ERASE_LINE)
+
+def on_stream(stream: TextIO) -> ProgressFor:
+    """Return what shows progress on a stream: one line that redraws itself on a terminal, else a line now and then."""
+
+    @contextmanager
+    def shown(label: str) -> Iterator[Progress]:
+        if not stream.isatty():
+            yield _Log(label, stream)
+            return
+        bar = _Bar(label, stream)
+        try:
+            yield bar
+        finally:
+            bar.close()
+
+    return shown
+
+
+class _Bar:
+    """A line on a terminal that redraws itself and is gone when the work is done."""
+
+    def __init__(self, label: str, stream: TextIO) -> None:
+        from tqdm import tqdm
+
+        self._label, self._stage = label, ""
+        self._bar = tqdm(desc=label, total=0, file=stream, leave=False, dynamic_ncols=True, bar_format=_FORMAT)
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        """Show that ``done`` of ``total`` steps are taken."""
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label, refresh=False)
+            self._bar.reset(total)
+        self._bar.total = total
+        if done > self._bar.n:
+            self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        """Take the line away."""
+        self._bar.close()
+
+
+class _Log:
+    """A line now and then in a file or a pipe; work that is soon done leaves none."""
+
+    def __init__(self, label: str, stream: TextIO) -> None:
+        self._label, self._stream = label, stream
+        self._stage, self._began_s = "", time.monotonic()
+        self._told_s = self._began_s
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        """Write a line where the last one is long past."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._began_s = stage, now_s
+        if now_s - self._told_s < LOG_EVERY_S:
+            return
+        from tqdm import tqdm
+
+        label = f"{self._label}, {stage}" if stage else self._label
+        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=_LOG_FORMAT)
+        self._stream.write(f"{meter}\n")
         self._stream.flush()
-
-    def advance(self, done: int, total: int) -> None:
-        """Say that ``done`` of ``total`` steps are taken; redraws at most ten times a second."""
-        if done >= total:
-            # A smoother's work begins here: a full bar that stands still would look like a hang.
-            self._draw(f"{total} frames read, finishing")
-        elif time.monotonic() - self._drawn_s >= _REDRAW_S:
-            filled = _WIDTH * done // total
-            self._draw(f"[{'#' * filled}{'.' * (_WIDTH - filled)}] {done}/{total}")
-
-    def _draw(self, text: str) -> None:
-        self._drawn_s = time.monotonic()
-        self._stream.write(f"{_ERASE_LINE}{self._label} {text}")
-        self._stream.flush()
+        self._told_s = now_s
 
 
-def progress_on(stream: TextIO, label: str) -> Silent | TerminalBar:
-    """Return a bar where the stream is a terminal, and silence where it is a file or a pipe."""
-    return TerminalBar(stream, label) if stream.isatty() else Silent()
+def of_this_process() -> ProgressFor:
+    """Return what shows progress on standard error."""
+    return on_stream(sys.stderr)
+
+
+def print_above(text: str) -> None:
+    """Print a text on standard output, above the line that shows progress where there is one."""
+    if not sys.stderr.isatty():
+        print(text, flush=True)
+        return
+    from tqdm import tqdm
+
+    tqdm.write(text, file=sys.stdout)
+    sys.stdout.flush()

@@ -11,7 +11,6 @@ import time
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -21,14 +20,9 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, Sequence
-
-
-class Progress(Protocol):
-    """Hears how many of all frames are done."""
-
-    def advance(self, done: int, total: int) -> None:
-        """Take note."""
+from toolkit.settings import DEFAULTS, Settings
 
 
 @dataclass
@@ -51,7 +45,14 @@ def _peak_rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 
 
-def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
+def run(
+    name: str,
+    build: Build,
+    sequence: Sequence,
+    prior: Prior,
+    progress: Progress = SILENT,
+    settings: Settings = DEFAULTS,
+) -> Run:
     """Run an estimator over a sequence from a prior.
 
     Linear algebra runs on one thread meanwhile, so that the same bits and comparable times come out wherever it
@@ -59,12 +60,21 @@ def run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pro
     log says why. Raises DataError where the sequence itself cannot be run.
     """
     with threadpool_limits(limits=1, user_api="blas"):
-        return _run(name, build, sequence, prior, progress)
+        return _run(name, build, sequence, prior, progress, settings)
 
 
-def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress) -> Run:
+def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress, settings: Settings) -> Run:
     packets = list(sequence.packets())
-    setup = Setup(sequence.rig, sequence.noise, prior, sequence.gravity_world, sequence.motion_kind)
+    setup = Setup(
+        sequence.rig,
+        sequence.noise,
+        prior,
+        sequence.gravity_world,
+        sequence.motion_kind,
+        settings,
+        settings.options_of(name),
+        progress,
+    )
     clock, said = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)

@@ -25,6 +25,7 @@ from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.estimator import find
 from toolkit.initialization import start_from_measurements
+from toolkit.progress import SILENT
 from toolkit.sequence import Sequence
 
 DATA = Path(__file__).parents[2] / os.environ.get("VISLAM_DATA", "../shared/data")
@@ -47,11 +48,6 @@ def reference_ms() -> float:
     return 1e3 * min(times)
 
 
-class _Unheard:
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
-
-
 def _recordings() -> Iterator[Sequence]:
     for source in RECORDINGS:
         if "/" in source and not Path(source).exists():
@@ -69,7 +65,7 @@ def measure(names: tuple[str, ...]) -> None:
         prior = start_from_measurements(sequence)
         for name in names:
             reference = reference_ms()
-            run = runner.run(name, find(name).load(), sequence, prior, _Unheard())
+            run = runner.run(name, find(name).load(), sequence, prior, SILENT)
             step_ms, total_s = 1e3 * run.timings.step_s, run.timings.total_s
             print(
                 f"{sequence.name:<12}{name:<16}{run.status:<10}{step_ms.mean():>9.3f}{np.quantile(step_ms, 0.95):>8.3f}"

@@ -28,17 +28,13 @@ from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import Evaluation, ate, held_out, nees
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.progress import SILENT
 from toolkit.sequence import ImuSamples, Observations, Sequence, TwistNoise, TwistSamples
 from toolkit.simulation import SCENARIOS, simulate
 
 DITHER = 0.05
 LEVELS_PERCENT = (0.0, 2.0, 5.0, 10.0)
 SIDES = (0, 1)
-
-
-class _Unheard:
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
 
 
 def dithered(sequence: Sequence, rng: np.random.Generator) -> Sequence:
@@ -94,7 +90,7 @@ def one_seed(source: str, duration_s: float, seed: int, estimators: tuple[str, .
         planted = np.random.default_rng([seed, side, 1])
         for name in estimators:
             before_s = reference_s()
-            run = runner.run(name, find(name).load(), read, prior, _Unheard())
+            run = runner.run(name, find(name).load(), read, prior, SILENT)
             assert run.timings is not None
             speed = 2.0 * run.timings.cpu_s / (before_s + reference_s())
             u = planted.uniform(0.0, 2.0, len(LEVELS_PERCENT))

@@ -14,6 +14,7 @@ from toolkit.estimate import Estimate, Finished, Run, Trajectory
 from toolkit.estimator import Build, Setup, discover, find
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import triangulate_world
+from toolkit.progress import SILENT
 from toolkit.sequence import Packet, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
 
@@ -64,14 +65,9 @@ def setup_of(sequence: Sequence) -> Setup:
     return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
 
 
-class Unheard:
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
-
-
 def run_on(name: str, build: Build, sequence: Sequence) -> Run:
     assert sequence.prior is not None
-    return runner.run(name, build, sequence, sequence.prior, Unheard())
+    return runner.run(name, build, sequence, sequence.prior, SILENT)
 
 
 class Watched(NamedTuple):

@@ -23,11 +23,8 @@ import numpy as np
 from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.estimator import discover
+from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-
-class Unheard:
-    def advance(self, done, total):
-        pass
 
 def feed(digest, value):
     if isinstance(value, np.ndarray):
@@ -42,7 +39,7 @@ for scenario in (replace(DRIVE, duration_s=0.8), replace(FLIGHT, duration_s=0.8)
     for name, entry in discover().items():
         digest = hashlib.sha256()
         try:
-            run = runner.run(name, entry.load(), sequence, sequence.prior, Unheard())
+            run = runner.run(name, entry.load(), sequence, sequence.prior, SILENT)
         except EstimatorError:
             said[f"{name} on {sequence.name}"] = "unavailable"
             continue

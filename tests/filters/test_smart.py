@@ -13,6 +13,7 @@ from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
+from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -139,17 +140,12 @@ def test_a_blackout_longer_than_the_window_does_not_end_it(run_estimator):
     assert np.isfinite(run.causal.cov).all()
 
 
-class Unheard:
-    def advance(self, done: int, total: int) -> None:
-        """Take no note."""
-
-
 def test_the_window_bounds_what_is_kept_of_the_past(run_estimator):
     """The final answer is each state as it left the window: a longer window corrects it longer."""
     sequence = simulate(replace(DRIVE, duration_s=6.0), 2)
 
     def error_m(lag_s):
-        run = runner.run("smart", lambda setup: Smart(setup, lag_s), sequence, sequence.prior, Unheard())
+        run = runner.run("smart", lambda setup: Smart(setup, lag_s), sequence, sequence.prior, SILENT)
         assert run.status == "ok"
         return np.linalg.norm(run.final.positions - run.causal.positions, axis=1).mean()
 

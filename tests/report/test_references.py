@@ -14,6 +14,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.metrics import cost, score_run
+from toolkit.progress import SILENT
 from toolkit.report.comparison import Comparison
 from toolkit.report.figures import errors_over_time, frame_times
 from toolkit.report.metrics_json import violations
@@ -28,15 +29,10 @@ NAME = "openvins (est.txt)"
 OFFSET_M = 0.25
 
 
-class Unheard:
-    def advance(self, done: int, total: int) -> None:
-        pass
-
-
 @contextmanager
 def quietly(_label: str) -> Iterator[Progress]:
     with nullcontext():
-        yield Unheard()
+        yield SILENT
 
 
 @pytest.fixture(scope="module")

@@ -25,9 +25,6 @@ exit status:
   130  interrupted (Ctrl-C or SIGTERM); nothing is left half-written"""
 
 
-DEFAULT_ESTIMATORS = ("dead-reckoning", "ekf", "batch")
-
-
 class UsageError(VislamError):
     """A command line that asks for something that does not exist."""
 
@@ -115,11 +112,21 @@ def positive_seconds(text: str) -> float:
 def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the names of estimators, with what they are named for."""
     parser.add_argument(
-        "--estimators",
-        metavar="NAME,...",
-        type=names,
-        default=DEFAULT_ESTIMATORS,
-        help=f"{what} (default: {','.join(DEFAULT_ESTIMATORS)})",
+        "--estimators", metavar="NAME,...", type=names, help=f"{what} (default: those that 'vislam list' marks)"
+    )
+
+
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the file and the single assignments that change settings."""
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, help="settings in TOML, or the manifest.json of a run to repeat"
+    )
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="one setting, as in window.lag_s=3 (see 'vislam list'); may be repeated",
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,7 +78,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.gate.baseline_json import to_text
     from toolkit.gate.checking import new_baseline
     from toolkit.gate.releases import label
-    from toolkit.progress import progress_on
+    from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, made_here, write_text
 
     cases = _cases(options)
@@ -87,7 +86,7 @@ def command(options: argparse.Namespace) -> int:
     check_writable(out)
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_baseline(cases, workers, made_by, lambda told: progress_on(sys.stderr, told))
+    made = new_baseline(cases, workers, made_by, of_this_process())
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join([*ends, f"baseline: {out}"]))
@@ -113,7 +112,7 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     from toolkit.datasets import is_drawn_from_a_seed
     from toolkit.estimator import find_all
     from toolkit.gate.baseline import Case
-    from toolkit.gate.case_work import located
+    from toolkit.gate.measuring import located
 
     estimators = tuple(find_all(options.estimators))
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,7 +50,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline_reader import check_releases, load_baseline
     from toolkit.gate.checking import How, check
-    from toolkit.progress import progress_on
+    from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, write_check
     from toolkit.report.gate_words import gate_text
 
@@ -62,7 +61,7 @@ def command(options: argparse.Namespace) -> int:
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
     how = How(options.workers or usable_cpus(), speed=not options.skip_speed)
-    checked = check(baseline, str(options.baseline), how, lambda label: progress_on(sys.stderr, label))
+    checked = check(baseline, str(options.baseline), how, of_this_process())
     write_check(checked, files)
     print(gate_text(checked))
     return 0 if checked.passed else 1

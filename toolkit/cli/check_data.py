@@ -31,12 +31,10 @@ def add_to(subcommands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     """Print the audit and return 1 where a fault stays that must not."""
     from toolkit.audit import faults
-    from toolkit.datasets.io.truth_file import load_truth
-    from toolkit.report.session import load_audited
+    from toolkit.experiment.recording import Recording, audited_recording
     from toolkit.report.terminal import audit_text
 
     keep = kept_faults(options, faults())
-    truth = None if options.truth is None else load_truth(options.truth)
-    audited = load_audited(options.sequence, truth, keep, options.seed)
+    audited = audited_recording(Recording(options.sequence, options.seed, options.truth, keep))
     print(audit_text(audited))
     return 1 if any(finding.blocking for finding in audited.findings) else 0

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     add_estimators_argument,
     add_repair_arguments,
+    add_settings_arguments,
     add_workers_argument,
     at_least,
     epilog,
@@ -19,12 +19,14 @@ from toolkit.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Mapping
 
     from toolkit.cli.arguments import Subcommands
-    from toolkit.report.session import Request
+    from toolkit.experiment import Plan
+    from toolkit.experiment.configuration import Configuration
 
-SEQUENCES = ("kitti00", "drive")
+# The one with truth first: its table is the first impression.
+SEQUENCES = ("drive", "kitti00")
 
 
 def add_to(subcommands: Subcommands) -> None:
@@ -40,7 +42,6 @@ def add_to(subcommands: Subcommands) -> None:
         "sequences",
         metavar="SEQUENCE",
         nargs="*",
-        default=SEQUENCES,
         help=f"a recording's path, or a built-in name (default: {' '.join(SEQUENCES)})",
     )
     add_estimators_argument(parser, "what to compare, see 'vislam list'; 'ladder' is every rung")
@@ -60,102 +61,116 @@ def add_to(subcommands: Subcommands) -> None:
     parser.add_argument(
         "--start",
         choices=("measurements", "truth"),
-        default="measurements",
         help="where the first state comes from; a start from the truth is labelled (default: measurements)",
     )
-    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of simulated sequences (default: 0)")
+    parser.add_argument("--seed", metavar="N", type=at_least(0), help="of simulated sequences (default: 0)")
     parser.add_argument(
-        "--seeds",
-        metavar="N",
-        type=at_least(1),
-        default=1,
-        help="repeat simulated sequences over N seeds, from --seed",
+        "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
     )
-    add_workers_argument(parser, "processes side by side with --seeds")
+    add_settings_arguments(parser)
+    add_workers_argument(parser)
     parser.set_defaults(command=command)
 
 
 def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
-    from toolkit.audit import faults
-    from toolkit.cli.arguments import UsageError
-    from toolkit.report.session import Request
+    from toolkit.experiment import comparisons, prepared_cases
+    from toolkit.progress import of_this_process, print_above
+    from toolkit.report.run_directory import MadeBy, write_run
+    from toolkit.report.session import directories_for
+    from toolkit.report.terminal import comparison_text
 
-    if options.truth is not None and len(options.sequences) != 1:
-        raise UsageError("--truth goes with exactly one SEQUENCE (see vislam compare --help)")
-    request = Request(
-        sources=tuple(options.sequences),
-        estimators=options.estimators,
-        out=options.out if options.out is not None else _new_run(),
-        truth=options.truth,
-        trajectories=_trajectories(options),
-        max_frames=options.max_frames,
-        keep=kept_faults(options, faults()),
-        start=options.start,
-        seed=options.seed,
-        command=shlex.join(options.command_line),
-    )
-    compared = _over_seeds(request, options) if options.seeds > 1 or options.workers is not None else _once(request)
+    asked = _configuration(options)
+    plan, progress_for = _plan(asked, options.workers), of_this_process()
+    cases = prepared_cases(plan, progress_for)
+    directories = directories_for(cases, options.out if options.out is not None else _new_run())
+    made_by = MadeBy(shlex.join(options.command_line), asked)
     all_ok = True
-    for text, directory, ok in compared:
-        print(text, f"\nresults: {directory}\n", sep="\n", flush=True)
-        all_ok = all_ok and ok
+    for comparison, directory in zip(comparisons(plan, cases, progress_for), directories, strict=True):
+        print_above(comparison_text(comparison))
+        with progress_for(f"{comparison.name}: figures and report"):
+            write_run(comparison, directory, made_by)
+        print_above(f"\nresults: {directory}\n")
+        all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
 
 
-def _trajectories(options: argparse.Namespace) -> dict[str, Path]:
-    """Return the trajectory files by name; a name that stands for something else is a UsageError."""
-    if not options.trajectory:
-        return {}
+def _configuration(options: argparse.Namespace) -> Configuration:
+    """Return what is to be compared and how: the file of --config, over it --set, over that the other arguments."""
+    from toolkit.experiment.configuration import configuration, read_configuration
+    from toolkit.settings import with_assignments
+
+    request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
+    place = "the command line" if options.config is None else str(options.config)
+    given = {
+        "sequences": options.sequences or None,
+        "estimators": options.estimators,
+        "truth": None if options.truth is None else str(options.truth),
+        "trajectories": {name: str(file) for name, file in options.trajectory} or None,
+        "max_frames": options.max_frames,
+        "keep": _kept(options),
+    }
+    named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds}
+    request = {**request, **{key: value for key, value in given.items() if value is not None}}
+    settings = with_assignments(settings, options.set)
+    settings |= {key: value for key, value in named.items() if value is not None}
+    return configuration(request, settings, place)
+
+
+def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
+    """Return the faults not to be repaired, or None where the command line says nothing of them."""
+    if not options.no_repair and not options.keep:
+        return None
+    from toolkit.audit import faults
+
+    return tuple(sorted(kept_faults(options, faults())))
+
+
+def _plan(asked: Configuration, workers: int | None) -> Plan:
+    """Return the plan of a configuration; what does not go together is a UsageError."""
+    from toolkit.cli.arguments import UsageError
+    from toolkit.estimator import defaults
+    from toolkit.experiment import Plan
+
+    request, settings = asked.request, asked.settings
+    sequences = request.sequences or SEQUENCES
+    estimators = request.estimators or defaults()
+    single = {"--truth": request.truth is not None, "--trajectory": bool(request.trajectories)}
+    for option, used in single.items():
+        if used and len(sequences) != 1:
+            raise UsageError(f"{option} goes with exactly one SEQUENCE (see vislam compare --help)")
+        if used and settings.seeds > 1:
+            raise UsageError(f"{option} and --seeds exclude each other: a file is of one recording")
+    _check_trajectory_names(request.trajectories, estimators)
+    return Plan(
+        sources=tuple(sequences),
+        estimators=tuple(estimators),
+        settings=settings,
+        truth=None if request.truth is None else Path(request.truth),
+        trajectories={name: Path(file) for name, file in request.trajectories.items()},
+        keep=frozenset(request.keep),
+        max_frames=request.max_frames,
+        workers=workers,
+    )
+
+
+def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterable[str]) -> None:
+    """Raise UsageError for a trajectory whose name stands for something else."""
+    if not trajectories:
+        return
     from toolkit.cli.arguments import UsageError
     from toolkit.estimator import find_all
-    from toolkit.report.comparison import plain_name
+    from toolkit.experiment.comparison import plain_name
     from toolkit.report.export import TRUTH
 
-    if len(options.sequences) != 1:
-        raise UsageError("--trajectory goes with exactly one SEQUENCE (see vislam compare --help)")
     # What a name becomes as that of a file must differ, too.
-    taken = {plain_name(name): name for name in (TRUTH, *find_all(options.estimators))}
-    for name, _ in options.trajectory:
+    taken = {plain_name(name): name for name in (TRUTH, *find_all(estimators))}
+    for name in trajectories:
         plain = plain_name(name)
         if not plain or plain in taken:
             why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
             raise UsageError(f"--trajectory: the name {name} {why}; choose another")
         taken[plain] = f"another trajectory, {name}"
-    return dict(options.trajectory)
-
-
-def _once(request: Request) -> Iterator[tuple[str, Path, bool]]:
-    """Yield each comparison as text, where its results are, and whether every run ended well."""
-    from toolkit.progress import progress_on
-    from toolkit.report.session import compare_all
-    from toolkit.report.terminal import comparison_text
-
-    for comparison, directory in compare_all(request, lambda label: progress_on(sys.stderr, label)):
-        yield comparison_text(comparison), directory, comparison.all_ok
-
-
-def _over_seeds(request: Request, options: argparse.Namespace) -> Iterator[tuple[str, Path, bool]]:
-    """Yield the same for each comparison over seeds; what cannot be repeated over seeds is a UsageError."""
-    from toolkit.cli.arguments import UsageError
-    from toolkit.datasets import is_drawn_from_a_seed
-    from toolkit.experiment.workers import usable_cpus
-    from toolkit.progress import progress_on
-    from toolkit.report.seeds_md import seeds_text
-    from toolkit.report.seeds_session import OverSeedsRequest, compare_over_seeds
-
-    if options.seeds == 1:
-        raise UsageError("--workers goes with --seeds of 2 and more (see vislam compare --help)")
-    if options.truth is not None:
-        raise UsageError("--truth and --seeds exclude each other: every seed has the truth of its own simulation")
-    if options.trajectory:
-        raise UsageError("--trajectory and --seeds exclude each other: a file is of one recording, not of every seed's")
-    for source in request.sources:
-        if not is_drawn_from_a_seed(source):
-            raise UsageError(f"--seeds repeats simulated sequences, and {source} is the same under every seed")
-    asked = OverSeedsRequest(request, options.seeds, options.workers or usable_cpus())
-    for over, directory in compare_over_seeds(asked, lambda label: progress_on(sys.stderr, label)):
-        yield seeds_text(over), directory, over.all_ok
 
 
 def _new_run() -> Path:

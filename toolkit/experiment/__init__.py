@@ -1,4 +1,10 @@
-"""The same comparison over many seeds of a simulated recording, in parallel processes on this machine.
+"""The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or in processes.
 
-Reading order: trial -> processes -> over_seeds.
+Reading order: recording (what is read) -> units (what is run) -> workers (where) -> pipeline -> comparison (what comes
+of it) -> statistics.
 """
+
+from toolkit.experiment.comparison import Comparison, Record, Row
+from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run
+
+__all__ = ["Comparison", "Plan", "Record", "Row", "comparisons", "prepared_cases", "run"]

@@ -1,56 +1,44 @@
-"""Trials side by side, each in a process of its own with one numeric thread.
+"""Units of work side by side, in processes of one numeric thread each (loky's).
 
-A process that dies takes the run it was busy with along and nothing else: that run has failed, the trial's other
-estimators go on in a new process. An interrupt is the parent's alone to handle: it ends the processes it started.
+A process that dies takes the unit it was busy with along and nothing else: the units that were under way are tried once
+more, each alone, and one that dies again is lost. An interrupt is the parent's alone to handle: it ends the processes
+it started. Loky's processes do not run the caller's main module again, so a script needs no guard.
 """
 
 import os
+import re
 import signal
-import traceback
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
-from toolkit.errors import VislamError
-from toolkit.experiment.trial import Outcome, Trial, run_trial
+import numpy as np
+from loky import ProcessPoolExecutor
+from loky.process_executor import BrokenProcessPool
 
-Work = Callable[[Trial], Iterator[Outcome]]
+from toolkit.progress import Progress
+
+T = TypeVar("T")
+R = TypeVar("R")
+Work = Callable[[T, Progress], R]
 
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-# A fork server imports the slow libraries once, under _ONE_THREAD and before any thread runs.
-_CONTEXT = get_context("forkserver")
-_PATIENCE_S = 5.0
+_POLL_S = 0.1
+# How far a unit has come, as its process writes it and the parent reads it.
+_ENTRY = np.dtype([("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64)])
+# Shown for each unit: its frames take the first half, what a smoother does in the end the second.
+_STEPS = 100
 
 
 @dataclass(frozen=True)
-class _Raised:
-    """An error of the work itself, as a process reports it; one that a user can meet keeps its type."""
+class Lost:
+    """What became of a unit whose process died twice: how, in words."""
 
-    text: str
-    expected: VislamError | None = None
-
-
-@dataclass
-class _Worker:
-    """A process, the trial it works on, the estimators it has not answered for and the pipe it answers by."""
-
-    trial: Trial
-    process: BaseProcess
-    answers: Connection
-    open: deque[str] = field(default_factory=deque)
-
-    def end(self) -> None:
-        """End the process now, whatever it is doing."""
-        self.process.terminate()
-        self.process.join(_PATIENCE_S)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
-        self.answers.close()
+    why: str
 
 
 def usable_cpus() -> int:
@@ -58,112 +46,151 @@ def usable_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def outcomes_of(trials: Iterable[Trial], workers: int, work: Work = run_trial) -> Generator[Outcome, None, None]:
-    """Yield the outcome of every estimator of every trial as each is there, from ``workers`` processes at a time.
+def results_of(
+    units: Sequence[T], workers: int, work: Work[T, R], progress: Progress
+) -> Generator[tuple[int, R | Lost], None, None]:
+    """Yield the place and the result of every unit as each is there.
 
-    ``work`` must be a module's function, and yield one outcome for each estimator of its trial, in order. An error it
-    raises ends everything: a VislamError is raised again here, any other as RuntimeError with its traceback. When
-    the iteration ends, for whatever reason, no process is left.
+    With one worker the work is done here, in order; with more in so many processes at a time. An error that the work
+    raises ends everything and is raised here. When the iteration ends, for whatever reason, no process is left.
     """
-    waiting = deque(trials)
-    busy: dict[Connection, _Worker] = {}
-    try:
-        while waiting or busy:
-            while waiting and len(busy) < workers:
-                worker = _start(waiting.popleft(), work)
-                busy[worker.answers] = worker
-            for ready in wait(list(busy)):
-                worker = busy[ready]  # type: ignore[index]  # wait returns what it was given
-                answer = _next_answer(worker)
-                if isinstance(answer, Outcome):
-                    worker.open.remove(answer.estimator)
-                    yield answer
-                    continue
-                del busy[worker.answers]
-                worker.end()
-                if worker.open:
-                    yield _lost(worker)
-                    waiting.extendleft(_rest(worker))
-    finally:
-        for worker in busy.values():
-            worker.end()
+    if workers == 1 or len(units) < 2:
+        yield from _here(units, work, progress)
+        return
+    with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
+        pool = _Pool(units, workers, work, Path(folder) / "progress")
+        yield from pool.results(progress)
 
 
-def _next_answer(worker: _Worker) -> Outcome | None:
-    """Return what the process says next, None where it has ended; raise what it raised."""
-    try:
-        answer: Outcome | _Raised = worker.answers.recv()
-    except (EOFError, OSError):
-        worker.process.join(_PATIENCE_S)
-        return None
-    if isinstance(answer, _Raised):
-        raise answer.expected or RuntimeError(answer.text)
-    return answer
+def _here(units: Sequence[T], work: Work[T, R], progress: Progress) -> Iterator[tuple[int, R | Lost]]:
+    for place, unit in enumerate(units):
+        yield place, work(unit, _Share(progress, place, len(units)))
 
 
-def _lost(worker: _Worker) -> Outcome:
-    """Return the outcome of the run the process was busy with when it died."""
-    code = worker.process.exitcode or 0
-    how = f"was ended by signal {-code}" if code < 0 else f"ended with status {code}"
-    return Outcome(worker.trial.seed, worker.open[0], "failed", log=(f"its process {how} before it answered",))
+class _Share:
+    """The progress of one unit as a part of that of all."""
+
+    def __init__(self, whole: Progress, place: int, count: int) -> None:
+        self._whole, self._place, self._count = whole, place, count
+        self._stages: list[str] = []
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        """Pass on how far the unit has come."""
+        if stage and stage not in self._stages:
+            self._stages.append(stage)
+        steps = _share_done(len(self._stages), done, total)
+        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count)
 
 
-def _rest(worker: _Worker) -> list[Trial]:
-    """Return the trial with the estimators behind the one that was lost, if there are any."""
-    remaining = tuple(worker.open)[1:]
-    return [replace(worker.trial, estimators=remaining)] if remaining else []
+def _share_done(stages: int, done: int, total: int) -> int:
+    half = _STEPS // 2
+    part = half * done // max(total, 1)
+    return part if stages == 0 else half + part
 
 
-def _start(trial: Trial, work: Work) -> _Worker:
-    answers, says = _CONTEXT.Pipe(duplex=False)
-    process = _CONTEXT.Process(target=_run, args=(says, trial, work), daemon=True)
-    try:
-        with _one_thread(), _interrupts_held_back():
-            _CONTEXT.set_forkserver_preload([__name__, "toolkit.initialization"])
-            process.start()
-    except KeyboardInterrupt:  # the one held back, perhaps: then there is a process that nobody knows of yet
-        if process.pid is not None:
-            process.terminate()
-        raise
-    says.close()  # ours: the end of the process must be the end of the pipe
-    return _Worker(trial, process, answers, deque(trial.estimators))
+class _Pool(Generic[T, R]):
+    """So many processes at work on some units."""
 
+    def __init__(self, units: Sequence[T], workers: int, work: Work[T, R], board: Path) -> None:
+        self._units, self._workers, self._work, self._board = units, workers, work, board
+        self._entries = np.memmap(board, dtype=_ENTRY, mode="w+", shape=(len(units),))
+        self._finished: set[int] = set()
 
-def _run(says: Connection, trial: Trial, work: Work) -> None:
-    """Work on a trial and say each outcome; the process' whole life."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    try:
-        for outcome in work(trial):
-            says.send(outcome)
-    except BrokenPipeError:
-        pass  # nobody listens any more
-    except MemoryError:
-        os._exit(1)
-    except Exception as error:
-        expected = error if isinstance(error, VislamError) else None
-        says.send(_Raised("".join(traceback.format_exception(error)), expected))
+    def results(self, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
+        """Yield the place and the result of every unit."""
+        progress.advance(0, _STEPS * len(self._units))
+        while len(self._finished) < len(self._units):
+            waiting = [place for place in range(len(self._units)) if place not in self._finished]
+            try:
+                yield from self._side_by_side(waiting, self._workers, progress)
+            except BrokenProcessPool:
+                suspects = [place for place in waiting if self._entries["begun"][place] and place not in self._finished]
+                for place in suspects:
+                    yield from self._alone(place, progress)
+
+    def _side_by_side(self, places: list[int], workers: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
+        with _executor(workers) as executor:
+            pending: dict[Future[R], int] = {self._submitted(executor, place): place for place in places}
+            while pending:
+                done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    place = pending.pop(future)
+                    result = future.result()
+                    self._finished.add(place)
+                    yield place, result
+                progress.advance(self._steps_done(), _STEPS * len(self._units))
+
+    def _alone(self, place: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
+        """Try a unit once more in a process of its own."""
+        try:
+            yield from self._side_by_side([place], 1, progress)
+        except BrokenProcessPool as error:
+            self._finished.add(place)
+            yield place, Lost(f"its process {_how_it_ended(error)} before it answered")
+
+    def _submitted(self, executor: ProcessPoolExecutor, place: int) -> "Future[R]":
+        with _interrupts_held_back():
+            future: Future[R] = executor.submit(_do, self._work, self._units[place], self._board, place)
+        return future
+
+    def _steps_done(self) -> int:
+        under_way = [
+            _share_done(int(entry["stages"]), int(entry["done"]), int(entry["total"]))
+            for place, entry in enumerate(self._entries)
+            if place not in self._finished
+        ]
+        return _STEPS * len(self._finished) + sum(under_way)
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Have processes started here read that numeric libraries may use one thread."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)
+def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
+    executor = ProcessPoolExecutor(workers, initializer=_begin, env=_ONE_THREAD)
     try:
-        yield
+        yield executor
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        executor.shutdown(wait=True, kill_workers=True)
+
+
+def _begin() -> None:
+    """Leave interrupts to the parent; the whole of a process' preparation."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
+    """Do a unit of work in a process of its own."""
+    entries = np.memmap(board, dtype=_ENTRY, mode="r+")
+    entries[place] = (1, 0, 1, 0)
+    try:
+        return work(unit, _Entry(entries, place))
+    except MemoryError:
+        os._exit(1)  # as if the system had ended the process: the unit alone is lost
+
+
+class _Entry:
+    """Progress that a process writes where its parent reads it."""
+
+    def __init__(self, entries: Any, place: int) -> None:
+        self._entries, self._place = entries, place
+        self._stages: list[str] = []
+
+    def advance(self, done: int, total: int, stage: str = "") -> None:
+        """Write how far the unit has come."""
+        if stage and stage not in self._stages:
+            self._stages.append(stage)
+        self._entries[self._place] = (1, done, total, len(self._stages))
+
+
+def _how_it_ended(error: BrokenProcessPool) -> str:
+    """Return how a process ended, of what loky says of it."""
+    named = re.search(r"exit codes of the workers are \{(\w+)\((-?\d+)\)", str(error))
+    if named is None:
+        return "ended"
+    return f"was ended by signal {-int(named[2])}" if int(named[2]) < 0 else f"ended with status {named[2]}"
 
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
     """Have processes started here be deaf to Ctrl-C from birth; one that comes meanwhile is delivered afterwards."""
-    resource_tracker.ensure_running()  # else it is started within, and lifts the block when it is
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from toolkit.estimate import Output, Status
-from toolkit.experiment.trial import OUTPUTS
+from toolkit.experiment.units import OUTPUTS
 from toolkit.gate import releases
 from toolkit.gate.baseline import Baseline, BaselineError, Bounds, Case, Criterion, Measured, Series, Values
 from toolkit.gate.baseline_json import SCHEMA

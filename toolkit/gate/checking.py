@@ -1,21 +1,18 @@
 """The whole of the gate: measure a new baseline, or measure an old one again and judge what became of it."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from toolkit.estimator import find_all
+from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured
-from toolkit.gate.case_work import case_sequence, trials_of
 from toolkit.gate.judging import Judged, judge_case
-from toolkit.gate.measuring import measure, metrics_of
+from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.paired import judge_pairs
 from toolkit.gate.releases import installed
 from toolkit.gate.verdict import Check
-from toolkit.runner import Progress
-
-ProgressFor = Callable[[str], AbstractContextManager[Progress]]
+from toolkit.progress import ProgressFor
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ def new_baseline(
     """
     for case in cases:
         find_each(case.estimators)
-        case_sequence(trials_of(case)[0])
+        prepare(recordings_of(case)[0])
     measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), workers, progress_for)) for case in cases)
     return Baseline(installed(), measured, made_by=made_by)
 
@@ -77,4 +74,4 @@ def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float) -> 
 def _measured(case: Case, metrics: Sequence[str], workers: int, progress_for: ProgressFor) -> Measured:
     runs = len(case.seeds) * len(case.estimators)
     with progress_for(f"{case.source}: {runs} runs") as progress:
-        return measure(case, metrics, workers, progress.advance)
+        return measure(case, metrics, workers, progress)

@@ -1,44 +1,99 @@
 """Run what a baseline lists, in processes side by side, and gather what came of it by estimator, metric and seed."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import os
+from collections.abc import Iterable, Sequence
 from contextlib import closing
-from dataclasses import replace
-from typing import cast
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+from toolkit.datasets import built_ins
 from toolkit.errors import EstimatorError, VislamError
-from toolkit.estimate import Output
+from toolkit.estimate import Output, Run, Status
 from toolkit.estimator import find
-from toolkit.experiment.trial import OUTPUTS, Outcome
-from toolkit.experiment.workers import Work, outcomes_of
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, prepared_of, run_estimator
+from toolkit.experiment.workers import Lost, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
-from toolkit.gate.case_work import CaseTrial, Timed, case_sequence, run_case, trials_of
+from toolkit.gate.fingerprint import fingerprint
+from toolkit.gate.reference import reference_s
+from toolkit.progress import Progress
 
-Advance = Callable[[int, int], None]
+DATA_ROOT = "VISLAM_DATA"
 
 
-def measure(case: Case, metrics: Iterable[str], workers: int, advance: Advance) -> Measured:
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """An outcome with its processor time over the reference workload's, and the fingerprint of what was read."""
+
+    outcome: Outcome
+    speed: float | None = None
+    fingerprint: str = ""
+
+
+def recordings_of(case: Case) -> list[Recording]:
+    """Return the recording of a case under each of its seeds.
+
+    Files are found here, by whole paths: a process that reads them may stand elsewhere, in another environment.
+    """
+    source, truth = located(case.source), None if case.truth is None else Path(located(case.truth))
+    return [Recording(source, seed, truth, duration_s=case.duration_s) for seed in case.seeds]
+
+
+def located(source: str) -> str:
+    """Return a built-in name as it is, and a path where it leads: from here, or from the folder VISLAM_DATA."""
+    if source in built_ins():
+        return source
+    root, here = os.environ.get(DATA_ROOT), Path(source).expanduser()
+    places = [here] if root is None else [here, Path(root).expanduser() / source]
+    return next((str(place.absolute()) for place in places if place.exists()), source)
+
+
+def measure(case: Case, metrics: Iterable[str], workers: int, progress: Progress) -> Measured:
     """Run every estimator of a case under every seed.
 
     An estimator that is not there is ``absent``, a sequence that cannot be had ``unreadable``; nothing of that is
-    raised, for a check has to say all that is missing. ``advance`` hears how many of all runs are done.
+    raised, for a check has to say all that is missing.
     """
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
-    trials = trials_of(present)
+    recordings = recordings_of(present)
+    units = [Unit(recording, recording.seed, name) for recording in recordings for name in present.estimators]
     try:
-        if trials:
-            case_sequence(trials[0])
-        outcomes = list(_outcomes(trials, workers, advance))
+        if units:
+            prepare(recordings[0])
+        with closing(results_of(units, workers, timed, progress)) as coming:
+            found = [_timed(result, units[place]) for place, result in coming]
     except EstimatorError:
         raise
     except VislamError as error:
         return Measured((), (), {}, absent, unreadable=str(error))
-    return gathered(present, outcomes, tuple(metrics), absent)
+    return gathered(present, found, tuple(metrics), absent)
+
+
+def timed(unit: Unit, progress: Progress) -> Timed:
+    """Run and score the estimator of a unit between two reference workloads."""
+    prepared = prepared_of(unit)
+    reference_s()  # warms up what every later one finds warm
+    before_s = reference_s()
+    run = run_estimator(unit, prepared, progress)
+    reference = (before_s + reference_s()) / 2.0
+    outcome = replace(outcome_of(run, prepared.sequence, unit.seed), run=None)
+    return Timed(outcome, _over(run, reference), fingerprint(prepared.sequence))
 
 
 def metrics_of(case: Case, bounds: Bounds) -> tuple[str, ...]:
     """Return the metrics a case is judged by."""
     return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
+
+
+def gathered(case: Case, found: Iterable[Timed], metrics: Sequence[str], absent: dict[str, str]) -> Measured:
+    """Arrange outcomes, which come in any order, by estimator and seed; keep the metrics of interest."""
+    by_run = {(one.outcome.estimator, one.outcome.seed): one for one in found}
+    read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
+    hashes = tuple(read[seed].outcome.sequence_hash if seed in read else "" for seed in case.seeds)
+    prints = tuple(read[seed].fingerprint if seed in read else "" for seed in case.seeds)
+    runs = {name: _series([by_run[name, seed] for seed in case.seeds], metrics) for name in case.estimators}
+    return Measured(hashes, prints, runs, absent)
 
 
 def _why_absent(name: str) -> str:
@@ -49,52 +104,39 @@ def _why_absent(name: str) -> str:
     return ""
 
 
-def _outcomes(trials: Sequence[CaseTrial], workers: int, advance: Advance) -> Iterator[Outcome]:
-    total = sum(len(trial.estimators) for trial in trials)
-    if total:
-        advance(0, total)
-    # run_case reads trials of its own kind, which are the only ones given here
-    with closing(outcomes_of(trials, workers, cast(Work, run_case))) as coming:
-        for done, outcome in enumerate(coming, 1):
-            if done < total:
-                advance(done, total)
-            yield outcome
+def _timed(result: Timed | Lost, unit: Unit) -> Timed:
+    """Return what came of a unit; of one whose process died nothing but its status."""
+    if isinstance(result, Lost):
+        return Timed(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
+    return result
 
 
-def gathered(case: Case, outcomes: Iterable[Outcome], metrics: Sequence[str], absent: dict[str, str]) -> Measured:
-    """Arrange outcomes, which come in any order, by estimator and seed; keep the metrics of interest."""
-    by_run = {(outcome.estimator, outcome.seed): _timed(outcome) for outcome in outcomes}
-    read = {timed.seed: timed for timed in by_run.values() if timed.sequence_hash}
-    hashes, prints = (
-        tuple(getattr(read[seed], name) if seed in read else "" for seed in case.seeds)
-        for name in ("sequence_hash", "fingerprint")
-    )
-    runs = {name: _series([by_run[name, seed] for seed in case.seeds], metrics) for name in case.estimators}
-    return Measured(hashes, prints, runs, absent)
+def _over(run: Run, reference: float) -> float | None:
+    """Return a run's processor time over the reference's; of a run cut short it would say nothing."""
+    ended: tuple[Status, ...] = ("ok", "diverged")
+    return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
 
 
-def _timed(outcome: Outcome) -> Timed:
-    """Return the outcome as a process of ours made it; one whose process died has nothing but its status."""
-    if isinstance(outcome, Timed):
-        return outcome
-    return Timed(outcome.seed, outcome.estimator, outcome.status, log=outcome.log)
-
-
-def _series(timed: Sequence[Timed], metrics: Sequence[str]) -> Series:
-    found = [dict(one.metrics) for one in timed]
-    given: list[Output] = [output for output in OUTPUTS if any(output in outputs for outputs in found)]
+def _series(found: Sequence[Timed], metrics: Sequence[str]) -> Series:
+    """Return the series of one estimator; a final output that only repeats the causal one is left out."""
+    outcomes = [one.outcome for one in found]
+    outputs = [{o: s.scores.values for o, s in one.outputs.items() if o not in _repeated(one)} for one in outcomes]
+    given: list[Output] = [output for output in OUTPUTS if any(output in one for one in outputs)]
     values: dict[Output, dict[str, Values]] = {
-        output: {key: tuple(outputs.get(output, {}).get(key) for outputs in found) for key in metrics}
-        for output in given
+        output: {key: tuple(one.get(output, {}).get(key) for one in outputs) for key in metrics} for output in given
     }
     # A metric without any value, as a NEES without a covariance, is none that could get lost.
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
-    return Series(tuple(one.status for one in timed), tuple(one.speed for one in timed), kept, _why(timed))
+    return Series(tuple(one.status for one in outcomes), tuple(one.speed for one in found), kept, _why(outcomes))
 
 
-def _why(timed: Sequence[Timed]) -> str:
+def _repeated(outcome: Outcome) -> tuple[Output, ...]:
+    return ("final",) if outcome.final_is_causal else ()
+
+
+def _why(outcomes: Sequence[Outcome]) -> str:
     """Return what the first run that did not end well says of it, in one line."""
-    for one in timed:
+    for one in outcomes:
         if one.status != "ok" and one.log:
             return " ".join(one.log[0 if one.status == "failed" else -1].split())
     return ""

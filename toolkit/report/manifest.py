@@ -8,9 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import toolkit
-from toolkit.experiment.monte_carlo import OverSeeds
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.workers import usable_cpus
-from toolkit.report.comparison import Comparison
 from toolkit.report.metrics_json import Json
 from toolkit.sequence import Sequence
 
@@ -26,31 +25,32 @@ _PACKAGES = {
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
 
 
-def build(comparison: Comparison, command: str, seed: int) -> Json:
-    """Return the manifest of a comparison made by ``command`` with ``seed``."""
+def build(comparison: Comparison, command: str) -> Json:
+    """Return the manifest of a comparison made by ``command``."""
+    here, seeds = _estimators(comparison), {"sequence": comparison.seeds[0]}
+    if comparison.over_seeds:
+        seeds["count"] = len(comparison.seeds)
     return {
         **_made_by(command),
         "sequence": _sequence(comparison.sequence),
         "start": comparison.prior.source,
-        "estimators": [run.estimator for run in comparison.runs if run.timings is not None],
-        "references": [run.estimator for run in comparison.runs if run.timings is None],
-        "seeds": {"sequence": seed},
-        "threads": {"cpus": usable_cpus(), **{name: os.environ.get(name) for name in _THREAD_VARIABLES}},
+        "estimators": here,
+        "references": [name for name in comparison.estimators if name not in here],
+        "seeds": seeds,
+        "threads": {
+            "cpus": usable_cpus(),
+            "workers": comparison.workers,
+            "per_worker": 1,
+            **{name: os.environ.get(name) for name in _THREAD_VARIABLES},
+        },
         **_machine(),
     }
 
 
-def build_over_seeds(over: OverSeeds, first: Sequence, command: str) -> Json:
-    """Return the manifest of a comparison over seeds; ``first`` is the recording of the first seed."""
-    return {
-        **_made_by(command),
-        "sequence": _sequence(first),
-        "start": over.start,
-        "estimators": list(over.estimators),
-        "seeds": {"sequence": over.seeds[0], "count": len(over.seeds)},
-        "threads": {"cpus": usable_cpus(), "workers": over.workers, "per_worker": 1},
-        **_machine(),
-    }
+def _estimators(comparison: Comparison) -> list[str]:
+    """Return the estimators that were run here."""
+    others = {run.estimator for run in comparison.runs if run.timings is None}
+    return [name for name in comparison.estimators if name not in others]
 
 
 def _made_by(command: str) -> Json:

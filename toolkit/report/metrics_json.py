@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from toolkit.report.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.sequence import Sequence
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from toolkit.estimate import Output, Run
+from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.report.comparison import Comparison, Row, plain_name
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from toolkit.report.comparison import Comparison
+from toolkit.experiment.comparison import Comparison
 from toolkit.report.messages import finding_lines, missing_lines, remark_lines, sequence_line, status_lines, truth_lines
 from toolkit.report.table import as_markdown, comparison_table
 

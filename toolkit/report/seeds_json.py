@@ -6,7 +6,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from toolkit.experiment.monte_carlo import Group, OverSeeds, Spread
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.statistics import Spread
 from toolkit.metrics import describe
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.metrics_json import METRIC_KEYS, Json
@@ -34,7 +35,7 @@ _RUN_FIELDS: dict[str, tuple[type, ...]] = {
 }
 
 
-def build(over: OverSeeds) -> Json:
+def build(over: Comparison) -> Json:
     """Return the document of a comparison over seeds."""
     return {
         "schema": SCHEMA,
@@ -43,13 +44,13 @@ def build(over: OverSeeds) -> Json:
             "source": over.source,
             "frames": over.frames_s.size,
             "duration_s": float(over.frames_s[-1]),
-            "motion": over.motion,
+            "motion": over.sequence.motion_kind,
         },
         "seeds": list(over.seeds),
         "hashes": list(over.hashes),
-        "start": over.start,
+        "start": over.prior.source,
         "estimators": list(over.estimators),
-        "runs": [_run(group, over) for group in over.groups],
+        "runs": [_run(group, over) for group in over.rows],
         "log": [
             {"estimator": o.estimator, "seed": o.seed, "status": o.status, "log": list(o.log)}
             for o in over.outcomes
@@ -58,7 +59,7 @@ def build(over: OverSeeds) -> Json:
     }
 
 
-def _run(group: Group, over: OverSeeds) -> Json:
+def _run(group: Row, over: Comparison) -> Json:
     keys = (*METRIC_KEYS, *(key for key in describe() if key not in METRIC_KEYS))
     spreads = {key: group.spread(key) for key in keys}
     change = {"change": over.changes[group.estimator]} if group.estimator in over.changes else {}
@@ -80,7 +81,7 @@ def _spread(spread: Spread | None) -> Json:
     return {name: getattr(spread, name) for name in _SPREAD_FIELDS}
 
 
-def _over_seeds(group: Group) -> Json:
+def _over_seeds(group: Row) -> Json:
     """Return the RMSE over frames and seeds, not aligned, and the NEES averaged over the seeds at each frame.
 
     The band is that of the largest number of runs any frame has.

@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
-from toolkit.experiment.monte_carlo import OverSeeds
+from toolkit.experiment.comparison import Comparison
 from toolkit.report.seeds_table import consistency_lines, seeds_table, status_lines
 from toolkit.report.table import as_markdown, as_text
 
@@ -33,21 +33,25 @@ means over the runs that are ok; `seeds.json` has median, spread and each seed's
 {_OUTSIDE_BY_DESIGN}"""
 
 
-def headline(over: OverSeeds) -> str:
+def headline(over: Comparison) -> str:
     """Return the comparison in one line."""
     seeds = f"seeds {over.seeds[0]} to {over.seeds[-1]}"
-    return f"{over.name}: {over.frames_s.size} frames, {over.frames_s[-1]:.1f} s, {over.motion}, {seeds}"
+    return f"{over.name}: {over.frames_s.size} frames, {over.frames_s[-1]:.1f} s, {over.sequence.motion_kind}, {seeds}"
 
 
-def seeds_text(over: OverSeeds) -> str:
+def seeds_text(over: Comparison) -> str:
     """Return the comparison as plain text."""
     lines = [headline(over), "", as_text(seeds_table(over)), ""]
-    for title, entries in (("start", [over.start]), ("nees", consistency_lines(over)), ("notes", status_lines(over))):
+    for title, entries in (
+        ("start", [over.prior.source]),
+        ("nees", consistency_lines(over)),
+        ("notes", status_lines(over)),
+    ):
         lines += _section(title, entries)
     return "\n".join(lines)
 
 
-def seeds_report(over: OverSeeds, captions: Mapping[str, str]) -> str:
+def seeds_report(over: Comparison, captions: Mapping[str, str]) -> str:
     """Return the report; ``captions`` maps the file names of the figures, beside the report, to their captions."""
     parts = [
         f"# {' / '.join(over.estimators)} on {over.name}, {len(over.seeds)} seeds",
@@ -55,7 +59,7 @@ def seeds_report(over: OverSeeds, captions: Mapping[str, str]) -> str:
         as_markdown(seeds_table(over)),
         *_bullets("Is the stated uncertainty honest?", consistency_lines(over)),
         *_bullets("Notes", status_lines(over)),
-        *_bullets("Where every estimator started", [over.start]),
+        *_bullets("Where every estimator started", [over.prior.source]),
         "## Figures",
         *(f"![{caption}](figures/{name})\n\n*{caption}*" for name, caption in captions.items()),
         "## How to read the table",

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from toolkit.experiment.monte_carlo import Group, OverSeeds
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.report.contract import field_violations, schema_violations
 from toolkit.report.metrics_json import Json
@@ -13,22 +13,22 @@ from toolkit.report.seeds_table import consistency_lines, status_lines
 _FIELDS: dict[str, tuple[type, ...]] = {"t_s": (list,), "runs": (list,), "words": (dict,)}
 
 
-def build(over: OverSeeds) -> Json:
+def build(over: Comparison) -> Json:
     """Return the document; its ``runs`` are those of seeds.json, each with series over the frames' ``t_s``."""
     return {
         "schema": SCHEMA,
         "t_s": numbers(over.frames_s),
-        "runs": [_run(group) for group in over.groups],
+        "runs": [_run(group) for group in over.rows],
         "words": {
             "sequence": headline(over),
             "notes": list(status_lines(over)),
             "verdicts": list(consistency_lines(over)),
-            "start": over.start,
+            "start": over.prior.source,
         },
     }
 
 
-def _run(group: Group) -> Json:
+def _run(group: Row) -> Json:
     """Return the NEES averaged over the seeds with its band, and the position error over the seeds, or None each."""
     nees, errors_m = group.mean_nees, group.position_m
     return {

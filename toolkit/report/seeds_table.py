@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from toolkit.experiment.monte_carlo import Group, OverSeeds
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.report.table import Table, number
 
 _MISSING = "-"
@@ -19,7 +19,7 @@ _COSTS = (("nis_mean", "NIS", "", "1", 2), ("frame_ms_mean", "frame", "", "ms", 
 _MOSTLY_PERCENT = 80.0
 
 
-def seeds_table(over: OverSeeds) -> Table:
+def seeds_table(over: Comparison) -> Table:
     """Return one row for each kind of output: means over the runs that are ok, and the spread of the first error."""
     labels = [("estimator", "", ""), ("output", "", ""), *([("change", "", "")] if over.changes else [])]
     counts = ("ok", "of", str(len(over.seeds)))
@@ -27,12 +27,12 @@ def seeds_table(over: OverSeeds) -> Table:
     in_band = ("NEES", "in band", "%")
     heads = [tuple(column[1:4]) for column in _COLUMNS]
     headings = (*labels, counts, heads[0], spread, *heads[1:], in_band, *(tuple(column[1:4]) for column in _COSTS))
-    rows = tuple(_row(group, over, first=i == 0 or over.groups[i - 1].estimator != group.estimator)
-                 for i, group in enumerate(over.groups))  # fmt: skip
+    rows = tuple(_row(group, over, first=i == 0 or over.rows[i - 1].estimator != group.estimator)
+                 for i, group in enumerate(over.rows))  # fmt: skip
     return Table(headings, rows, labels=len(labels))
 
 
-def _row(group: Group, over: OverSeeds, *, first: bool) -> tuple[str, ...]:
+def _row(group: Row, over: Comparison, *, first: bool) -> tuple[str, ...]:
     change = [over.changes.get(group.estimator, "") if first else ""] if over.changes else []
     error = group.spread(_COLUMNS[0][0])
     std = _MISSING if error is None or error.std is None else number(error.std, 3)
@@ -43,12 +43,12 @@ def _row(group: Group, over: OverSeeds, *, first: bool) -> tuple[str, ...]:
     return (group.estimator, group.output, *change, str(group.counts["ok"]), means[0], std, *means[1:], in_band, *costs)
 
 
-def _mean(group: Group, key: str, decimals: int) -> str:
+def _mean(group: Row, key: str, decimals: int) -> str:
     spread = group.spread(key)
     return _MISSING if spread is None else number(spread.mean, decimals)
 
 
-def status_lines(over: OverSeeds) -> Iterator[str]:
+def status_lines(over: Comparison) -> Iterator[str]:
     """Yield the runs that did not end well, with what the first of a kind said about it."""
     for estimator in over.estimators:
         for status in ("diverged", "failed"):
@@ -63,10 +63,10 @@ def status_lines(over: OverSeeds) -> Iterator[str]:
         yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
 
 
-def consistency_lines(over: OverSeeds) -> Iterator[str]:
+def consistency_lines(over: Comparison) -> Iterator[str]:
     """Yield a verdict a row on whether its stated covariance is honest; equal verdicts of both outputs once."""
     told: set[str] = set()
-    for group in over.groups:
+    for group in over.rows:
         nees = group.mean_nees
         if nees is None:
             yield f"{group.estimator} {group.output}: {group.reason('nees_pose_mean')}"
@@ -78,10 +78,10 @@ def consistency_lines(over: OverSeeds) -> Iterator[str]:
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
         if verdict not in told:
             told.add(verdict)
-            same = sum(g.estimator == group.estimator and _equal(g, group) for g in over.groups) > 1
+            same = sum(g.estimator == group.estimator and _equal(g, group) for g in over.rows) > 1
             yield verdict.format("" if same else f" {group.output}")
 
 
-def _equal(one: Group, other: Group) -> bool:
+def _equal(one: Row, other: Row) -> bool:
     nees, others = one.mean_nees, other.mean_nees
     return nees is not None and others is not None and nees.in_band_percent == others.in_band_percent

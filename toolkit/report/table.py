@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from toolkit.report.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison, Row
 
 _SEPARATOR = "  "
 _MISSING = "-"

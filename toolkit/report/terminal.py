@@ -4,8 +4,9 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.audit import Audit
-from toolkit.report.comparison import Comparison
+from toolkit.experiment.comparison import Comparison
 from toolkit.report.messages import finding_lines, missing_lines, outcome, sequence_line, status_lines, truth_lines
+from toolkit.report.seeds_md import seeds_text
 from toolkit.report.table import as_text, comparison_table
 
 _WIDTH = 118
@@ -13,6 +14,8 @@ _WIDTH = 118
 
 def comparison_text(comparison: Comparison) -> str:
     """Return the comparison as plain text, no line of prose wider than 118 columns."""
+    if comparison.over_seeds:
+        return seeds_text(comparison)
     lines = [sequence_line(comparison.sequence), "", as_text(comparison_table(comparison)), ""]
     lines += _section("start", [comparison.prior.source])
     lines += _section("audit", finding_lines(comparison))

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from toolkit.report.comparison import Comparison
+from toolkit.experiment.comparison import Comparison
 from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
 from toolkit.report.figures.style import NamedFigure
 
@@ -13,11 +13,6 @@ _DRAWINGS: tuple[Callable[[Comparison], Iterator[NamedFigure]], ...] = (
     reprojection.draw,
     frame_times.draw,
 )
-
-
-def write_figures(comparison: Comparison, directory: Path) -> dict[str, str]:
-    """Draw every figure the comparison has data for into PNG files; return file name -> caption, in order."""
-    return save(drawn(comparison), directory)
 
 
 def drawn(comparison: Comparison) -> Iterator[NamedFigure]:

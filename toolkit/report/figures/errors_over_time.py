@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics._shared.alignment import Alignment
-from toolkit.report.comparison import Comparison, Row
 from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, alignment_words, errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet, width_of
 from toolkit.resampling import NS_PER_S

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.ticker import NullFormatter
 
+from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
-from toolkit.report.comparison import Comparison
 from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet, width_of
 
 _MS = 1e3

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from toolkit.estimate import Output
-from toolkit.experiment.monte_carlo import Group, OverSeeds
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.report.figures.style import NamedFigure, line_of, new_figure, quiet
 
@@ -17,17 +17,17 @@ _MOST_COLUMNS = 3
 _NEES_RANGE = (1e-2, 1e4)
 
 
-def draw(over: OverSeeds) -> Iterator[NamedFigure]:
+def draw(over: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of position errors and that of NEES, each where there is anything to draw."""
-    if any(group.position_m is not None for group in over.groups):
+    if any(group.position_m is not None for group in over.rows):
         yield _errors(over)
-    if any(group.mean_nees is not None for group in over.groups):
+    if any(group.mean_nees is not None for group in over.rows):
         yield _nees(over)
 
 
-def _errors(over: OverSeeds) -> NamedFigure:
+def _errors(over: Comparison) -> NamedFigure:
     figure, panels = _panels(over)
-    for group in over.groups:
+    for group in over.rows:
         errors_m = group.position_m
         if errors_m is None or _repeats(over, group):
             continue
@@ -45,9 +45,9 @@ def _errors(over: OverSeeds) -> NamedFigure:
     return NamedFigure("errors_over_seeds", caption, figure)
 
 
-def _nees(over: OverSeeds) -> NamedFigure:
+def _nees(over: Comparison) -> NamedFigure:
     figure, panels = _panels(over)
-    for group in over.groups:
+    for group in over.rows:
         nees = group.mean_nees
         if nees is None or _repeats(over, group):
             continue
@@ -67,7 +67,7 @@ def _nees(over: OverSeeds) -> NamedFigure:
     return NamedFigure("nees_over_seeds", caption, figure)
 
 
-def _panels(over: OverSeeds) -> tuple[Figure, dict[str, Axes]]:
+def _panels(over: Comparison) -> tuple[Figure, dict[str, Axes]]:
     columns = min(_MOST_COLUMNS, len(over.estimators))
     rows = -(-len(over.estimators) // columns)
     figure = new_figure(max(3.4 * columns, 5.0), 0.6 + 2.5 * rows)
@@ -77,7 +77,7 @@ def _panels(over: OverSeeds) -> tuple[Figure, dict[str, Axes]]:
     return figure, dict(zip(over.estimators, grid, strict=False))
 
 
-def _finish(figure: Figure, panels: dict[str, Axes], over: OverSeeds, y_label: str) -> None:
+def _finish(figure: Figure, panels: dict[str, Axes], over: Comparison, y_label: str) -> None:
     for name, axes in panels.items():
         quiet(axes, name, "", "")
         axes.tick_params(labelbottom=True)
@@ -90,18 +90,18 @@ def _finish(figure: Figure, panels: dict[str, Axes], over: OverSeeds, y_label: s
     figure.supylabel(y_label, fontsize=10)
 
 
-def _repeats(over: OverSeeds, group: Group) -> bool:
+def _repeats(over: Comparison, group: Row) -> bool:
     """Say whether a group's errors are those of the estimator's other output, as a filter's final ones are."""
     return group.output == "final" and _same_as_causal(over, group)
 
 
-def _same_as_causal(over: OverSeeds, group: Group) -> bool:
-    causal = next((g for g in over.groups if g.estimator == group.estimator and g.output == "causal"), None)
+def _same_as_causal(over: Comparison, group: Row) -> bool:
+    causal = next((g for g in over.rows if g.estimator == group.estimator and g.output == "causal"), None)
     if causal is None or causal.position_m is None or group.position_m is None:
         return False
     return np.array_equal(causal.position_m, group.position_m, equal_nan=True)
 
 
-def _label(over: OverSeeds, group: Group) -> str:
-    both = next((g for g in over.groups if g.estimator == group.estimator and g.output == "final"), group)
+def _label(over: Comparison, group: Row) -> str:
+    both = next((g for g in over.rows if g.estimator == group.estimator and g.output == "final"), group)
     return "causal = final" if group is not both and _same_as_causal(over, both) else group.output

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from toolkit.estimate import Output
-from toolkit.report.comparison import Comparison
+from toolkit.experiment.comparison import Comparison
 
 DPI = 110
 TRUTH_COLOUR = "#1a1a1a"

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from toolkit.estimate import Output, Run
+from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.geometry import Array
-from toolkit.report.comparison import Comparison, plain_name
 from toolkit.report.figures.alignment import alignment_words, onto_truth, truth_during
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,

@@ -13,8 +13,8 @@ from toolkit.datasets.trajectories.belonging import (
 from toolkit.datasets.trajectories.poses import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
+from toolkit.experiment.comparison import plain_name
 from toolkit.metrics._shared.association import median_period_ns, poses_at
-from toolkit.report.comparison import plain_name
 from toolkit.sequence import Sequence
 
 _OTHER_TERMS = (

@@ -1,0 +1,81 @@
+"""Settings: documented key by key, read from TOML and the command line, wrong ones answered with the nearest."""
+
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.special import chdtri
+
+from toolkit import settings
+from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, describe, settings_of, with_assignments
+
+
+def test_every_setting_is_described_with_its_default() -> None:
+    described = {one.key: one for one in describe()}
+    values = as_values(DEFAULTS)
+    sections = {key: value for key, value in values.items() if isinstance(value, dict) and key != "estimators"}
+    keys = {f"{section}.{key}" for section, inner in sections.items() for key in inner}
+    assert described.keys() == keys | (values.keys() - sections.keys() - {"estimators"})
+    assert all(one.meaning for one in described.values())
+    assert described["window.lag_s"] == ("window.lag_s", "s", "2", "> 0, <= 3600", described["window.lag_s"].meaning)
+
+
+def test_what_is_written_reads_back_as_the_same_settings() -> None:
+    changed = settings_of({"window": {"lag_s": 3.0}, "estimators": {"mine": {"gain": 0.5}}}, "here")
+    assert settings_of(as_values(changed), "there") == changed
+    assert changed.options_of("mine") == {"gain": 0.5}
+    assert changed.options_of("other") == {}
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ({"window": {"lag": 3}}, "there is no setting window.lag; did you mean window.lag_s?"),
+        ({"nois": {}}, "there is no setting nois"),
+        ({"window": {"lag_s": -1}}, "window.lag_s: expected `float` > 0"),
+        ({"window": {"lag_s": math.nan}}, "window.lag_s"),
+        ({"window": 3}, "window: expected `object`"),
+        ({"start": "nowhere"}, "start: invalid enum value"),
+        ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected `float | null`, got `str`"),
+    ],
+)
+def test_a_wrong_setting_is_refused_in_one_line_that_names_it(given: dict[str, object], complaint: str) -> None:
+    with pytest.raises(SettingsError) as refusal:
+        settings_of(given, "run.toml")
+    assert str(refusal.value).startswith(f"run.toml: {complaint}")
+    assert "\n" not in str(refusal.value)
+
+
+def test_assignments_take_values_as_toml_writes_them_and_bare_words() -> None:
+    given = {"window": {"lag_s": 1.0}}
+    merged = with_assignments(given, ("window.landmarks=7", "start=truth", "noise.pixel_sigma_px=0.7"))
+    assert given == {"window": {"lag_s": 1.0}}
+    read = settings_of(merged, "--set")
+    assert (read.window.lag_s, read.window.landmarks, read.start, read.noise.pixel_sigma_px) == (1.0, 7, "truth", 0.7)
+
+
+@pytest.mark.parametrize("text", ["window.lag_s", "=3", "start.early=3"])
+def test_an_assignment_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(SettingsError):
+        settings_of(with_assignments({"start": "truth"}, (text,)), "--set")
+
+
+def test_a_file_that_is_not_toml_is_refused_with_its_place(tmp_path: Path) -> None:
+    (tmp_path / "run.toml").write_text("window = [")
+    with pytest.raises(SettingsError, match=r"run\.toml: is not TOML"):
+        settings.read_toml(tmp_path / "run.toml")
+    with pytest.raises(SettingsError, match="cannot be read"):
+        settings.read_toml(tmp_path / "absent.toml")
+
+
+def test_the_smoothers_threshold_is_the_filters_gate_as_a_length() -> None:
+    gate = float(np.sqrt(chdtri(3, 1.0 - DEFAULTS.outliers.gate_probability)))
+    assert DEFAULTS.outliers.smoother_huber == gate
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(AttributeError):
+        DEFAULTS.window.lag_s = 5.0  # type: ignore[misc]
+    assert isinstance(msgspec.structs.replace(DEFAULTS, seeds=3), Settings)

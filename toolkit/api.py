@@ -1,0 +1,193 @@
+"""Comparisons from a script, a notebook or standard input: what ``vislam compare`` does, with values in return.
+
+::
+
+    import toolkit
+
+    result = toolkit.compare("drive", ["ekf", "batch"])
+    result.table()                        # a short table; columns by name, or "all"
+    result.figures["top_all"]             # a matplotlib figure
+    result.metrics["batch", "final"]      # every metric of one line of the table
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from toolkit.errors import VislamError
+from toolkit.estimate import Output, Run
+from toolkit.estimator import Build, defaults
+from toolkit.experiment import Comparison, Plan, Record
+from toolkit.experiment import run as run_plan
+from toolkit.experiment.configuration import Configuration, Request
+from toolkit.progress import silent
+from toolkit.report.table import Table, as_markdown, as_text, comparison_table
+from toolkit.sequence import Sequence
+from toolkit.settings import DEFAULTS, Settings, as_values, settings_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Source = str | Path | Sequence
+Names = str | Iterable[str]
+
+
+def compare(
+    source: Source,
+    estimators: Names | None = None,
+    *,
+    own: Mapping[str, Build] | None = None,
+    truth: str | Path | None = None,
+    max_frames: int | None = None,
+    settings: Settings | Mapping[str, Any] = DEFAULTS,
+    **more: Any,
+) -> "Result":
+    """Audit a recording, run estimators on it from the same start, and score them.
+
+    ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "ladder" for
+    every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name; ``truth`` a
+    TUM file. ``settings`` is a record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. Further
+    arguments: ``keep`` (faults the audit reports and leaves alone), ``trajectories`` (files of other systems by name),
+    ``seed``, ``seeds`` (repeat a simulated source), ``workers`` (processes; by default one a processor).
+
+    Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
+    trajectory that cannot, SettingsError for a setting that does not exist.
+    """
+    plan = _plan(source, estimators, own or {}, truth, max_frames, settings, _Further(**more))
+    return Result(run_plan(plan, silent)[0])
+
+
+@dataclass(frozen=True)
+class _Further:
+    """The arguments of :func:`compare` that few need."""
+
+    keep: Names = ()
+    trajectories: Mapping[str, str | Path] | None = None
+    seed: int | None = None
+    seeds: int | None = None
+    workers: int | None = None
+
+
+def _plan(
+    source: Source,
+    estimators: Names | None,
+    own: Mapping[str, Build],
+    truth: str | Path | None,
+    max_frames: int | None,
+    settings: Settings | Mapping[str, Any],
+    more: _Further,
+) -> Plan:
+    unnamed = () if own else defaults()
+    values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
+    values |= {key: value for key, value in (("first_seed", more.seed), ("seeds", more.seeds)) if value is not None}
+    return Plan(
+        sources=(source if isinstance(source, Sequence) else str(source),),
+        estimators=unnamed if estimators is None else _names(estimators),
+        own=own,
+        settings=settings_of(values, "settings"),
+        truth=None if truth is None else Path(truth),
+        trajectories={name: Path(file) for name, file in (more.trajectories or {}).items()},
+        keep=frozenset(_names(more.keep)),
+        max_frames=max_frames,
+        workers=more.workers,
+    )
+
+
+def _names(given: Names) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """What a comparison found. ``comparison`` holds the values themselves; the rest shows them."""
+
+    comparison: Comparison
+
+    def table(self, *columns: str) -> "ShownTable":
+        """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
+        chosen = "all" if columns == ("all",) else columns or None
+        return ShownTable(comparison_table(self.comparison, chosen))
+
+    @cached_property
+    def figures(self) -> Mapping[str, "Figure"]:
+        """Every figure there is data for, by the name ``vislam compare`` gives its file; drawn when first asked for."""
+        from toolkit.report.figures import drawn
+
+        return {figure.name: figure.figure for figure in drawn(self.comparison)}
+
+    @cached_property
+    def metrics(self) -> Mapping[tuple[str, Output], Mapping[str, float | None]]:
+        """Every metric by estimator and output: the value of the run, or the mean over the seeds whose runs are ok."""
+        return _Metrics({(row.estimator, row.output): _Values(row.value) for row in self.comparison.rows})
+
+    @property
+    def runs(self) -> Mapping[str, Run]:
+        """The runs by estimator, with trajectories and landmarks; none where it was repeated over seeds."""
+        return {run.estimator: run for run in self.comparison.runs}
+
+    def records(self) -> Iterator[Record]:
+        """Yield every value as sequence, seed, estimator, output, metric, value: a table for pandas and its kin."""
+        return self.comparison.records()
+
+    def save(self, directory: str | Path) -> Path:
+        """Write the run directory that ``vislam compare`` writes; raises OutputError where it cannot be."""
+        from toolkit.report.run_directory import MadeBy, write_run
+
+        target = Path(directory)
+        asked = Configuration(Request(), self.comparison.settings)
+        write_run(self.comparison, target, MadeBy("toolkit.compare", asked))
+        return target
+
+    def __repr__(self) -> str:
+        seeds = f", {len(self.comparison.seeds)} seeds" if self.comparison.over_seeds else ""
+        return f"{self.comparison.name}{seeds}\n{self.table()}"
+
+    def _repr_markdown_(self) -> str:
+        return self.table()._repr_markdown_()
+
+
+@dataclass(frozen=True)
+class ShownTable:
+    """A table that a notebook shows as such and ``print`` shows as text."""
+
+    table: Table
+
+    def __str__(self) -> str:
+        return as_text(self.table)
+
+    def __repr__(self) -> str:
+        return as_text(self.table)
+
+    def _repr_markdown_(self) -> str:
+        return as_markdown(self.table)
+
+
+class _Values(Mapping[str, float | None]):
+    """The metrics of one line by key."""
+
+    def __init__(self, value_of: Callable[[str], float | None]) -> None:
+        from toolkit.metrics import describe
+
+        self._value_of, self._keys = value_of, describe()
+
+    def __getitem__(self, key: str) -> float | None:
+        if key not in self._keys:
+            from toolkit.settings import nearest
+
+            raise KeyError(f"no metric is called {key}{nearest(key, list(self._keys))}")
+        return self._value_of(key)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+
+class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):
+    """Metrics by estimator and output; a line that is not there is answered with those that are."""
+
+    def __missing__(self, key: object) -> Mapping[str, float | None]:
+        raise VislamError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")

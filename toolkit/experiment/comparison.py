@@ -1,0 +1,225 @@
+"""What came of one sequence: every estimator under every seed, scored; the value that every report reads.
+
+One seed is the common case and many are the same thing repeated: a line of the table is one kind of output of one
+estimator, and what stands in it is the value of the one run or the mean over the runs that are ok.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from toolkit.experiment.statistics import MeanNees, Spread, mean_nees, spread_of
+from toolkit.experiment.units import OUTPUTS, Outcome, Scored
+from toolkit.metrics import Scores, describe
+from toolkit.resampling import NS_PER_S
+from toolkit.settings import DEFAULTS, Settings
+
+if TYPE_CHECKING:
+    from toolkit.audit import Finding
+    from toolkit.estimate import Output, Run, Status
+    from toolkit.geometry import Array
+    from toolkit.sequence import Prior
+    from toolkit.sequence import Sequence as Recorded
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One kind of output of one estimator over all seeds, in their order: a line of the table."""
+
+    output: Output
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def estimator(self) -> str:
+        """Return the estimator's name."""
+        return self.outcomes[0].estimator
+
+    @property
+    def run(self) -> Run:
+        """Return the run under the first seed; only of a comparison that keeps its runs."""
+        run = self.outcomes[0].run
+        assert run is not None, "a comparison over seeds keeps no runs"
+        return run
+
+    @property
+    def status(self) -> Status:
+        """Return how the run under the first seed ended."""
+        return self.outcomes[0].status
+
+    @cached_property
+    def scores(self) -> Scores:
+        """The scores under the first seed; without a value where the run gave no such output."""
+        scored = self.outcomes[0].outputs.get(self.output)
+        if scored is not None:
+            return scored.scores
+        keys = describe()
+        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
+
+    @property
+    def repeats_causal(self) -> bool:
+        """Say whether this is a final answer that only repeats the causal one, as a filter's does."""
+        return self.output == "final" and self._final_is_causal
+
+    @property
+    def label(self) -> str:
+        """Return the kind of output, or "both" where one line serves for the two."""
+        return "both" if self._final_is_causal else self.output
+
+    @cached_property
+    def _final_is_causal(self) -> bool:
+        return all(outcome.final_is_causal for outcome in self.outcomes)
+
+    @property
+    def counts(self) -> dict[Status, int]:
+        """Return how many seeds ended each way."""
+        counted = Counter(outcome.status for outcome in self.outcomes)
+        return {status: counted[status] for status in ("ok", "diverged", "failed")}
+
+    @cached_property
+    def good(self) -> tuple[Scored, ...]:
+        """What the runs that are ok gave; all that is aggregated is aggregated over these."""
+        given = (o.outputs.get(self.output) for o in self.outcomes if o.status == "ok")
+        return tuple(scored for scored in given if scored is not None)
+
+    def value(self, key: str) -> float | None:
+        """Return a metric's value: that of the only run however it ended, or the mean over the runs that are ok."""
+        if len(self.outcomes) == 1:
+            return self.scores.values.get(key)
+        spread = self.spread(key)
+        return None if spread is None else spread.mean
+
+    def values(self, key: str) -> list[float | None]:
+        """Return a metric's value under each seed, whatever the run's status."""
+        given = (outcome.outputs.get(self.output) for outcome in self.outcomes)
+        return [None if scored is None else scored.scores.values.get(key) for scored in given]
+
+    def spread(self, key: str) -> Spread | None:
+        """Return what a metric's values over the runs that are ok say, or None where there is no value."""
+        return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)
+
+    def reason(self, key: str) -> str:
+        """Return why a metric has no value under any seed."""
+        if len(self.outcomes) == 1:
+            return self.scores.notes.get(key, "not computed")
+        notes = (scored.scores.notes.get(key) for scored in self.good)
+        return next((note for note in notes if note), "no run is ok" if not self.good else "not computed")
+
+    @cached_property
+    def mean_nees(self) -> MeanNees | None:
+        """The NEES averaged over the runs that are ok, or None where no run has one."""
+        known = [scored.nees_pose for scored in self.good if np.isfinite(scored.nees_pose).any()]
+        return mean_nees(np.array(known)) if known else None
+
+    @cached_property
+    def position_m(self) -> Array | None:
+        """Position errors (runs, K) m of the runs that are ok, or None where no run has any."""
+        known = [scored.position_m for scored in self.good if np.isfinite(scored.position_m).any()]
+        return np.array(known) if known else None
+
+
+class Record(NamedTuple):
+    """One value of one metric, as a long table has it."""
+
+    sequence: str
+    seed: int
+    estimator: str
+    output: Output
+    metric: str
+    value: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Several estimators on the same packets of one sequence, from the same start, under one seed or many.
+
+    ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
+    in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
+    changes against the rung before.
+    """
+
+    source: str
+    sequence: Recorded
+    findings: tuple[Finding, ...]
+    prior: Prior
+    seeds: tuple[int, ...]
+    outcomes: tuple[Outcome, ...]
+    changes: Mapping[str, str] = field(default_factory=dict)
+    settings: Settings = DEFAULTS
+    workers: int = 1
+
+    @property
+    def over_seeds(self) -> bool:
+        """Say whether the comparison was repeated over seeds."""
+        return len(self.seeds) > 1
+
+    @property
+    def name(self) -> str:
+        """Return the sequence's name."""
+        return self.sequence.name
+
+    @cached_property
+    def estimators(self) -> tuple[str, ...]:
+        """The estimators' names, in order, other systems' behind."""
+        return tuple(dict.fromkeys(outcome.estimator for outcome in self.outcomes))
+
+    @cached_property
+    def runs(self) -> tuple[Run, ...]:
+        """The runs, by estimator; none where the comparison was repeated over seeds."""
+        return tuple(outcome.run for outcome in self.outcomes if outcome.run is not None)
+
+    @cached_property
+    def rows(self) -> tuple[Row, ...]:
+        """Every kind of output of every estimator; one that gave none under any seed keeps its final one."""
+        return tuple(row for name in self.estimators for row in self._rows_of(name))
+
+    @cached_property
+    def lines(self) -> tuple[Row, ...]:
+        """The rows to print: a final answer that only repeats the causal one has no line of its own."""
+        return tuple(row for row in self.rows if not row.repeats_causal)
+
+    @property
+    def all_ok(self) -> bool:
+        """Say whether every run under every seed ended well."""
+        return all(outcome.status == "ok" for outcome in self.outcomes)
+
+    @property
+    def frames_s(self) -> Array:
+        """Return the frames' times (K,) s from the first."""
+        t_ns = self.sequence.frames_t_ns
+        seconds: Array = (t_ns - t_ns[0]) / NS_PER_S
+        return seconds
+
+    @property
+    def hashes(self) -> tuple[str | None, ...]:
+        """The hash of what the estimators read under each seed, None where no run lived to tell it."""
+        known = {outcome.seed: outcome.sequence_hash for outcome in self.outcomes if outcome.sequence_hash}
+        return tuple(known.get(seed) for seed in self.seeds)
+
+    def records(self) -> Iterator[Record]:
+        """Yield every value of every metric: a row of sequence, seed, estimator, output, metric and value."""
+        for outcome in self.outcomes:
+            for output, scored in outcome.outputs.items():
+                for key, value in scored.scores.values.items():
+                    yield Record(self.name, outcome.seed, outcome.estimator, output, key, value)
+
+    def _rows_of(self, estimator: str) -> list[Row]:
+        outcomes = tuple(outcome for outcome in self.outcomes if outcome.estimator == estimator)
+        given = [output for output in OUTPUTS if any(output in outcome.outputs for outcome in outcomes)]
+        return [Row(output, outcomes) for output in given or ["final"]]
+
+
+def in_order(outcomes: Iterable[Outcome], estimators: Sequence[str], seeds: Sequence[int]) -> tuple[Outcome, ...]:
+    """Return outcomes by estimator, then seed, whatever the order they came in."""
+    return tuple(sorted(outcomes, key=lambda o: (estimators.index(o.estimator), seeds.index(o.seed))))
+
+
+def plain_name(name: str) -> str:
+    """Return a name as one of a file, without blanks, brackets and the like; it may come out empty."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._")

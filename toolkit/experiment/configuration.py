@@ -1,0 +1,76 @@
+"""A comparison as a file: a TOML file somebody wrote, or the manifest of a run that is to be repeated."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta, Struct
+
+from toolkit.settings import Settings, SettingsError, as_values, nearest, read_toml, settings_of
+
+# The table of a configuration that says what to compare; all others are settings.
+COMPARE = "compare"
+
+
+class Request(Struct, frozen=True, forbid_unknown_fields=True):
+    """What to compare, named as the arguments of the command line; paths are from the folder one is in."""
+
+    sequences: tuple[str, ...] | None = None
+    estimators: tuple[str, ...] | None = None
+    truth: str | None = None
+    trajectories: dict[str, str] = {}
+    max_frames: Annotated[int, Meta(ge=2)] | None = None
+    keep: tuple[str, ...] = ()
+
+
+class Configuration(Struct, frozen=True):
+    """What to compare, and with which settings."""
+
+    request: Request = Request()
+    settings: Settings = Settings()
+
+
+def read_configuration(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return what a file says of the comparison and of the settings, as nested values not yet checked.
+
+    Raises SettingsError where it is neither TOML nor a manifest that holds settings.
+    """
+    values = _manifest(path) if path.suffix == ".json" else read_toml(path)
+    request = values.pop(COMPARE, {})
+    if not isinstance(request, Mapping):
+        raise SettingsError(f"{path}: {COMPARE} is not a table")
+    return request, values
+
+
+def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place: str) -> Configuration:
+    """Return nested values as records, the defaults where nothing is given; raises SettingsError as settings_of."""
+    known = [field.name for field in msgspec.structs.fields(Request)]
+    for key in request:
+        if key not in known:
+            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{nearest(key, known)}")
+    try:
+        asked = msgspec.convert(dict(request), Request)
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"{place}: {COMPARE}: {error}") from error
+    return Configuration(asked, settings_of(settings, place))
+
+
+def as_manifest(configuration: Configuration) -> dict[str, Any]:
+    """Return what a manifest holds so that the comparison can be repeated from it."""
+    return {COMPARE: msgspec.to_builtins(configuration.request), "settings": as_values(configuration.settings)}
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(
+            f"{path}: cannot be read ({error.strerror}); name a manifest.json or a TOML file"
+        ) from error
+    except ValueError as error:
+        raise SettingsError(f"{path}: is not JSON ({error})") from error
+    if not isinstance(document, dict) or not isinstance(document.get("settings"), dict):
+        raise SettingsError(f"{path}: holds no settings; name the manifest.json of a comparison, or a TOML file")
+    return {**document["settings"], COMPARE: document.get(COMPARE, {})}

@@ -1,0 +1,161 @@
+"""The one experiment: load, audit, start, run, score. The command line, the gate, notebooks and users all call this."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from toolkit.datasets import is_drawn_from_a_seed, load_references
+from toolkit.datasets.trajectories import read_poses
+from toolkit.errors import DataError
+from toolkit.estimate import Run
+from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
+from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.experiment.references import check_names, external_runs, reference_runs
+from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
+from toolkit.experiment.workers import Lost, results_of, usable_cpus
+from toolkit.progress import ProgressFor, silent
+from toolkit.sequence import Sequence as Recorded
+from toolkit.settings import DEFAULTS, Settings
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What to compare.
+
+    ``sources`` are paths, built-in names or sequences; ``estimators`` are names, or the word for the whole ladder;
+    ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is a TUM file and ``trajectories``
+    are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
+    leaves as they are. ``workers`` is the number of processes, one a processor where it is None.
+    """
+
+    sources: tuple[str | Recorded, ...]
+    estimators: tuple[str, ...]
+    own: Mapping[str, Build] = field(default_factory=dict)
+    settings: Settings = DEFAULTS
+    truth: Path | None = None
+    trajectories: Mapping[str, Path] = field(default_factory=dict)
+    keep: frozenset[str] = frozenset()
+    max_frames: int | None = None
+    workers: int | None = None
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Return the seeds of simulated sequences."""
+        return tuple(range(self.settings.first_seed, self.settings.first_seed + self.settings.seeds))
+
+    def recording(self, source: str | Recorded, seed: int) -> Recording:
+        """Return a source of the plan under a seed."""
+        settings = self.settings
+        return Recording(
+            source, seed, self.truth, self.keep, settings.start, max_frames=self.max_frames, noise=settings.noise
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A source of a plan, ready to be read: under its first seed, with what other systems estimated from it."""
+
+    source: str | Recorded
+    prepared: Prepared
+    references: tuple[Run, ...]
+
+    @property
+    def name(self) -> str:
+        """Return the sequence's name."""
+        return self.prepared.sequence.name
+
+
+def run(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Comparison, ...]:
+    """Run and score every estimator on every source; raises as :func:`prepared_cases` and :func:`comparisons` do."""
+    return tuple(comparisons(plan, prepared_cases(plan, progress_for), progress_for))
+
+
+def prepared_cases(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
+    """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
+
+    Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
+    trajectory that cannot, or for a recording without a seed that is to be repeated over seeds.
+    """
+    for entry in find_all(plan.estimators).values():
+        entry.check_usable(plan.settings)
+    files = {name: read_poses(path) for name, path in plan.trajectories.items()}
+    cases = []
+    for source in plan.sources:
+        _check_seeds(plan, source)
+        with progress_for(f"{_name(source)}: loading and checking"):
+            prepared = prepare(plan.recording(source, plan.seeds[0]))
+            brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
+            check_names(brought, files)
+            references = reference_runs(brought, prepared.sequence)
+            references += external_runs(files, prepared.whole, prepared.sequence)
+            cases.append(Case(source, prepared, references))
+    return tuple(cases)
+
+
+def comparisons(plan: Plan, cases: Sequence[Case], progress_for: ProgressFor = silent) -> Iterator[Comparison]:
+    """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
+
+    An estimator that fails is a row that says so. Raises DataError where a recording cannot be had under a seed.
+    """
+    entries = find_all(plan.estimators)
+    units = [unit for case in cases for unit in _units(plan, case, entries)]
+    owner = [i for i, case in enumerate(cases) for _ in _units(plan, case, entries)]
+    workers = plan.workers or usable_cpus()
+    outcomes: list[list[Outcome]] = [[] for _ in cases]
+    missing, shown = [owner.count(i) for i in range(len(cases))], 0
+    label = f"{', '.join(dict.fromkeys(case.name for case in cases))}: {len(units)} runs"
+    with progress_for(label) as progress, closing(results_of(units, workers, run_unit, progress)) as coming:
+        for place, result in coming:
+            outcomes[owner[place]].append(_outcome(result, units[place]))
+            missing[owner[place]] -= 1
+            while shown < len(cases) and not missing[shown]:
+                yield _comparison(plan, cases[shown], outcomes[shown], entries, workers)
+                shown += 1
+    for case, found in zip(cases[shown:], outcomes[shown:], strict=True):
+        yield _comparison(plan, case, found, entries, workers)
+
+
+def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
+    """Yield the work of a case: seed by seed, the estimators that take longest first."""
+    names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
+    for seed in plan.seeds:
+        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(case.source, seed)
+        for name in names:
+            yield Unit(recording, seed, name, plan.settings, plan.own.get(name), keep_run=len(plan.seeds) == 1)
+
+
+def _outcome(result: Outcome | Lost, unit: Unit) -> Outcome:
+    if isinstance(result, Outcome):
+        return result
+    return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
+
+
+def _comparison(
+    plan: Plan, case: Case, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
+) -> Comparison:
+    sequence = case.prepared.sequence
+    ordered = in_order(outcomes, (*entries, *plan.own), plan.seeds)
+    others = tuple(outcome_of(reference, sequence, plan.seeds[0]) for reference in case.references)
+    on_ladder = LADDER in plan.estimators
+    return Comparison(
+        source=_name(case.source),
+        sequence=sequence,
+        findings=case.prepared.findings,
+        prior=case.prepared.prior,
+        seeds=plan.seeds,
+        outcomes=(*ordered, *others),
+        changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
+        settings=plan.settings,
+        workers=workers,
+    )
+
+
+def _check_seeds(plan: Plan, source: str | Recorded) -> None:
+    if len(plan.seeds) > 1 and (isinstance(source, Recorded) or not is_drawn_from_a_seed(source)):
+        raise DataError(f"{_name(source)} is the same under every seed; only simulated ones are repeated over seeds")
+
+
+def _name(source: str | Recorded) -> str:
+    return source.name if isinstance(source, Recorded) else source

@@ -1,0 +1,112 @@
+"""From a source to what every estimator reads: loaded, audited, cut, with its noise and a state to start from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+from toolkit.audit import Audit, Finding, audit
+from toolkit.datasets import load_sequence
+from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence
+from toolkit.settings import DEFAULTS, Noise
+from toolkit.simulation import SCENARIOS, simulate
+
+Start = Literal["measurements", "truth"]
+STARTS: dict[Start, Callable[[Sequence], Prior]] = {
+    "measurements": start_from_measurements,
+    "truth": start_from_truth,
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A source under one seed, and what is made of it before an estimator sees it.
+
+    ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
+    reports and leaves as they are. ``max_frames`` and ``duration_s`` cut it; a simulation of ``duration_s`` is made
+    that long.
+    """
+
+    source: str | Sequence
+    seed: int = 0
+    truth: Path | None = None
+    keep: frozenset[str] = frozenset()
+    start: Start = "measurements"
+    max_frames: int | None = None
+    duration_s: float | None = None
+    noise: Noise = DEFAULTS.noise
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A recording as the estimators read it, what the audit found in it before, and the state they start from.
+
+    ``whole`` is the recording before it was cut.
+    """
+
+    sequence: Sequence
+    findings: tuple[Finding, ...]
+    prior: Prior
+    whole: Sequence
+
+
+def prepare(recording: Recording) -> Prepared:
+    """Load, audit, cut and find the start.
+
+    Raises DataError where the source or the truth cannot be used, VislamError where ``keep`` names no fault.
+    """
+    audited = audited_recording(recording)
+    whole = _with_noise(audited.sequence, recording.noise)
+    sequence = _cut(whole, recording)
+    return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole)
+
+
+def audited_recording(recording: Recording) -> Audit:
+    """Load a recording and audit it whole: slow faults (a bias, a lag) show better so. Raises as :func:`prepare`."""
+    return audit(_loaded(recording), recording.keep)
+
+
+@lru_cache(maxsize=1)
+def prepare_once(recording: Recording) -> Prepared:
+    """Prepare a recording, or return it where it is the one that was prepared last in this process."""
+    return prepare(recording)
+
+
+def _loaded(recording: Recording) -> Sequence:
+    source = recording.source
+    if isinstance(source, Sequence):
+        sequence = source
+    elif source in SCENARIOS and recording.duration_s is not None:
+        sequence = simulate(replace(SCENARIOS[source], duration_s=recording.duration_s), recording.seed)
+    else:
+        sequence = load_sequence(source, recording.seed)
+    return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))
+
+
+def _cut(sequence: Sequence, recording: Recording) -> Sequence:
+    if recording.duration_s is not None:
+        end_ns = sequence.frames_t_ns[0] + round(recording.duration_s * NS_PER_S)
+        sequence = sequence.truncated(int((sequence.frames_t_ns <= end_ns).sum()))
+    return sequence if recording.max_frames is None else sequence.truncated(recording.max_frames)
+
+
+def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
+    """Return the sequence with the noise that the settings ask for."""
+    rig = sequence.rig
+    if asked.pixel_sigma_px is not None:
+        rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (asked.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
+    noise = sequence.noise if asked.motion_scale == 1.0 else _scaled(sequence.noise, asked.motion_scale)
+    return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
+
+
+def _scaled(noise: MotionNoise, factor: float) -> MotionNoise:
+    """Return the noise with its white densities scaled; random walks stay."""
+    if isinstance(noise, ImuNoise):
+        gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
+        return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
+    velocity = factor * noise.velocity_noise_density
+    return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)

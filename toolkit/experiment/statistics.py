@@ -1,0 +1,68 @@
+"""What many seeds say together: every metric's mean, median and spread, and the NEES averaged over the seeds.
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
+over N independent runs the mean NEES of a consistent estimator stays within the chi-square band for N runs.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.geometry import Array, IntArray
+from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What the n values of a metric say together; ``std`` (n - 1 in its divisor) is None for a single one."""
+
+    n: int
+    mean: float
+    median: float
+    std: float | None
+    least: float
+    lower_quartile: float
+    upper_quartile: float
+    most: float
+
+
+@dataclass(frozen=True, eq=False)
+class MeanNees:
+    """Pose NEES over 6 averaged over runs: at each frame (K,) the mean, the number of runs and the band for it."""
+
+    mean: Array
+    runs: IntArray
+    low: Array
+    high: Array
+
+    @property
+    def in_band_percent(self) -> float:
+        """Share of the frames with a mean at which it is in its band."""
+        known = self.runs > 0
+        return 100.0 * float(np.mean((self.mean >= self.low)[known] & (self.mean <= self.high)[known]))
+
+    @property
+    def too_sure_percent(self) -> float:
+        """Share of the frames with a mean at which it is above its band: errors larger than stated."""
+        return 100.0 * float(np.mean((self.mean > self.high)[self.runs > 0]))
+
+
+def spread_of(values: Iterable[float]) -> Spread | None:
+    """Return mean, median and spread of values, or None where there are none."""
+    given = np.array(list(values), dtype=float)
+    if not given.size:
+        return None
+    least, lower, median, upper, most = np.percentile(given, [0.0, 25.0, 50.0, 75.0, 100.0]).tolist()
+    std = float(given.std(ddof=1)) if given.size > 1 else None
+    return Spread(given.size, float(given.mean()), median, std, least, lower, upper, most)
+
+
+def mean_nees(nees: Array) -> MeanNees:
+    """Average pose NEES (runs, K), each over 6, at every frame over the runs that have it there (NaN: has not)."""
+    known = np.isfinite(nees)
+    runs = known.sum(axis=0)
+    mean = np.where(known, nees, 0.0).sum(axis=0) / np.maximum(runs, 1)
+    bands = {n: nees_band(POSE_DOF, n) if n else (np.nan, np.nan) for n in np.unique(runs).tolist()}
+    low, high = (np.array([bands[n][side] for n in runs.tolist()]) for side in (0, 1))
+    return MeanNees(np.where(runs > 0, mean, np.nan), runs, low, high)

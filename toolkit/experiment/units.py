@@ -1,0 +1,110 @@
+"""A unit of work: one estimator on one recording, run and scored."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from toolkit import runner
+from toolkit.estimate import Output, Run, Status
+from toolkit.estimator import Build, find
+from toolkit.experiment.recording import Prepared, Recording, prepare_once
+from toolkit.geometry import Array, IntArray
+from toolkit.metrics import Evaluation, Scores, score_run
+from toolkit.metrics._shared.consistency import body_errors, nees_over_time
+from toolkit.metrics._shared.scores import Unavailable
+from toolkit.progress import Progress
+from toolkit.sequence import Sequence
+from toolkit.settings import DEFAULTS, Settings
+
+OUTPUTS: tuple[Output, ...] = ("causal", "final")
+
+
+@dataclass(frozen=True, eq=False)
+class Unit:
+    """What to run. ``recording`` may be prepared already; ``build`` is an estimator that cannot be found by its name.
+
+    ``keep_run`` asks for the run itself with its trajectories and landmarks, not for its scores alone.
+    """
+
+    recording: Recording | Prepared
+    seed: int
+    estimator: str
+    settings: Settings = DEFAULTS
+    build: Build | None = None
+    keep_run: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """One output's scores, and at each frame (K,) its pose NEES over 6 and its position error, NaN where unknown."""
+
+    scores: Scores
+    nees_pose: Array
+    position_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How one estimator fared under one seed; ``outputs`` lacks the kinds of output it did not give.
+
+    ``sequence_hash`` is that of the recording it read; ``run`` is there where it was asked for. ``final_is_causal``
+    tells that the final output only repeats the causal one, as a filter's does.
+    """
+
+    seed: int
+    estimator: str
+    status: Status
+    outputs: Mapping[Output, Scored] = field(default_factory=dict)
+    log: tuple[str, ...] = ()
+    sequence_hash: str = ""
+    final_is_causal: bool = False
+    run: Run | None = None
+
+
+def run_unit(unit: Unit, progress: Progress) -> Outcome:
+    """Run the estimator of a unit and score what it gave.
+
+    Raises DataError where the recording cannot be had, EstimatorError where the estimator cannot be used.
+    """
+    prepared = prepared_of(unit)
+    outcome = outcome_of(run_estimator(unit, prepared, progress), prepared.sequence, unit.seed)
+    return outcome if unit.keep_run else replace(outcome, run=None)
+
+
+def prepared_of(unit: Unit) -> Prepared:
+    """Return a unit's recording, prepared."""
+    return unit.recording if isinstance(unit.recording, Prepared) else prepare_once(unit.recording)
+
+
+def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
+    """Run a unit's estimator over its prepared recording."""
+    build = find(unit.estimator).load() if unit.build is None else unit.build
+    return runner.run(unit.estimator, build, prepared.sequence, prepared.prior, progress, unit.settings)
+
+
+def outcome_of(run: Run, sequence: Sequence, seed: int) -> Outcome:
+    """Score every output of a run."""
+    outputs = {output: _scored(run, output, sequence) for output in OUTPUTS if run.trajectory(output) is not None}
+    return Outcome(seed, run.estimator, run.status, outputs, run.log, sequence.content_hash(), run.final_is_causal, run)
+
+
+def _scored(run: Run, output: Output, sequence: Sequence) -> Scored:
+    evaluation = Evaluation(run, output, sequence)
+    nees_pose, position_m = (np.full(sequence.frame_count, np.nan) for _ in range(2))
+    with np.errstate(all="ignore"):  # a diverged run overflows, as in score_run
+        try:
+            errors = body_errors(evaluation)
+            _put(position_m, sequence.frames_t_ns, errors.t_ns, errors.distance_m)
+            nees = nees_over_time(evaluation)
+            _put(nees_pose, sequence.frames_t_ns, nees.t_ns, nees.pose)
+        except Unavailable:
+            pass  # the scores have the reason
+    return Scored(score_run(run, output, sequence), nees_pose, position_m)
+
+
+def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) -> None:
+    """Enter values (n,) at stamps (n,) into a series (K,) by frame; what belongs to no frame is left out."""
+    row = np.minimum(np.searchsorted(frames_t_ns, t_ns), frames_t_ns.size - 1)
+    same = frames_t_ns[row] == t_ns
+    series[row[same]] = values[same]

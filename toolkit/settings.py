@@ -1,0 +1,238 @@
+"""Every option of a comparison in one typed record: what it is, its unit, its default and its range.
+
+An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
+runs carry the same one. A threshold that nobody should have to choose is no setting: it stands in the code, once, with
+its source.
+"""
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta, Struct
+
+from toolkit.errors import VislamError
+
+Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+Scalar = bool | int | float | str
+
+
+class SettingsError(VislamError):
+    """A setting that does not exist or has a value out of its range."""
+
+    exit_status: ClassVar[int] = 2
+
+
+class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
+    """What an estimator does about measurements that disagree with it."""
+
+    gate_probability: Annotated[
+        Probability, Meta(description="chi-square probability below which filters accept a measurement")
+    ] = 0.95
+    filter_huber: Annotated[
+        float, Meta(gt=0.0, description="Huber threshold of the decoupled filters", extra={"unit": "sigma"})
+    ] = 1.5
+    smoother_huber: Annotated[
+        float, Meta(gt=0.0, description="Huber threshold of the incremental smoothers", extra={"unit": "sigma"})
+    ] = 2.7954834829151074  # the filters' 95 % gate of three degrees of freedom, as a length
+    batch_huber: Annotated[
+        float, Meta(gt=0.0, description="Huber threshold of batch's first solve", extra={"unit": "sigma"})
+    ] = 1.5
+    batch_cauchy: Annotated[
+        float, Meta(gt=0.0, description="Cauchy scale of batch's second solve", extra={"unit": "sigma"})
+    ] = 2.0
+    batch_cut_probability: Annotated[
+        Probability, Meta(description="probability below which batch's last solve leaves a sighting out")
+    ] = 1e-3
+
+
+class Window(Struct, frozen=True, forbid_unknown_fields=True):
+    """How much of the past an estimator keeps."""
+
+    lag_s: Annotated[
+        float, Meta(gt=0.0, le=3600.0, description="window of the fixed-lag smoothers", extra={"unit": "s"})
+    ] = 2.0
+    imu_clones: Annotated[
+        int, Meta(ge=2, le=200, description="past poses a windowed filter keeps with raw IMU samples")
+    ] = 12
+    twist_clones: Annotated[
+        int, Meta(ge=2, le=200, description="past poses a windowed filter keeps with measured twists")
+    ] = 5
+    landmarks: Annotated[
+        int, Meta(ge=0, le=500, description="landmarks msckf-slam keeps in its state for as long as they are seen")
+    ] = 50
+
+
+class Noise(Struct, frozen=True, forbid_unknown_fields=True):
+    """What every estimator is told of the noise; by default what the recording states or its samples show."""
+
+    pixel_sigma_px: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0, le=100.0, description="standard deviation of uL and uR; v in proportion", extra={"unit": "px"}
+            ),
+        ]
+        | None
+    ) = None
+    motion_scale: Annotated[
+        float, Meta(gt=0.0, le=1e3, description="factor on the white-noise densities of the motion samples")
+    ] = 1.0
+
+
+class Settings(Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole record, by section. ``estimators`` holds options of single estimators by name, as they define them."""
+
+    outliers: Outliers = Outliers()
+    window: Window = Window()
+    noise: Noise = Noise()
+    start: Annotated[
+        Literal["measurements", "truth"], Meta(description="where the first state comes from; the truth is labelled")
+    ] = "measurements"
+    first_seed: Annotated[int, Meta(ge=0, description="seed of simulated sequences, the first of several")] = 0
+    seeds: Annotated[
+        int, Meta(ge=1, le=100_000, description="how many seeds a simulated sequence is repeated over")
+    ] = 1
+    estimators: dict[str, dict[str, Scalar]] = {}
+
+    def options_of(self, estimator: str) -> Mapping[str, Scalar]:
+        """Return the options set for one estimator alone."""
+        return self.estimators.get(estimator, {})
+
+
+DEFAULTS = Settings()
+
+
+class Described(NamedTuple):
+    """One setting as documentation shows it: key, unit, default, range in words, what it is."""
+
+    key: str
+    unit: str
+    default: str
+    range: str
+    meaning: str
+
+
+def settings_of(given: Mapping[str, Any], place: str) -> Settings:
+    """Return the record of nested values, the defaults where nothing is given.
+
+    Raises SettingsError for a key that does not exist, naming the nearest that does, and for a value of another type
+    or out of range; ``place`` says where the values come from.
+    """
+    _check_keys(given, Settings, "", place)
+    try:
+        return msgspec.convert(dict(given), Settings)
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"{place}: {_in_words(str(error))}") from error
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the nested values of a TOML file; raise SettingsError where it cannot be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SettingsError(f"{path}: is not TOML ({error})") from error
+
+
+def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
+    """Return nested values with ``section.key=value`` put in, the value as TOML writes it or a bare word."""
+    result: dict[str, Any] = {key: dict(v) if isinstance(v, Mapping) else v for key, v in given.items()}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise SettingsError(f"--set takes KEY=VALUE, as in window.lag_s=3, not {text!r}")
+        *sections, name = key.strip().split(".")
+        at = result
+        for section in sections:
+            at = at.setdefault(section, {})
+            if not isinstance(at, dict):
+                raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
+        at[name] = _value(value.strip())
+    return result
+
+
+def as_values(settings: Settings) -> dict[str, Any]:
+    """Return the whole record as nested values, for a manifest."""
+    values: dict[str, Any] = msgspec.to_builtins(settings)
+    return values
+
+
+def describe() -> tuple[Described, ...]:
+    """Return every setting, in the order of the record."""
+    return tuple(_described(Settings, ""))
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """Return the words that name the known names most like another, or nothing where none is."""
+    close = get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, place: str) -> None:
+    hints = get_type_hints(record)
+    for key, value in given.items():
+        if key not in hints:
+            known = [described.key for described in describe()] + ["estimators"]
+            raise SettingsError(f"{place}: there is no setting {prefix}{key}{nearest(prefix + key, known)}")
+        if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
+            _check_keys(value, hints[key], f"{key}.", place)
+
+
+def _in_words(message: str) -> str:
+    """Return what msgspec says of a value, the setting by its own name first."""
+    what, _, where = message.partition(" - at `$.")
+    return f"{where.rstrip('`')}: {what[0].lower()}{what[1:]}" if where else what
+
+
+def _described(record: type[Struct], prefix: str) -> Iterator[Described]:
+    hints = get_type_hints(record, include_extras=True)
+    for field in msgspec.structs.fields(record):
+        hint = hints[field.name]
+        if isinstance(hint, type) and issubclass(hint, Struct):
+            yield from _described(hint, f"{field.name}.")
+        elif field.name != "estimators":
+            yield _one(f"{prefix}{field.name}", hint, field.default)
+
+
+def _one(key: str, hint: Any, default: Any) -> Described:
+    metas = list(_metas(hint))
+    extra = {name: text for meta in metas for name, text in (meta.extra or {}).items()}
+    bounds = {name: getattr(meta, name) for meta in metas for name in _BOUNDS if getattr(meta, name) is not None}
+    words = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
+    words += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
+    meaning = next(meta.description for meta in metas if meta.description)
+    return Described(key, extra.get("unit", ""), _shown(default), ", ".join(words), meaning)
+
+
+_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+
+
+def _shown(default: Any) -> str:
+    if default is None:
+        return "the recording's"
+    return f"{default:.4g}" if isinstance(default, float) else str(default)
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """Yield a type annotation and all it is made of."""
+    yield hint
+    for part in get_args(hint):
+        if not isinstance(part, Meta):
+            yield from _parts(part)
+
+
+def _metas(hint: Any) -> Iterator[Meta]:
+    for part in _parts(hint):
+        yield from (meta for meta in getattr(part, "__metadata__", ()) if isinstance(meta, Meta))
