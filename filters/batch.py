@@ -8,18 +8,17 @@ mapped along that, for a start that has run off, dead-reckoned or too sure of it
 import gtsam
 import numpy as np
 
-from filters.kalman.belief import initial_belief
 from filters.kalman.known_pose_mapping import MapAlong
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
 from filters.smoothing.covariance_recovery import with_covariances
 from filters.smoothing.landmarks import restricted, worth_smoothing
-from filters.smoothing.motion import motion_graph
 from filters.smoothing.robust import seen_ids, solve_in_stages
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 120, "+ the future"
@@ -36,8 +35,8 @@ class Batch:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._motion = motion_graph(setup)
-        self._first_belief = initial_belief(setup.prior, setup.motion_kind)
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._first_belief = self._motion.initial_belief(setup.prior)
         self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates(), WindowSize(CLONES[setup.motion_kind]))
         self._map = MapAlong(setup.rig)
         self._packets: list[Packet] = []
@@ -68,15 +67,12 @@ class Batch:
 
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""
-        graph = gtsam.NonlinearFactorGraph()
-        for factor in self._motion.hold(self._first_belief, 0):
-            graph.add(factor)
+        graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias
         assert best_bias is not None
         for packet in self._packets:
             if packet.motion is not None:
-                for factor in self._motion.step(packet.motion, best_bias, packet.index):
-                    graph.add(factor)
+                graph.push_back(self._motion.integrate(packet.motion, best_bias).factors(packet.index))
         return graph
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:

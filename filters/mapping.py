@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from filters.kalman.belief import initial_belief
 from filters.kalman.correction import correct_landmarks
 from filters.kalman.landmarks import TrackedMap
 from filters.kalman.online_output import Speaker
-from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
 
@@ -22,14 +21,13 @@ class Mapping:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._predictor = predictor(setup)
-        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
         """Integrate the motion, then map from where it leads."""
-        if packet.motion is not None:
-            self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
+        self._belief = predicted(self._belief, self._motion, packet.motion)
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):

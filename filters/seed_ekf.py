@@ -10,15 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
 from filters.kalman.landmarks import LandmarkMap, TrackedMap
 from filters.kalman.online_output import Speaker
-from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
+from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import Belief
 from toolkit.sequence import Packet
 
 # Standing in for zero, which has no inverse: a bias of 1e-8 rad/s turns by 1e-6 rad in 100 s.
@@ -37,14 +37,13 @@ class SeedEkf:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._predictor = predictor(setup)
-        self._belief = _without_biases(initial_belief(setup.prior, setup.motion_kind))
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = _without_biases(self._motion.initial_belief(setup.prior))
         self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
         """Predict (1-2), map (3-10), correct the pose (11-14)."""
-        if packet.motion is not None:
-            self._belief = _without_biases(predicted(self._belief, self._predictor.step(self._belief, packet.motion)))
+        self._belief = _without_biases(predicted(self._belief, self._motion, packet.motion))
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
             seen = correct_landmarks(seen, uvs_px, self._belief.T_world_imu, np.zeros((6, 6)), self._rig).landmarks
@@ -65,8 +64,7 @@ class SeedEkf:
 
 def _without_biases(belief: Belief) -> Belief:
     """Return the belief with its biases held where they are: the report's state has none."""
-    cov = belief.cov.copy()
-    first_bias = (belief.layout.accel_bias or belief.layout.gyro_bias).start
-    cov[first_bias:], cov[:, first_bias:] = 0.0, 0.0
-    cov[first_bias:, first_bias:] = _HELD_VARIANCE * np.eye(len(cov) - first_bias)
+    cov, biases = belief.cov.copy(), belief.layout.biases
+    cov[biases], cov[:, biases] = 0.0, 0.0
+    cov[biases, biases] = _HELD_VARIANCE * np.eye(biases.stop - biases.start)
     return replace(belief, cov=cov)

@@ -13,11 +13,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from filters.kalman.belief import initial_belief
-from filters.kalman.prediction import predicted, predictor
 from filters.smoothing.landmarks import restricted
-from filters.smoothing.marginals import in_estimate_order
-from filters.smoothing.motion import motion_graph
 from filters.smoothing.outlier_check import bound_to_its_map, slipped
 from filters.smoothing.structureless import Sightings
 from filters.smoothing.window import Prior, Window
@@ -27,6 +23,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
@@ -44,8 +41,8 @@ class Smart:
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
-        self._motion, self._predictor = motion_graph(setup), predictor(setup)
-        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = self._motion.initial_belief(setup.prior)
         self._tracked = _nothing()
         self._solution = Solution(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
@@ -76,17 +73,17 @@ class Smart:
         """Return the window with the packet's state, predicted, and its sightings."""
         if packet.motion is None:
             return self._begun(packet)
-        factors = self._motion.step(packet.motion, self._belief.bias, packet.index)
-        step, points = self._predictor.step(self._belief, packet.motion), self._tracked.points_by_id()
-        expected = predicted(bound_to_its_map(self._belief), step)
+        increment = self._motion.integrate(packet.motion, self._belief.bias)
+        prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
+        expected = bound_to_its_map(self._belief).predicted(prediction)
         sound = restricted(packet.frame, ~slipped(packet.frame, points, expected, self._rig))
-        self._belief = predicted(self._belief, step)
-        return self._with_state(self._tracked, packet.index, sound, _graph(factors))
+        self._belief = self._belief.predicted(prediction)
+        return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
     def _begun(self, packet: Packet) -> Tracked:
         """Return a window that begins here, held at the state as predicted."""
         hold = self._motion.hold(self._belief, packet.index)
-        return self._with_state(_nothing(), packet.index, packet.frame, _graph(hold))
+        return self._with_state(_nothing(), packet.index, packet.frame, hold)
 
     def _with_state(self, tracked: Tracked, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph) -> Tracked:
         window, estimate = tracked.window, self._belief.estimate(frame.t_ns)
@@ -114,7 +111,7 @@ class Smart:
         first = len(self._states) - len(self._solution.window.keys)
         for i in places:
             state = self._states[first + i]
-            cov = in_estimate_order(self._solution.cov(i), state.T_world_imu[:3, :3])
+            cov = self._motion.estimate_cov(self._solution.cov(i), state.T_world_imu[:3, :3])
             self._states[first + i] = replace(state, cov=cov)
 
     def _complete_all(self) -> None:
@@ -128,13 +125,6 @@ class Smart:
             self._complete(range(leaving))
             window = without_oldest(self._tracked.window, leaving, self._rig)
             self._tracked = replace(self._tracked, window=window).compacted()
-
-
-def _graph(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.add(factor)
-    return graph
 
 
 def _nothing() -> Tracked:

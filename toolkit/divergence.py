@@ -8,15 +8,15 @@ that are rare in a filter that works and common in one that has lost its way.
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, se3_adjoint, se3_inverse, se3_log
-from toolkit.models import imu, twist
-from toolkit.sequence import ImuNoise, Packet, Sequence, TwistMotion, TwistNoise
+from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.models.motion import MotionModel, motion_model
+from toolkit.models.state import POSE, Belief
+from toolkit.sequence import Motion, Sequence
 
 # A windowed filter puts corrections off and then makes several frames' worth at once: five times the motion noise.
 _LUMP_FRAMES = 5
@@ -28,9 +28,9 @@ MOST_FAR_STEPS = 1.0 / 6.0
 # The gate passes 95 % of sound measurements, and still 65 % where tracks slip all the time. A filter that is sure of
 # a wrong pose hears next to nothing, and from then on: so much must pass in the whole run and in its last quarter.
 LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
-# What a correction may do beyond the noise of an IMU, whose velocity and biases it corrects as well:
+# What a correction may do beyond the noise of the motion where it corrects a velocity and biases as well:
 # rad/s of turn rate and m/s of velocity.
-_IMU_SLACK = np.repeat([0.02, 0.2], 3)
+_VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
 
 
 def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
@@ -64,62 +64,54 @@ def deafness(info: Mapping[str, Array]) -> str | None:
 
 def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Iterator[float]:
     """Yield the squared Mahalanobis distance of each step between neighbouring frames from the measured motion."""
+    model = motion_model(sequence.noise, sequence.gravity_world)
     row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
     for before, packet in pairwise(sequence.packets()):
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
-        if start is None or end is None:
+        if start is None or end is None or packet.motion is None:
             continue
-        deviation, cov = _deviation(trajectory, start, end, packet, sequence)
+        deviation, cov = _deviation(trajectory, start, end, packet.motion, model)
         yield float(deviation @ np.linalg.solve(cov, deviation))
 
 
-def _deviation(trajectory: Trajectory, start: int, end: int, packet: Packet, sequence: Sequence) -> tuple[Array, Array]:
+def _deviation(trajectory: Trajectory, start: int, end: int, motion: Motion, model: MotionModel) -> tuple[Array, Array]:
     """Return the step's deviation (6,) from the measured motion, in the tangent of its end, and its covariance."""
-    if isinstance(packet.motion, TwistMotion) and isinstance(sequence.noise, TwistNoise):
-        predicted = _twist_prediction(trajectory, start, packet.motion, sequence.noise)
-    else:
-        predicted = _imu_prediction(trajectory, start, packet, sequence)
-    cov = _LUMP_FRAMES * predicted.cov
+    belief = _belief_at(trajectory, start, model)
+    prediction = model.integrate(motion, belief.bias).predict(belief)
+    noise = prediction.noise[POSE, POSE]
+    if model.layout.velocity is not None:
+        noise = noise + np.diag(_slack(trajectory, float(motion.dt_s.sum())))
+    cov = _LUMP_FRAMES * noise
     if trajectory.cov is not None:
-        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], predicted)
-    return se3_log(se3_inverse(predicted.T_world_imu) @ trajectory.T_world_imu[end]), cov
+        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], prediction.transition[POSE], noise)
+    return se3_log(se3_inverse(prediction.T_world_imu) @ trajectory.T_world_imu[end]), cov
 
 
-class _Predicted(NamedTuple):
-    """Where the measured motion leads, what of the state's error (d,) reaches the pose (6, d), and its own noise."""
+def _belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
+    """Return a state of the trajectory as a belief; velocity and biases it lacks are zero, and so is its covariance."""
+    d = model.layout.size
+    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
+    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
+    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
 
-    T_world_imu: Array
-    transition: Array
-    cov: Array
+
+def _slack(trajectory: Trajectory, dt_s: float) -> Array:
+    """Return the variance (6,) that corrections of velocity and biases may add to a step of the pose."""
+    slack = (_VELOCITY_SLACK * dt_s) ** 2
+    if trajectory.v_world is None:  # without a velocity only the rotation can be compared
+        slack[3:] = 1e12
+    return slack
 
 
-def _taken_away(cov_start: Array, cov_end: Array, predicted: _Predicted) -> Array:
-    """Return the pose covariance (6, 6) that the correction at the end of a step took away, where it took any."""
-    if cov_start.shape[0] != predicted.transition.shape[1]:
+def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Array) -> Array:
+    """Return the pose covariance (6, 6) that the correction at the end of a step took away, where it took any.
+
+    ``transition`` (6, d) is what of the state's error reaches the pose, ``noise`` (6, 6) what the step adds to it.
+    """
+    if cov_start.shape[0] != transition.shape[1]:
         return np.zeros((6, 6))
-    taken = predicted.transition @ cov_start @ predicted.transition.T + predicted.cov - cov_end[:6, :6]
+    taken = transition @ cov_start @ transition.T + noise - cov_end[:6, :6]
     if not np.isfinite(taken).all():
         return np.zeros((6, 6))
     size, axes = np.linalg.eigh(taken)
     return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
-
-
-def _twist_prediction(trajectory: Trajectory, start: int, motion: TwistMotion, noise: TwistNoise) -> _Predicted:
-    bias = np.zeros(3) if trajectory.bias is None else trajectory.bias[start, 3:]
-    step = twist.integrate(motion, bias, noise)
-    transition = np.hstack([se3_adjoint(se3_inverse(step.T_start_end)), step.d_step_d_bias])
-    return _Predicted(trajectory.T_world_imu[start] @ step.T_start_end, transition, step.cov)
-
-
-def _imu_prediction(trajectory: Trajectory, start: int, packet: Packet, sequence: Sequence) -> _Predicted:
-    assert packet.motion is not None and not isinstance(packet.motion, TwistMotion)
-    assert isinstance(sequence.noise, ImuNoise)
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[start]
-    params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
-    preintegration = imu.preintegrate(packet.motion, bias, params)
-    slack = (_IMU_SLACK * float(packet.motion.dt_s.sum())) ** 2
-    if trajectory.v_world is None:  # without a velocity only the rotation can be compared
-        slack[3:] = 1e12
-    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[start]
-    step = imu.predict(preintegration, trajectory.T_world_imu[start], v_world, bias)
-    return _Predicted(step.T_world_imu, step.transition[:6], step.cov[:6, :6] + np.diag(slack))

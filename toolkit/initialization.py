@@ -11,9 +11,11 @@ import gtsam
 import numpy as np
 
 from toolkit.errors import DataError
+from toolkit.estimate import Estimate
 from toolkit.geometry import Array, IntArray, se3, so3_exp, transform
-from toolkit.models import factors, imu, stereo
-from toolkit.models.factors import B, L, V, X
+from toolkit.models import stereo
+from toolkit.models.factors import B, L, StereoFactors, X, joint_cov
+from toolkit.models.motion import MotionModel, motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuMotion, ImuNoise, Packet, Prior, Sequence, StereoFrame, StereoRig
 
@@ -138,19 +140,16 @@ def _positions(frames: list[StereoFrame], attitudes: list[Array], rig: StereoRig
 
 def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: list[Array], sequence: Sequence) -> Prior:
     """Adjust poses, velocities, biases and landmarks of the first frames and return the state at the first."""
-    assert isinstance(sequence.noise, ImuNoise)
+    model = motion_model(sequence.noise, sequence.gravity_world)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     positions = _positions(frames, attitudes, sequence.rig)
     stamps_s = np.array([f.t_ns - frames[0].t_ns for f in frames]) / NS_PER_S
     velocities = np.gradient(positions, stamps_s, axis=0)
-    maker = factors.StereoFactors(sequence.rig, gtsam.noiseModel.mEstimator.Huber.Create(_HUBER))
-    params = imu.preintegration_params(sequence.noise, sequence.gravity_world)
+    maker = StereoFactors(sequence.rig, gtsam.noiseModel.mEstimator.Huber.Create(_HUBER))
     _hold_gauge(graph, attitudes[0])
     for k, frame in enumerate(frames):
         T_world_imu = se3(attitudes[k], positions[k])
-        values.insert(X(k), gtsam.Pose3(T_world_imu))
-        values.insert(V(k), velocities[k])
-        values.insert(B(k), gtsam.imuBias.ConstantBias())
+        model.insert(values, Estimate(frame.t_ns, T_world_imu, v_world=velocities[k], bias=np.zeros(6)), k)
         points = stereo.triangulate_world(frame.uvs_px, T_world_imu, sequence.rig)
         for track_id, point in zip(frame.track_ids.tolist(), points, strict=True):
             if not values.exists(L(track_id)):
@@ -158,12 +157,12 @@ def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: li
         for factor in maker.of(frame, k):
             graph.add(factor)
         if k:
-            graph.add(factors.imu_factor(imu.preintegrate(motions[k - 1], np.zeros(6), params), k))
+            graph.push_back(model.integrate(motions[k - 1], np.zeros(6)).factors(k))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
     try:
         solved = optimizer.optimize()
         if np.isfinite(optimizer.error()):
-            return _first_state(graph, solved, len(frames))
+            return _first_state(graph, solved, model, len(frames))
     except RuntimeError as refusal:
         if "Indeterminate" not in str(refusal):
             raise
@@ -182,18 +181,10 @@ def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:
     )
 
 
-def _first_state(graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, frames: int) -> Prior:
-    joint = gtsam.Marginals(graph, solved).jointMarginalCovariance([X(0), V(0), B(0)])
-    keys = (X(0), V(0), B(0))
-    cov = np.block([[joint.at(row, column) for column in keys] for row in keys])
-    pose = solved.atPose3(X(0)).matrix()
-    to_body = np.eye(15)
-    to_body[6:9, 6:9] = pose[:3, :3].T
-    cov = _INFLATION * (to_body @ cov @ to_body.T)
-    return Prior(
-        pose,
-        solved.atVector(V(0)),
-        solved.atConstantBias(B(0)).vector(),
-        0.5 * (cov + cov.T),
-        f"the specific force and stereo of the first {frames} frames",
-    )
+def _first_state(graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, model: MotionModel, frames: int) -> Prior:
+    first = model.read(solved, 0, 0)
+    assert first.v_world is not None and first.bias is not None
+    cov = joint_cov(gtsam.Marginals(graph, solved), model.keys(0))
+    cov = _INFLATION * model.estimate_cov(cov, first.T_world_imu[:3, :3])
+    source = f"the specific force and stereo of the first {frames} frames"
+    return Prior(first.T_world_imu, first.v_world, first.bias, cov, source)

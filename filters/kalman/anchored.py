@@ -11,10 +11,10 @@ the same vectors whatever the estimate, as in the invariant belief that this one
 
 import numpy as np
 
-from filters.kalman.belief import POSITION, ROTATION, Belief
 from filters.kalman.invariant import InvariantBelief
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew, transform
+from toolkit.models.state import POSITION, ROTATION, Belief
 
 
 class AnchoredBelief(InvariantBelief):

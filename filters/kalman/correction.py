@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.belief import POSE, Belief
 from filters.kalman.gate import STEREO_GATE, huber_weights, mahalanobis_squared
 from filters.kalman.landmarks import LandmarkMap
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
+from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoRig
 
 

@@ -6,13 +6,13 @@ landmark, and the filter is too sure of itself: its covariance does not grow wit
 
 import numpy as np
 
-from filters.kalman.belief import POSE, initial_belief
 from filters.kalman.correction import correct_landmarks_gated, correct_pose
 from filters.kalman.diagnostics import Innovation
 from filters.kalman.landmarks import TrackedMap
-from filters.kalman.prediction import predicted, predictor
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
+from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import POSE
 from toolkit.sequence import Packet
 
 
@@ -21,14 +21,13 @@ class DecoupledEkf:
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
-        self._predictor = predictor(setup)
-        self._belief = initial_belief(setup.prior, setup.motion_kind)
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
-        if packet.motion is not None:
-            self._belief = predicted(self._belief, self._predictor.step(self._belief, packet.motion))
+        self._belief = predicted(self._belief, self._motion, packet.motion)
         seen, uvs_px = self._map.seen_again(packet.frame)
         innovation = Innovation()
         if len(seen):

@@ -15,9 +15,9 @@ from copy import copy
 
 import numpy as np
 
-from filters.kalman.belief import POSE, ROTATION
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, se3_adjoint, se3_inverse, se3_right_jacobian, skew, so3_left_jacobian
+from toolkit.models.state import POSE, ROTATION
 
 
 class InvariantBelief(JointBelief):

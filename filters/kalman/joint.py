@@ -11,9 +11,8 @@ from typing import Self
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from filters.kalman.belief import Belief
-from filters.kalman.prediction import Step
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
+from toolkit.models.state import Belief, Prediction
 
 
 class JointBelief:
@@ -52,15 +51,15 @@ class JointBelief:
         """Return where the landmarks stand in the error state."""
         return slice(self.clone_columns.stop, self._cov.shape[0])
 
-    def propagate(self, step: Step, transition: Array) -> None:
-        """Carry the IMU over a step; its end is the first estimate of the new instant."""
+    def propagate(self, prediction: Prediction, transition: Array) -> None:
+        """Carry the IMU over an interval; its end is the first estimate of the new instant."""
         d = self._core.layout.size
-        self._core = replace(self._core, T_world_imu=step.T_world_imu, v_world=step.v_world)
+        self._core = replace(self._core, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world)
         self.first_core = self._core
         cov = self._cov.copy()
         cov[:d] = transition @ cov[:d]
         cov[:, :d] = cov[:, :d] @ transition.T
-        cov[:d, :d] += step.noise
+        cov[:d, :d] += prediction.noise
         self._cov = _symmetric(cov)
 
     def clone(self, frame: int) -> None:

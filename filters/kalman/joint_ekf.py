@@ -10,15 +10,15 @@ from typing import Protocol
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Sightings
-from filters.kalman.prediction import predictor
 from filters.kalman.triangulation import triangulate
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame, StereoRig
 
 
@@ -45,8 +45,8 @@ class JointEkf:
         correct: Correct = joint_landmarks.correct,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
-        self._predictor = predictor(setup)
-        self._joint = belief(initial_belief(setup.prior, setup.motion_kind))
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
 
     @property
@@ -57,7 +57,7 @@ class JointEkf:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
-            propagate(self._joint, self._predictor, self._at, packet.motion)
+            propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)

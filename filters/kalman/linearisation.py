@@ -8,18 +8,18 @@ odometry", section 4).
 
 from typing import Protocol
 
-from filters.kalman.belief import Belief
 from filters.kalman.joint import JointBelief
-from filters.kalman.prediction import Predictor, Step
 from toolkit.geometry import Array
+from toolkit.models.motion import Increment, MotionModel
+from toolkit.models.state import Prediction
 from toolkit.sequence import Motion
 
 
 class Linearisation(Protocol):
     """Chooses the values Jacobians are taken at."""
 
-    def transition(self, predictor: Predictor, joint: JointBelief, step: Step, motion: Motion) -> Array:
-        """Return the transition (d, d) of a step."""
+    def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
+        """Return the transition (d, d) of a prediction from the joint belief."""
 
     def clones(self, joint: JointBelief) -> Array:
         """Return the poses (C, 4, 4) of the clones."""
@@ -31,9 +31,9 @@ class Linearisation(Protocol):
 class AtLatestEstimates:
     """The standard EKF."""
 
-    def transition(self, predictor: Predictor, joint: JointBelief, step: Step, motion: Motion) -> Array:
-        """Return the transition of the step as it was taken."""
-        return step.transition
+    def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
+        """Return the transition as it was predicted."""
+        return prediction.transition
 
     def clones(self, joint: JointBelief) -> Array:
         """Return the clones as estimated now."""
@@ -47,10 +47,9 @@ class AtLatestEstimates:
 class AtFirstEstimates:
     """First-estimate Jacobians."""
 
-    def transition(self, predictor: Predictor, joint: JointBelief, step: Step, motion: Motion) -> Array:
+    def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
         """Return the transition between the first estimates of both instants."""
-        start: Belief = joint.first_core
-        return predictor.transition_between(start, step, motion)
+        return increment.transition_between(joint.first_core, prediction)
 
     def clones(self, joint: JointBelief) -> Array:
         """Return the clones as first estimated."""
@@ -61,7 +60,8 @@ class AtFirstEstimates:
         return joint.first_points
 
 
-def propagate(joint: JointBelief, predictor: Predictor, at: Linearisation, motion: Motion) -> None:
+def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion) -> None:
     """Carry a joint belief over the motion between two frames, linearised as chosen."""
-    step = predictor.step(joint.core, motion)
-    joint.propagate(step, at.transition(predictor, joint, step, motion))
+    increment = model.integrate(motion, joint.core.bias)
+    prediction = increment.predict(joint.core)
+    joint.propagate(prediction, at.transition(joint, increment, prediction))

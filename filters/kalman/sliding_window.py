@@ -11,17 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Constraints, Sightings
-from filters.kalman.prediction import predictor
 from filters.kalman.track_gate import FEWEST_SIGHTINGS, TrackGate
 from filters.kalman.tracks import WindowTracks
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet, StereoFrame
 
 # An IMU ties poses over a second so well that tracks may take as long to speak. A measured twist is a
@@ -42,15 +41,15 @@ class SlidingWindowFilter:
 
     def __init__(self, setup: Setup, linearisation: Linearisation, size: WindowSize) -> None:
         self._rig, self._size, self._at = setup.rig, size, linearisation
-        self._predictor = predictor(setup)
-        self._joint = JointBelief(initial_belief(setup.prior, setup.motion_kind))
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks = WindowTracks()
         self._memory = LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and say where the IMU is."""
         if packet.motion is not None:
-            propagate(self._joint, self._predictor, self._at, packet.motion)
+            propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
         innovation = Innovation()
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)

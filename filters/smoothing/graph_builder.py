@@ -9,18 +9,17 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from filters.kalman.belief import Belief, initial_belief
 from filters.kalman.gate import STEREO_GATE
 from filters.kalman.landmarks import LEAST_DISPARITY_PX
-from filters.kalman.prediction import predicted, predictor
 from filters.smoothing.landmarks import restricted
-from filters.smoothing.motion import MotionGraph, motion_graph
 from filters.smoothing.outlier_check import bound_to_its_map, slipped
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
+from toolkit.models.motion import MotionModel, motion_model
+from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame
 
 # Sightings that have not slipped but strain the filters' gate are weighed down from the gate's own bound.
@@ -42,11 +41,10 @@ class Growth:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._predictor = predictor(setup)
         self._stereo = StereoFactors(setup.rig, gtsam.noiseModel.mEstimator.Huber.Create(HUBER_THRESHOLD))
         self._points: dict[int, Array] = {}
-        self.motion: MotionGraph = motion_graph(setup)
-        self.belief: Belief = initial_belief(setup.prior, setup.motion_kind)
+        self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
+        self.belief: Belief = self.motion.initial_belief(setup.prior)
 
     def by(self, packet: Packet) -> Grown:
         """Return what a packet adds, the new state being predicted from the latest known."""
@@ -70,13 +68,12 @@ class Growth:
         """Add the new state; return it as expected against the map."""
         expected = bound_to_its_map(self.belief)
         if packet.motion is None:
-            new = self.motion.hold(self.belief, packet.index)
+            grown.factors.push_back(self.motion.hold(self.belief, packet.index))
         else:
-            new = self.motion.step(packet.motion, self.belief.bias, packet.index)
-            step = self._predictor.step(self.belief, packet.motion)
-            self.belief, expected = predicted(self.belief, step), predicted(expected, step)
-        for factor in new:
-            grown.factors.add(factor)
+            increment = self.motion.integrate(packet.motion, self.belief.bias)
+            prediction = increment.predict(self.belief)
+            self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
+            grown.factors.push_back(increment.factors(packet.index))
         self._add_values(packet, grown)
         return expected
 

@@ -4,31 +4,11 @@ Only the path from the variables to the root of the Bayes tree is touched: for s
 that is next to nothing, however long the graph.
 """
 
-from typing import Protocol
-
-import gtsam
 import numpy as np
 
-from filters.kalman.belief import IMU_LAYOUT
 from toolkit.geometry import Array
-from toolkit.models.factors import kind_of
-
-
-class EliminatedGraph(Protocol):
-    """What knows its marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
-
-    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
-        """Return the joint marginal of some variables."""
-
-
-def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
-    """Return the joint covariance (d, d) of variables, in the order of the keys and in GTSAM's tangent spaces.
-
-    Raises RuntimeError, as GTSAM does, where the graph does not determine them.
-    """
-    marginal = tree.jointMarginalCovariance(keys)
-    cov = np.block([[marginal.at(i, j) for j in keys] for i in keys])
-    return np.asarray(0.5 * (cov + cov.T))
+from toolkit.models.factors import EliminatedGraph, joint_cov, kind_of
+from toolkit.models.imu import IMU_LAYOUT
 
 
 def state_cov(tree: EliminatedGraph, keys: list[int], R_world_imu: Array) -> Array:

@@ -5,13 +5,14 @@ beside the smoother is asked: one that is too sure of itself runs off, and then 
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from filters.kalman.belief import POSE, Belief
 from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
+from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
 
 # A smoother relinearises and weighs doubtful sightings down: it leaves out only what no chance explains.
@@ -27,7 +28,7 @@ def bound_to_its_map(belief: Belief) -> Belief:
     """
     cov = belief.cov.copy()
     cov[POSE], cov[:, POSE] = 0.0, 0.0
-    return Belief(belief.layout, belief.T_world_imu, belief.v_world, belief.bias, cov)
+    return replace(belief, cov=cov)
 
 
 def slipped(frame: StereoFrame, points: Mapping[int, Array], expected: Belief, rig: StereoRig) -> BoolArray:

@@ -12,13 +12,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.kalman.belief import Belief, initial_belief
 from filters.smoothing.landmarks import restricted
-from filters.smoothing.motion import motion_graph
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import B, L, StereoFactors, V, X
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief
 from toolkit.models.stereo import triangulate_world
 from toolkit.sequence import Sequence
 from toolkit.simulation import Scenario, simulate
@@ -90,16 +90,14 @@ class BatchAtTruth:
         self._marginals = gtsam.Marginals(graph, values)
 
     def _motion(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        recording, graph, values = self._recording, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        maker = motion_graph(recording.setup)
-        for factor in maker.hold(first_belief(recording), 0):
-            graph.add(factor)
+        recording, values = self._recording, gtsam.Values()
+        maker = motion_model(recording.setup.noise, recording.setup.gravity_world)
+        graph = maker.hold(first_belief(recording), 0)
         for packet in recording.sequence.packets():
             maker.insert(values, recording.truth_at(packet.index), packet.index)
             if packet.motion is not None:
                 bias = recording.truth_at(packet.index - 1).bias
-                for factor in maker.step(packet.motion, bias, packet.index):
-                    graph.add(factor)
+                graph.push_back(maker.integrate(packet.motion, bias).factors(packet.index))
         return graph, values
 
     def state(self, k: int) -> tuple[Array, Array]:
@@ -115,7 +113,7 @@ class BatchAtTruth:
 
 
 def first_belief(recording: Recording) -> Belief:
-    return initial_belief(recording.setup.prior, recording.setup.motion_kind)
+    return motion_model(recording.setup.noise, recording.setup.gravity_world).initial_belief(recording.setup.prior)
 
 
 def assert_covariances_agree(one: Array, other: Array, relative: float) -> None:

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from filters.kalman import gate
-from filters.kalman.belief import IMU_LAYOUT, TWIST_LAYOUT, Belief, Layout
 from filters.kalman.correction import correct_landmarks, correct_pose, updated_by_pose_sightings
 from filters.kalman.landmarks import LandmarkMap
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
+from toolkit.models.imu import IMU_LAYOUT
+from toolkit.models.state import Belief, Layout
+from toolkit.models.twist import TWIST_LAYOUT
 from toolkit.simulation import DRIVE
 
 RIG = DRIVE.rig

@@ -13,11 +13,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters.kalman.belief import TWIST_LAYOUT, Belief, initial_belief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
 from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
 from toolkit.geometry import Array, skew
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief
+from toolkit.models.twist import TWIST_LAYOUT
 from toolkit.sequence import Prior
 from toolkit.simulation import DRIVE, FLIGHT
 
@@ -56,9 +58,9 @@ class Watched:
         self._at = at
         self.joint = None
 
-    def transition(self, predictor, joint, step, motion):
+    def transition(self, joint, increment, prediction):
         self.joint = joint
-        return self._at.transition(predictor, joint, step, motion)
+        return self._at.transition(joint, increment, prediction)
 
     def clones(self, joint):
         return self._at.clones(joint)
@@ -83,7 +85,7 @@ class Said(NamedTuple):
 def run(name: str, scenario: str, at: type, recorded, *, loose: bool) -> Said:
     recording = recorded(SCENARIOS[scenario], 1.0)
     setup = recording.setup
-    first = initial_belief(setup.prior, setup.motion_kind)
+    first = motion_model(setup.noise, setup.gravity_world).initial_belief(setup.prior)
     if loose:
         setup = replace(setup, prior=loosened(setup.prior, first))
     watched = Watched(at())

@@ -20,10 +20,10 @@ from filters.kalman.invariant import InvariantBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates, propagate
-from filters.kalman.prediction import predictor
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
@@ -63,7 +63,7 @@ def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) ->
     for packet in packets[:frames]:
         ekf.step(packet)
     joint, frame = ekf.joint, packets[frames].frame
-    propagate(joint, predictor(setup_of(sequence)), AT, packets[frames].motion)
+    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), AT, packets[frames].motion)
     joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
     rows = np.isin(frame.track_ids, joint.landmark_ids)
     drawn = np.random.default_rng(8).standard_normal(joint.cov.shape[0])

@@ -17,7 +17,8 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models import twist
-from toolkit.models.factors import B, L, V, X, twist_factor
+from toolkit.models.factors import B, L, V, X
+from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence, TwistMotion
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

@@ -7,14 +7,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.kalman.belief import initial_belief
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from filters.smoothing.motion import motion_graph
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
-from toolkit.estimator import Setup
 from toolkit.models import stereo
 from toolkit.models.factors import B, L, StereoFactors, X
+from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate
 
 EXACT = Stopping(relative_decrease=1e-12, max_iterations=100)
@@ -26,19 +24,15 @@ class Problem:
     def __init__(self, scenario: Scenario) -> None:
         sequence = simulate(replace(scenario, duration_s=2.0), 2)
         self.rig, self.packets = sequence.rig, list(sequence.packets())
-        setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-        motion, maker = motion_graph(setup), StereoFactors(sequence.rig)
-        self.graph, self.start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for factor in motion.hold(initial_belief(sequence.prior, sequence.motion_kind), 0):
-            self.graph.add(factor)
+        motion, maker = motion_model(sequence.noise, sequence.gravity_world), StereoFactors(sequence.rig)
+        self.graph, self.start = motion.hold(motion.initial_belief(sequence.prior), 0), gtsam.Values()
         truth, rng = sequence.truth, np.random.default_rng(5)
         for k, packet in enumerate(self.packets):
             disturbed = gtsam.Pose3(truth.T_world_imu[k]).retract(0.02 * rng.standard_normal(6)).matrix()
             estimate = Estimate(packet.frame.t_ns, disturbed, v_world=truth.v_world[k], bias=np.zeros(6))
             motion.insert(self.start, estimate, k)
             if packet.motion is not None:
-                for factor in motion.step(packet.motion, np.zeros(6), k):
-                    self.graph.add(factor)
+                self.graph.push_back(motion.integrate(packet.motion, np.zeros(6)).factors(k))
             for factor in maker.of(packet.frame, k):
                 self.graph.add(factor)
             points = stereo.triangulate_world(packet.frame.uvs_px, disturbed, sequence.rig)

@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.belief import initial_belief
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
 from filters.kalman.multiview import Linearised, Sightings
-from filters.kalman.prediction import predictor
 from filters.kalman.sliding_window import SlidingWindowFilter, WindowSize
 from filters.kalman.tracks import WindowTracks
 from filters.kalman.triangulation import triangulate
 from filters.smoothing.landmarks import restricted
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
+from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, FLIGHT
 
 CLONES = 6
@@ -41,10 +40,11 @@ class Window(NamedTuple):
 
 def window_of(recording) -> Window:
     setup, at = recording.setup, AtLatestEstimates()
-    joint, tracks = JointBelief(initial_belief(setup.prior, setup.motion_kind)), WindowTracks()
+    model = motion_model(setup.noise, setup.gravity_world)
+    joint, tracks = JointBelief(model.initial_belief(setup.prior)), WindowTracks()
     for packet in recording.sequence.packets():
         if packet.motion is not None:
-            propagate(joint, predictor(setup), at, packet.motion)
+            propagate(joint, model, at, packet.motion)
         joint.clone(packet.index)
         tracks.add_frame(packet.frame)
     taken = tracks.take(np.ones(len(tracks.ended()), dtype=bool))

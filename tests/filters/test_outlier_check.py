@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.belief import Belief, initial_belief
-from filters.kalman.prediction import predicted, predictor
 from filters.smoothing.outlier_check import bound_to_its_map, slipped
-from toolkit.estimator import Setup
 from toolkit.geometry import se3, se3_inverse
 from toolkit.models import stereo
+from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import Belief
 from toolkit.sequence import Packet, Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
@@ -20,15 +19,14 @@ SLIPPING = replace(CLEAN, camera=replace(CLEAN.camera, outlier_rate=0.05, outlie
 
 def expected_states(sequence: Sequence) -> list[tuple[Packet, Belief]]:
     """Return each packet but the first with the state its motion foretells from the truth one frame earlier."""
-    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-    carries, prior = predictor(setup), initial_belief(sequence.prior, sequence.motion_kind)
-    truth, result = sequence.truth, []
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    prior, truth, result = model.initial_belief(sequence.prior), sequence.truth, []
     for packet in list(sequence.packets())[1:]:
         k = packet.index - 1
         v_world = np.zeros(3) if truth.v_world is None else truth.v_world[k]
         before = replace(prior, T_world_imu=truth.T_world_imu[k], v_world=v_world, bias=truth.bias[k])
         before = bound_to_its_map(before)
-        result.append((packet, predicted(before, carries.step(before, packet.motion))))
+        result.append((packet, predicted(before, model, packet.motion)))
     return result
 
 

@@ -14,15 +14,16 @@ from scipy.linalg import expm
 
 from filters.kalman import iterated, joint_landmarks
 from filters.kalman.anchored import AnchoredBelief
-from filters.kalman.belief import IMU_LAYOUT, Belief, initial_belief
 from filters.kalman.diagnostics import Innovation, LandmarkMemory
 from filters.kalman.invariant import InvariantBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates, propagate
-from filters.kalman.prediction import predictor
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3, se3_exp, skew, so3_log
+from toolkit.models.imu import IMU_LAYOUT
+from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief
 from toolkit.sequence import Prior, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
@@ -91,7 +92,7 @@ def predicted(scenario, belief=InvariantBelief, frames: int = 6):
     for packet in packets[:frames]:
         ekf.step(packet)
     joint, frame = ekf.joint, packets[frames].frame
-    propagate(joint, predictor(setup_of(sequence)), AT, packets[frames].motion)
+    propagate(joint, motion_model(sequence.noise, sequence.gravity_world), AT, packets[frames].motion)
     joint_landmarks.forget_lost(joint, frame, LandmarkMemory())
     assert len(joint.landmark_ids) > 5
     return joint, frame, sequence.rig
@@ -137,13 +138,13 @@ def test_its_error_propagates_alike_from_every_state(scenario) -> None:
     sequence = recording(scenario)
     setup, motion = setup_of(sequence), list(sequence.packets())[3].motion
     assert motion is not None
-    carry, rng = predictor(setup), np.random.default_rng(1)
-    start = initial_belief(setup.prior, setup.motion_kind)
+    carry, rng = motion_model(setup.noise, setup.gravity_world), np.random.default_rng(1)
+    start = motion_model(setup.noise, setup.gravity_world).initial_belief(setup.prior)
     transitions = []
     for _ in range(3):
         T_world_imu = se3_exp(np.r_[rng.standard_normal(3), 100.0 * rng.standard_normal(3)])
         here = replace(start, T_world_imu=T_world_imu, v_world=10.0 * rng.standard_normal(3))
-        step = carry.step(here, motion)
+        step = carry.integrate(motion, here.bias).predict(here)
         there = replace(here, T_world_imu=step.T_world_imu, v_world=step.v_world)
         before, after = to_invariant(JointBelief(here)), to_invariant(JointBelief(there))
         transitions.append(after @ step.transition @ np.linalg.inv(before))
@@ -214,10 +215,11 @@ def most_information_gained(scenario, belief, correct) -> float:
     setup = setup_of(sequence)
     # Without an accelerometer nothing measures the vertical either.
     turns = np.eye(3) if setup.motion_kind == "twist" else np.eye(3)[:, 2:]
-    core = initial_belief(setup.prior, setup.motion_kind)
+    model = motion_model(setup.noise, setup.gravity_world)
+    core = model.initial_belief(setup.prior)
     setup = replace(setup, prior=loosened(setup.prior, core, turns))
     directions = gauge(JointBelief(core), turns)
-    first = directions.T @ np.linalg.solve(initial_belief(setup.prior, setup.motion_kind).cov, directions)
+    first = directions.T @ np.linalg.solve(model.initial_belief(setup.prior).cov, directions)
     root = np.linalg.inv(np.linalg.cholesky(first))
     ekf, gained = JointEkf(setup, AT, partial(belief, setup.rig), correct), -1.0
     for packet in sequence.packets():

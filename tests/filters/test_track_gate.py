@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from filters.kalman import multiview
-from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation
 from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.linearisation import AtLatestEstimates, propagate
 from filters.kalman.multiview import Sightings
-from filters.kalman.prediction import predictor
 from filters.kalman.track_gate import TrackGate
 from filters.kalman.triangulation import triangulate
-from toolkit.estimator import Setup
 from toolkit.models import stereo
+from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, simulate
 
 WINDOW, TRACKS = 6, 12
@@ -25,12 +23,11 @@ WINDOW, TRACKS = 6, 12
 def scene():
     """A window of exact clones and tracks of exact points seen from all of them, with ordinary noise."""
     sequence = simulate(replace(DRIVE, duration_s=1.5), 2)
-    setup = Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-    joint, carry = JointBelief(initial_belief(setup.prior, "twist")), predictor(setup)
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    joint = JointBelief(model.initial_belief(sequence.prior))
     for packet in list(sequence.packets())[:WINDOW]:
         if packet.motion is not None:
-            step = carry.step(joint.core, packet.motion)
-            joint.propagate(step, step.transition)
+            propagate(joint, model, AtLatestEstimates(), packet.motion)
         joint.clone(packet.index)
     rng = np.random.default_rng(0)
     ahead = np.stack([rng.uniform(14, 25, TRACKS), rng.uniform(-6, 6, TRACKS), rng.uniform(-2, 2, TRACKS)], axis=1)

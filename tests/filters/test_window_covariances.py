@@ -12,11 +12,11 @@ from filters.smart import Smart
 from filters.smoothing.indeterminate import without_gaps
 from filters.smoothing.lag_window import LagWindow
 from filters.smoothing.marginals import state_cov
-from filters.smoothing.motion import motion_graph
 from filters.smoothing.structureless import Sightings
 from filters.smoothing.window_solver import Solution, without_oldest
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
+from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -68,7 +68,7 @@ def assert_covs_agree(covs, expected, relative):
 @pytest.mark.parametrize("changed", [lambda s: s, with_gap, from_zero], ids=["whole", "gap", "from-zero"])
 def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(scenario, changed, monkeypatch):
     sequence = changed(simulate(scenario, 3))
-    motion, last = motion_graph(setup_of(sequence)), {}
+    motion, last = motion_model(sequence.noise, sequence.gravity_world), {}
     add = LagWindow.add
 
     def spied(window, grown, t_ns):

@@ -15,7 +15,7 @@ import pytest
 from toolkit.datasets import load_sequence
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
-from toolkit.models import factors, imu
+from toolkit.models import imu
 from toolkit.models.factors import B, V, X
 from toolkit.sequence import GRAVITY_WORLD, ImuMotion
 from toolkit.simulation import FLIGHT, noise_free, simulate
@@ -100,12 +100,12 @@ def test_noise_covariance_is_that_of_the_sampled_noise(motion):
         white = density * rng.standard_normal((motion.dt_s.size, 6)) / np.sqrt(motion.dt_s)[:, None]
         noisy = ImuMotion(motion.dt_s, motion.accel_mps2 + white[:, :3], motion.gyro_radps + white[:, 3:])
         errors[i] = end.error_to(predicted(imu.preintegrate(noisy, np.zeros(6), PARAMS), start))[:9]
-    normal = np.linalg.solve(np.linalg.cholesky(clean.cov[:9, :9]), errors.T)
+    normal = np.linalg.solve(np.linalg.cholesky(clean.noise[:9, :9]), errors.T)
     # The sample covariance of 2000 normal draws: each entry has a standard error of 0.022 or 0.032; five of them.
     # The midpoint rule shifts the white noise of the gyro by half a step, which is 1 / n of its effect at most.
     np.testing.assert_allclose(normal @ normal.T / draws, np.eye(9), atol=0.16 + 0.05)
     bias_walk = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3) ** 2 * motion.dt_s.sum()
-    np.testing.assert_allclose(clean.cov[9:, 9:], np.diag(bias_walk), rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(clean.noise[9:, 9:], np.diag(bias_walk), rtol=1e-9, atol=1e-18)
 
 
 def factor_in_filter_terms(factor: gtsam.NonlinearFactor, start: State, end: State, k: int) -> tuple[Array, ...]:
@@ -137,14 +137,14 @@ def test_filter_equals_gtsams_factor_on_every_interval_of_kitti00():
         preintegration = imu.preintegrate(packet.motion, prior.bias, params)
         step = imu.predict(preintegration, *start)
         end = State(step.T_world_imu, step.v_world, start.bias)
-        factor = factors.imu_factor(preintegration, packet.index)
+        factor = imu.imu_factor(preintegration, packet.index)
         residual, transition, noise = factor_in_filter_terms(factor, start, end, packet.index)
         # 1e-9 is the promise of docs; double precision gives 1e-14 on entries of the order of 1.
         np.testing.assert_allclose(residual, 0.0, atol=1e-9)
         np.testing.assert_allclose(step.transition, transition, rtol=0.0, atol=1e-9)
         # Variances of rotation, velocity and bias differ by many orders: compare correlations.
         sigma = np.sqrt(np.diag(noise))
-        np.testing.assert_allclose(step.cov / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=1e-9)
+        np.testing.assert_allclose(step.noise / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=1e-9)
         start, compared = end, compared + 1
     assert compared == sequence.frame_count - 1
 

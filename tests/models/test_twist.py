@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log
-from toolkit.models import factors, twist
+from toolkit.models import twist
 from toolkit.models.factors import B, X
 from toolkit.sequence import TwistMotion, TwistNoise
 from toolkit.simulation import DRIVE, simulate
@@ -123,7 +123,7 @@ def test_factor_equals_the_filters_prediction_on_every_interval_of_the_drive(dri
         if packet.motion is None:
             continue
         step = twist.integrate(packet.motion, BIAS, drive.noise)
-        factor, end = factors.twist_factor(step, BIAS, 5), start @ step.T_start_end
+        factor, end = twist.twist_factor(step, BIAS, 5), start @ step.T_start_end
         values = values_of(start, end, BIAS)
         d_start, d_end, d_bias = np.split(unwhitened(factor, values), [6, 12], axis=1)
         np.testing.assert_allclose(factor.unwhitenedError(values), 0.0, atol=1e-9)
@@ -143,7 +143,7 @@ def test_factor_jacobians_are_derivatives_away_from_the_prediction(motion, size,
     start = se3_exp(rng.standard_normal(6))
     end = start @ step.T_start_end @ se3_exp(size * rng.standard_normal(6))
     bias = BIAS + 0.1 * size * rng.standard_normal(3)
-    factor = factors.twist_factor(step, BIAS, 5)
+    factor = twist.twist_factor(step, BIAS, 5)
 
     def residual(delta: Array) -> Array:
         moved = values_of(start @ se3_exp(delta[:6]), end @ se3_exp(delta[6:12]), bias + delta[12:])
@@ -160,8 +160,8 @@ def test_factor_jacobians_are_derivatives_away_from_the_prediction(motion, size,
 
 def test_factor_and_walk_stand_between_the_right_variables():
     step = twist.integrate(TwistMotion(np.array([0.1]), np.ones((1, 3)), np.ones((1, 3))), BIAS, NOISE)
-    assert list(factors.twist_factor(step, BIAS, 5).keys()) == [X(4), X(5), B(4)]
-    walk = factors.gyro_bias_walk_factor(NOISE, 0.25, 5)
+    assert list(twist.twist_factor(step, BIAS, 5).keys()) == [X(4), X(5), B(4)]
+    walk = twist.gyro_bias_walk_factor(NOISE, 0.25, 5)
     assert list(walk.keys()) == [B(4), B(5)]
     np.testing.assert_allclose(walk.noiseModel().covariance(), twist.bias_walk_cov(NOISE, 0.25), rtol=1e-12, atol=1e-20)
     values = gtsam.Values()

@@ -1,15 +1,14 @@
-"""The shared models as GTSAM factors: what a filter predicts with is what a smoother's factors contain."""
+"""What graphs of every kind share: the keys, the stereo measurement as factors, priors, and marginal covariances."""
 
 from collections.abc import Iterator
+from itertools import chain
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.models import twist
-from toolkit.models.imu import Preintegration
-from toolkit.models.twist import TwistStep
-from toolkit.sequence import StereoFrame, StereoRig, TwistNoise
+from toolkit.sequence import StereoFrame, StereoRig
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 
@@ -37,40 +36,34 @@ class StereoFactors:
             )
 
 
-def imu_factor(preintegration: Preintegration, k: int) -> gtsam.NonlinearFactor:
-    """Return the factor from frame k - 1 to frame k on poses X, velocities V and biases B."""
-    return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), preintegration)
+def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam.NonlinearFactorGraph:
+    """Return the factor that holds several variables jointly at their values.
 
-
-def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFactor:
-    """Return the factor from pose X(k - 1) and gyro bias B(k - 1) (3,) to pose X(k).
-
-    The residual is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``. ``step``
-    was integrated with the bias ``step_bias`` (3,); the change with another bias is first order, as in a
-    preintegration.
+    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces and ``blocks`` says where each key's stand in it:
+    what the errors have in common says as much as their variances.
     """
-    predicted, d_step_d_bias = gtsam.Pose3(step.T_start_end), step.d_step_d_bias
-    noise = gtsam.noiseModel.Gaussian.Covariance(step.cov)
-
-    def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        start, end, bias_key = this.keys()
-        correction = gtsam.Pose3.Expmap(d_step_d_bias @ (values.atVector(bias_key) - step_bias))
-        step_now = predicted.compose(correction)
-        moved = values.atPose3(start).between(values.atPose3(end))
-        error_pose = step_now.between(moved)
-        error: Array = gtsam.Pose3.Logmap(error_pose)
-        if jacobians is not None:
-            d_error_d_end = gtsam.Pose3.LogmapDerivative(error)
-            d_error_d_step = -d_error_d_end @ error_pose.inverse().AdjointMap()
-            jacobians[0] = d_error_d_step @ step_now.inverse().AdjointMap()
-            jacobians[1] = d_error_d_end
-            jacobians[2] = d_error_d_step @ d_step_d_bias
-        return error
-
-    return gtsam.CustomFactor(noise, [X(k - 1), X(k), B(k - 1)], residual)
+    root_information = np.linalg.inv(np.linalg.cholesky(cov))
+    terms = [(key, root_information[:, block]) for key, block in blocks.items()]
+    arguments: Any = [*chain.from_iterable(terms), np.zeros(len(cov)), gtsam.noiseModel.Unit.Create(len(cov))]
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.LinearContainerFactor(gtsam.JacobianFactor(*arguments), at))
+    return graph
 
 
-def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float, k: int) -> gtsam.NonlinearFactor:
-    """Return the random walk of the gyro bias from B(k - 1) to B(k), both (3,)."""
-    covariance = gtsam.noiseModel.Gaussian.Covariance(twist.bias_walk_cov(noise, dt_s))
-    return gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), covariance)
+class EliminatedGraph(Protocol):
+    """What knows its marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
+        """Return the joint marginal of some variables."""
+
+
+def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
+    """Return the joint covariance (d, d) of variables, in the order of the keys and in GTSAM's tangent spaces.
+
+    Only the path from the variables to the root of the Bayes tree is touched: for states that were eliminated last
+    that is next to nothing, however long the graph (Kaess & Dellaert 2009). Raises RuntimeError, as GTSAM does,
+    where the graph does not determine them.
+    """
+    marginal = tree.jointMarginalCovariance(keys)
+    cov = np.block([[marginal.at(i, j) for j in keys] for i in keys])
+    return np.asarray(0.5 * (cov + cov.T))

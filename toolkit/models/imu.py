@@ -1,35 +1,28 @@
-"""Raw-IMU motion through one preintegration that filter and smoother share (Forster et al. 2017, eqs. 26-38).
+"""Motion by raw IMU samples, through one preintegration that filter and smoother share.
 
 The preintegration is GTSAM's ``PreintegratedCombinedMeasurements``: the filter predicts with it, the smoother
-makes its ``CombinedImuFactor`` of the very same object, so both see the same residual, Jacobians and noise.
+makes its ``CombinedImuFactor`` of the very same object, so both see the same residual, Jacobians and noise
+(Forster et al. 2017, eqs. 26-38). The state is pose, velocity and both biases.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from toolkit.geometry import Array, so3_exp
-from toolkit.sequence import ImuMotion, ImuNoise
+from toolkit.estimate import Estimate
+from toolkit.geometry import Array, skew, so3_exp
+from toolkit.models.factors import B, V, X, joint_prior
+from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction
+from toolkit.sequence import ImuMotion, ImuNoise, Motion, Prior
+
+IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
+_VELOCITY = slice(6, 9)
 
 # GTSAM wants a position-integration noise of its own (m/s/sqrt(Hz)); this one is far below any accelerometer's.
 _INTEGRATION_DENSITY = 1e-6
 
 Preintegration = gtsam.PreintegratedCombinedMeasurements
-
-
-class ImuStep(NamedTuple):
-    """The state at the end of an interval and its first-order error.
-
-    ``T_world_imu`` (4, 4), ``v_world`` (3,) m/s; ``transition`` (15, 15) carries an error over the interval
-    and ``cov`` (15, 15) is what the interval adds, both in the order rotation, position, velocity (body
-    frame), accelerometer bias, gyro bias.
-    """
-
-    T_world_imu: Array
-    v_world: Array
-    transition: Array
-    cov: Array
 
 
 def preintegration_params(noise: ImuNoise, gravity_world: Array) -> gtsam.PreintegrationCombinedParams:
@@ -51,7 +44,7 @@ def preintegrate(motion: ImuMotion, bias: Array, params: gtsam.PreintegrationCom
     they are turned by half the step's rotation first. That makes the integration second order: 20 s of a
     200 Hz flight drift by 1 mm instead of 9 cm.
     """
-    preintegration = Preintegration(params, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+    preintegration = Preintegration(params, constant_bias(bias))
     half_turns = so3_exp(0.5 * motion.dt_s[:, None] * (motion.gyro_radps - bias[3:]))
     accel_mps2 = (half_turns @ (motion.accel_mps2 - bias[:3])[..., None])[..., 0] + bias[:3]
     for accel, gyro, dt_s in zip(accel_mps2, motion.gyro_radps, motion.dt_s.tolist(), strict=True):
@@ -59,13 +52,118 @@ def preintegrate(motion: ImuMotion, bias: Array, params: gtsam.PreintegrationCom
     return preintegration
 
 
-def predict(preintegration: Preintegration, T_world_imu: Array, v_world: Array, bias: Array) -> ImuStep:
+def predict(preintegration: Preintegration, T_world_imu: Array, v_world: Array, bias: Array) -> Prediction:
     """Carry a state (pose (4, 4), velocity (3,) m/s, bias (6,)) over the preintegrated interval."""
     state = gtsam.NavState(gtsam.Pose3(T_world_imu), v_world)
     d_state, d_bias = np.zeros((9, 9), order="F"), np.zeros((9, 6), order="F")
-    predicted = preintegration.predict(state, gtsam.imuBias.ConstantBias(bias[:3], bias[3:]), d_state, d_bias)
+    predicted = preintegration.predict(state, constant_bias(bias), d_state, d_bias)
     transition = np.eye(15)
     transition[:9, :9], transition[:9, 9:] = d_state, d_bias
-    return ImuStep(
-        predicted.pose().matrix(), predicted.velocity(), transition, np.asarray(preintegration.residualCovariance())
-    )
+    noise = np.asarray(preintegration.residualCovariance())
+    return Prediction(predicted.pose().matrix(), predicted.velocity(), transition, noise)
+
+
+def imu_factor(preintegration: Preintegration, k: int) -> gtsam.NonlinearFactor:
+    """Return the factor from frame k - 1 to frame k on poses X, velocities V and biases B."""
+    return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), preintegration)
+
+
+def constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:
+    """Return GTSAM's value for a bias (6,) [accel, gyro]."""
+    return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
+
+
+@dataclass(frozen=True, eq=False)
+class ImuIncrement:
+    """The preintegrated samples between two frames, their duration, and gravity (3,) m/s^2 in the world."""
+
+    preintegration: Preintegration
+    dt_s: float
+    gravity_world: Array
+
+    def predict(self, start: Belief) -> Prediction:
+        """Carry a state over the interval."""
+        return predict(self.preintegration, start.T_world_imu, start.v_world, start.bias)
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``.
+
+        The blocks of the biases stay as predicted; those of pose and velocity are the exact derivatives at both means
+        (Li & Mourikis 2013, section 4).
+        """
+        dt_s = self.dt_s
+        to_start = start.T_world_imu[:3, :3].T
+        turned_back = end.T_world_imu[:3, :3].T @ start.T_world_imu[:3, :3]
+        fallen = start.v_world * dt_s + 0.5 * self.gravity_world * dt_s**2
+        moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
+        accelerated = to_start @ (end.v_world - start.v_world - self.gravity_world * dt_s)
+        transition = end.transition.copy()
+        transition[ROTATION, ROTATION] = turned_back
+        transition[POSITION, :9] = turned_back @ np.hstack([-skew(moved), np.eye(3), dt_s * np.eye(3)])
+        transition[_VELOCITY, :9] = turned_back @ np.hstack([-skew(accelerated), np.zeros((3, 3)), np.eye(3)])
+        return transition
+
+    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return the preintegrated factor between two states."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(imu_factor(self.preintegration, k))
+        return graph
+
+
+class ImuModel:
+    """Pose, velocity and both biases, moved by specific force and turn rate."""
+
+    layout = IMU_LAYOUT
+
+    def __init__(self, noise: ImuNoise, gravity_world: Array) -> None:
+        self._params = preintegration_params(noise, gravity_world)
+        self._gravity_world = gravity_world
+
+    def initial_belief(self, prior: Prior) -> Belief:
+        """Return the belief at the first frame: all of the prior."""
+        return Belief.of_prior(prior, self.layout)
+
+    def integrate(self, motion: Motion, bias: Array) -> ImuIncrement:
+        """Preintegrate the samples between two frames about a bias (6,)."""
+        assert isinstance(motion, ImuMotion)
+        preintegration = preintegrate(motion, bias, self._params)
+        return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
+
+    def keys(self, k: int) -> list[int]:
+        """Return the keys of pose, velocity in the world (3,) and biases."""
+        return [X(k), V(k), B(k)]
+
+    def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
+        """Add state k at an estimate."""
+        assert estimate.bias is not None and estimate.v_world is not None
+        values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
+        values.insert(V(k), estimate.v_world)
+        values.insert(B(k), constant_bias(estimate.bias))
+
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        """Return state k."""
+        pose, velocity, bias = values.atPose3(X(k)), values.atVector(V(k)), values.atConstantBias(B(k))
+        return Estimate(t_ns, pose.matrix(), v_world=velocity, bias=bias.vector())
+
+    def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return what holds state k at a belief."""
+        at = gtsam.Values()
+        at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
+        at.insert(V(k), belief.v_world)
+        at.insert(B(k), constant_bias(belief.bias))
+        to_world = _with_velocity_turned(belief.T_world_imu[:3, :3])
+        blocks = {X(k): POSE, V(k): _VELOCITY, B(k): self.layout.biases}
+        return joint_prior(at, blocks, to_world @ belief.cov @ to_world.T)
+
+    def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
+        """Return the covariance (15, 15) with the velocity's error in the body frame, exactly symmetric."""
+        to_body = _with_velocity_turned(R_world_imu.T)
+        cov = to_body @ cov @ to_body.T
+        return np.asarray(0.5 * (cov + cov.T))
+
+
+def _with_velocity_turned(rotation: Array) -> Array:
+    """Return the matrix (15, 15) that turns the velocity's error by a rotation (3, 3) and leaves the others."""
+    turned = np.eye(15)
+    turned[_VELOCITY, _VELOCITY] = rotation
+    return turned

@@ -1,15 +1,22 @@
-"""Pose kinematics driven by a measured body twist, with an optional gyro bias (Kang, eqs. 1-2).
+"""Motion by a measured body twist, with a gyro bias (Kang, eqs. 1-2): its integration, its factors, its model.
 
 The pose moves by T <- T exp(dt [w - b, v]); everything is in GTSAM's order [rotation, position] and perturbed
-on the right.
+on the right. The state is pose and gyro bias; the velocity is measured, not estimated.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import gtsam
 import numpy as np
 
+from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_right_jacobian
-from toolkit.sequence import TwistMotion, TwistNoise
+from toolkit.models.factors import B, X, joint_prior
+from toolkit.models.state import POSE, Belief, Layout, Prediction
+from toolkit.sequence import Motion, Prior, TwistMotion, TwistNoise
+
+TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
 
 
 class TwistStep(NamedTuple):
@@ -43,3 +50,113 @@ def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> Twist
 def bias_walk_cov(noise: TwistNoise, dt_s: float) -> Array:
     """Return the covariance (3, 3) of the gyro bias' walk over an interval."""
     return np.diag(noise.gyro_random_walk**2 * dt_s)
+
+
+def twist_factor(step: TwistStep, step_bias: Array, k: int) -> gtsam.NonlinearFactor:
+    """Return the factor from pose X(k - 1) and gyro bias B(k - 1) (3,) to pose X(k).
+
+    The residual is the pose error in the tangent of the predicted end, ``log(predicted^-1 T_k)``. ``step``
+    was integrated with the bias ``step_bias`` (3,); the change with another bias is first order, as in a
+    preintegration.
+    """
+    predicted, d_step_d_bias = gtsam.Pose3(step.T_start_end), step.d_step_d_bias
+    noise = gtsam.noiseModel.Gaussian.Covariance(step.cov)
+
+    def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
+        start, end, bias_key = this.keys()
+        correction = gtsam.Pose3.Expmap(d_step_d_bias @ (values.atVector(bias_key) - step_bias))
+        step_now = predicted.compose(correction)
+        moved = values.atPose3(start).between(values.atPose3(end))
+        error_pose = step_now.between(moved)
+        error: Array = gtsam.Pose3.Logmap(error_pose)
+        if jacobians is not None:
+            d_error_d_end = gtsam.Pose3.LogmapDerivative(error)
+            d_error_d_step = -d_error_d_end @ error_pose.inverse().AdjointMap()
+            jacobians[0] = d_error_d_step @ step_now.inverse().AdjointMap()
+            jacobians[1] = d_error_d_end
+            jacobians[2] = d_error_d_step @ d_step_d_bias
+        return error
+
+    return gtsam.CustomFactor(noise, [X(k - 1), X(k), B(k - 1)], residual)
+
+
+def gyro_bias_walk_factor(noise: TwistNoise, dt_s: float, k: int) -> gtsam.NonlinearFactor:
+    """Return the random walk of the gyro bias from B(k - 1) to B(k), both (3,)."""
+    covariance = gtsam.noiseModel.Gaussian.Covariance(bias_walk_cov(noise, dt_s))
+    return gtsam.BetweenFactorVector(B(k - 1), B(k), np.zeros(3), covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class TwistIncrement:
+    """The step between two frames and the gyro bias (3,) it was integrated about."""
+
+    step: TwistStep
+    gyro_bias: Array
+    noise: TwistNoise
+
+    def predict(self, start: Belief) -> Prediction:
+        """Carry a state over the interval."""
+        size, gyro_bias = TWIST_LAYOUT.size, TWIST_LAYOUT.gyro_bias
+        transition, noise = np.eye(size), np.zeros((size, size))
+        transition[POSE, POSE] = se3_adjoint(se3_inverse(self.step.T_start_end))
+        transition[POSE, gyro_bias] = self.step.d_step_d_bias
+        noise[POSE, POSE] = self.step.cov
+        noise[gyro_bias, gyro_bias] = bias_walk_cov(self.noise, self.step.dt_s)
+        return Prediction(start.T_world_imu @ self.step.T_start_end, start.v_world, transition, noise)
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        """Return the transition (9, 9) from the mean of ``start`` to that of ``end``."""
+        transition = end.transition.copy()
+        transition[POSE, POSE] = se3_adjoint(se3_inverse(end.T_world_imu) @ start.T_world_imu)
+        return transition
+
+    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return the step from pose to pose and the walk of the gyro bias."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(twist_factor(self.step, self.gyro_bias, k))
+        graph.add(gyro_bias_walk_factor(self.noise, self.step.dt_s, k))
+        return graph
+
+
+class TwistModel:
+    """Pose and gyro bias, moved by a measured twist."""
+
+    layout = TWIST_LAYOUT
+
+    def __init__(self, noise: TwistNoise) -> None:
+        self._noise = noise
+
+    def initial_belief(self, prior: Prior) -> Belief:
+        """Return the belief at the first frame: pose and gyro bias of the prior."""
+        return Belief.of_prior(prior, self.layout)
+
+    def integrate(self, motion: Motion, bias: Array) -> TwistIncrement:
+        """Integrate the twists between two frames about a bias (6,), of which the gyro's counts."""
+        assert isinstance(motion, TwistMotion)
+        return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
+
+    def keys(self, k: int) -> list[int]:
+        """Return the keys of pose and gyro bias (3,)."""
+        return [X(k), B(k)]
+
+    def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
+        """Add state k at an estimate."""
+        assert estimate.bias is not None
+        values.insert(X(k), gtsam.Pose3(estimate.T_world_imu))
+        values.insert(B(k), estimate.bias[3:])
+
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        """Return state k; its accelerometer bias is zero."""
+        bias = np.concatenate([np.zeros(3), values.atVector(B(k))])
+        return Estimate(t_ns, values.atPose3(X(k)).matrix(), bias=bias)
+
+    def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return what holds state k at a belief."""
+        at = gtsam.Values()
+        at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
+        at.insert(B(k), belief.bias[3:])
+        return joint_prior(at, {X(k): POSE, B(k): self.layout.gyro_bias}, belief.cov)
+
+    def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
+        """Return the covariance, made exactly symmetric: both sides use the same errors."""
+        return np.asarray(0.5 * (cov + cov.T))

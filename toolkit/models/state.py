@@ -1,10 +1,10 @@
-"""What a filter believes about the IMU: a mean on the manifold and a covariance in its tangent space.
+"""The state of the IMU as every model, filter and graph has it: where its blocks stand, its mean, its covariance.
 
 Errors follow GTSAM: the pose [rotation, position] and the velocity are perturbed in the body frame.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -17,16 +17,30 @@ ROTATION, POSITION, POSE = slice(0, 3), slice(3, 6), slice(0, 6)
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the blocks of an error state stand; a block that the state lacks is None."""
+    """Where the blocks of an error state stand; a block that the state lacks is None. The biases stand last."""
 
     size: int
     velocity: slice | None
     accel_bias: slice | None
     gyro_bias: slice
 
+    @property
+    def biases(self) -> slice:
+        """Return where all biases stand."""
+        return slice((self.accel_bias or self.gyro_bias).start, self.size)
 
-TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
-IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
+
+class Prediction(NamedTuple):
+    """A state carried over one interval.
+
+    ``T_world_imu`` (4, 4) and ``v_world`` (3,) m/s at its end; ``transition`` F (d, d) carries an error over the
+    interval and ``noise`` Q (d, d) is what the interval adds, both in the layout of the state. The biases stay.
+    """
+
+    T_world_imu: Array
+    v_world: Array
+    transition: Array
+    noise: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +53,14 @@ class Belief:
     bias: Array
     cov: Array
 
+    @classmethod
+    def of_prior(cls, prior: Prior, layout: Layout) -> Self:
+        """Return the belief at the first frame: the prior, cut to the blocks the layout has."""
+        velocity = [] if layout.velocity is None else [slice(6, 9)]
+        accel_bias = [] if layout.accel_bias is None else [slice(9, 12)]
+        kept = np.r_[(slice(0, 6), *velocity, *accel_bias, slice(12, 15))]
+        return cls(layout, prior.T_world_imu, prior.v_world, prior.bias, prior.cov[np.ix_(kept, kept)])
+
     def moved(self, delta: Array, cov: Array) -> "Belief":
         """Return the belief moved by an error (d,), with a new covariance made exactly symmetric."""
         v_world, bias = self.v_world, self.bias.copy()
@@ -50,22 +72,20 @@ class Belief:
         T_world_imu = self.T_world_imu @ se3_exp(delta[POSE])
         return replace(self, T_world_imu=T_world_imu, v_world=v_world, bias=bias, cov=0.5 * (cov + cov.T))
 
+    def predicted(self, prediction: Prediction) -> "Belief":
+        """Return the belief at the end of an interval: its mean as predicted, its covariance F P F^T + Q."""
+        F, Q = prediction.transition, prediction.noise
+        cov = F @ self.cov @ F.T + Q
+        return replace(self, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world, cov=0.5 * (cov + cov.T))
+
     def at(self, estimate: Estimate) -> "Belief":
-        """Return the belief that an estimate says; what the estimate lacks stays."""
+        """Return the belief that an estimate states; what the estimate lacks stays."""
         v_world = self.v_world if estimate.v_world is None else estimate.v_world
         bias = self.bias if estimate.bias is None else estimate.bias
         cov = self.cov if estimate.cov is None else estimate.cov
         return replace(self, T_world_imu=estimate.T_world_imu, v_world=v_world, bias=bias, cov=cov)
 
     def estimate(self, t_ns: int, **info: float) -> Estimate:
-        """Say the belief as an Estimate; a velocity is given only where it is part of the state."""
+        """Return the belief as an Estimate; a velocity is given only where it is part of the state."""
         v_world = None if self.layout.velocity is None else self.v_world
         return Estimate(t_ns, self.T_world_imu, self.cov, v_world, self.bias, info)
-
-
-def initial_belief(prior: Prior, motion_kind: Literal["twist", "imu"]) -> Belief:
-    """Return the belief at the first frame: the prior, cut to the blocks the motion model has."""
-    if motion_kind == "imu":
-        return Belief(IMU_LAYOUT, prior.T_world_imu, prior.v_world, prior.bias, prior.cov)
-    kept = np.r_[0:6, 12:15]
-    return Belief(TWIST_LAYOUT, prior.T_world_imu, prior.v_world, prior.bias, prior.cov[np.ix_(kept, kept)])

@@ -1,0 +1,137 @@
+"""Every motion model offers a filter and a graph the same state and the same motion."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from toolkit.estimate import Estimate
+from toolkit.geometry import se3_exp, se3_inverse, se3_log
+from toolkit.models.factors import joint_cov
+from toolkit.models.motion import motion_model, predicted
+from toolkit.models.state import Belief
+from toolkit.sequence import Packet, Sequence
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+each_motion = pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["twist", "imu"])
+K = 7
+
+
+def recorded(scenario) -> tuple[Sequence, Packet]:
+    sequence = simulate(replace(scenario, duration_s=2.0), 4)
+    return sequence, list(sequence.packets())[K]
+
+
+def some_belief(sequence: Sequence, seed: int = 0) -> Belief:
+    """Return a belief at an arbitrary attitude, whose errors are all correlated."""
+    rng = np.random.default_rng(seed)
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    first = model.initial_belief(sequence.prior)
+    sigma, mixed = np.sqrt(np.diag(first.cov)), rng.standard_normal((model.layout.size, 2 * model.layout.size))
+    cov = sigma[:, None] * (mixed @ mixed.T / mixed.shape[1]) * sigma
+    bias = first.bias + np.r_[np.zeros(3), 0.01 * rng.standard_normal(3)]
+    moved = replace(first, T_world_imu=se3_exp(rng.standard_normal(6)), bias=bias, cov=cov)
+    if model.layout.velocity is None:
+        return moved
+    return replace(moved, v_world=rng.standard_normal(3))
+
+
+@each_motion
+def test_what_is_inserted_is_read(scenario):
+    sequence, packet = recorded(scenario)
+    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
+    estimate = some_belief(sequence).estimate(packet.frame.t_ns)
+    model.insert(values, estimate, K)
+    read = model.read(values, K, packet.frame.t_ns)
+    assert set(values.keys()) == set(model.keys(K))
+    assert read.t_ns == estimate.t_ns
+    # A rotation passes through GTSAM's matrix unchanged.
+    np.testing.assert_allclose(read.T_world_imu, estimate.T_world_imu, rtol=0.0, atol=1e-15)
+    np.testing.assert_array_equal(read.bias, estimate.bias)
+    assert (read.v_world is None) == (estimate.v_world is None)
+    if read.v_world is not None:
+        np.testing.assert_array_equal(read.v_world, estimate.v_world)
+
+
+@each_motion
+def test_a_held_state_has_the_covariance_it_is_held_with(scenario):
+    sequence, packet = recorded(scenario)
+    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
+    belief = some_belief(sequence)
+    model.insert(values, belief.estimate(packet.frame.t_ns), K)
+    cov = joint_cov(gtsam.Marginals(model.hold(belief, K), values), model.keys(K))
+    sigma = np.sqrt(np.diag(belief.cov))
+    in_estimate_order = model.estimate_cov(cov, belief.T_world_imu[:3, :3])
+    # Two inversions of a matrix whose condition, scaled to unit variances, is below 1e3.
+    assert np.abs((in_estimate_order - belief.cov) / np.outer(sigma, sigma)).max() < 1e-9
+
+
+@each_motion
+def test_a_prediction_is_what_the_graph_of_the_same_increment_says(scenario):
+    """The filter's F P F^T + Q is the marginal of the next state, and the predicted mean costs nothing."""
+    sequence, packet = recorded(scenario)
+    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
+    before = some_belief(sequence)
+    after = predicted(before, model, packet.motion)
+    model.insert(values, before.estimate(0), K - 1)
+    model.insert(values, after.estimate(1), K)
+    graph = model.hold(before, K - 1)
+    graph.push_back(model.integrate(packet.motion, before.bias).factors(K))
+    # Half the sum of squares of whitened residuals that are all rounding: micrometres over sigmas of micrometres.
+    assert graph.error(values) < 1e-9
+    cov = model.estimate_cov(joint_cov(gtsam.Marginals(graph, values), model.keys(K)), after.T_world_imu[:3, :3])
+    sigma = np.sqrt(np.diag(after.cov))
+    # GTSAM's factor works about the end's residual: the two covariances agree to the condition of Q.
+    assert np.abs((cov - after.cov) / np.outer(sigma, sigma)).max() < 1e-6
+
+
+@each_motion
+def test_the_transition_between_a_prediction_and_its_own_start_is_the_predictions(scenario):
+    sequence, packet = recorded(scenario)
+    model, belief = motion_model(sequence.noise, sequence.gravity_world), some_belief(sequence)
+    increment = model.integrate(packet.motion, belief.bias)
+    prediction = increment.predict(belief)
+    # Both are exact derivatives at the same states; positions of metres leave rounding of 1e-15 each.
+    np.testing.assert_allclose(increment.transition_between(belief, prediction), prediction.transition, atol=1e-12)
+
+
+@each_motion
+def test_a_turn_and_a_shift_of_the_world_pass_through_first_estimates(scenario):
+    """Between any two states the transition takes the gauge's error at one to the gauge's error at the other."""
+    sequence, packet = recorded(scenario)
+    model, belief = motion_model(sequence.noise, sequence.gravity_world), some_belief(sequence)
+    increment = model.integrate(packet.motion, belief.bias)
+    end = increment.predict(belief)
+    start = some_belief(sequence, seed=1)
+    F = increment.transition_between(start, end)
+    there = replace(start, T_world_imu=end.T_world_imu, v_world=end.v_world)
+    np.testing.assert_allclose(F @ gauge(start), gauge(there), atol=1e-9)
+
+
+def gauge(belief: Belief) -> np.ndarray:
+    """Return the errors (d, 4) of a belief when the world is shifted along x, y, z and turned about z."""
+    to_body, up = belief.T_world_imu[:3, :3].T, np.array([0.0, 0.0, 1.0])
+    directions = np.zeros((belief.layout.size, 4))
+    directions[3:6, :3], directions[:3, 3] = to_body, to_body @ up
+    directions[3:6, 3] = to_body @ np.cross(up, belief.T_world_imu[:3, 3])
+    if belief.layout.velocity is not None:
+        directions[belief.layout.velocity, 3] = to_body @ np.cross(up, belief.v_world)
+    return directions
+
+
+@each_motion
+def test_without_a_motion_a_belief_stays_as_it_is(scenario):
+    sequence, _ = recorded(scenario)
+    belief = some_belief(sequence)
+    assert predicted(belief, motion_model(sequence.noise, sequence.gravity_world), None) is belief
+
+
+@each_motion
+def test_a_belief_takes_over_what_an_estimate_states(scenario):
+    sequence, _ = recorded(scenario)
+    belief, other = some_belief(sequence), some_belief(sequence, seed=1)
+    assert belief.at(Estimate(0, other.T_world_imu)).bias is belief.bias
+    taken = belief.at(other.estimate(0))
+    assert np.abs(se3_log(se3_inverse(taken.T_world_imu) @ other.T_world_imu)).max() < 1e-15
+    np.testing.assert_array_equal(taken.cov, other.cov)

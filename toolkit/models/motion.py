@@ -1,0 +1,81 @@
+"""What moves the IMU between two frames, for filters and smoothers alike; nobody else asks which kind of motion it is.
+
+A motion model integrates what was measured between two frames, once, about a bias. A filter predicts from that
+increment (mean, F, Q), a smoother makes its factors of the same one. There is one implementation a file:
+:mod:`toolkit.models.twist` and :mod:`toolkit.models.imu`.
+"""
+
+from typing import Protocol
+
+import gtsam
+
+from toolkit.estimate import Estimate
+from toolkit.geometry import Array
+from toolkit.models.imu import ImuModel
+from toolkit.models.state import Belief, Layout, Prediction
+from toolkit.models.twist import TwistModel
+from toolkit.sequence import Motion, MotionNoise, Prior, TwistNoise
+
+
+class Increment(Protocol):
+    """The measured motion between two frames, integrated about a bias."""
+
+    def predict(self, start: Belief) -> Prediction:
+        """Carry a state, whose bias is the increment's, over the interval."""
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        """Return the transition (d, d) linearised at other states than ``end`` was predicted from.
+
+        From the mean of ``start`` to that of ``end``: with the first estimates of both instants, errors
+        of the unobservable heading and position stay unobservable (Li & Mourikis 2013, section 4).
+        """
+
+    def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return what ties state k - 1 to state k in a graph."""
+
+
+class MotionModel(Protocol):
+    """The state that one kind of motion needs, and how it moves."""
+
+    @property
+    def layout(self) -> Layout:
+        """Return where the blocks of the error state stand."""
+
+    def initial_belief(self, prior: Prior) -> Belief:
+        """Return the belief at the first frame."""
+
+    def integrate(self, motion: Motion, bias: Array) -> Increment:
+        """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
+
+    def keys(self, k: int) -> list[int]:
+        """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""
+
+    def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
+        """Add state k at an estimate."""
+
+    def read(self, values: gtsam.Values, k: int, t_ns: int) -> Estimate:
+        """Return state k, without a covariance."""
+
+    def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
+        """Return what holds state k at a belief: one linear factor on all its variables."""
+
+    def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
+        """Return the covariance (d, d) of a state's variables in GTSAM's tangent spaces as that of an Estimate.
+
+        A velocity is a vector in the world to GTSAM and an error in the body frame to an Estimate; ``R_world_imu``
+        (3, 3) is the state's own attitude.
+        """
+
+
+def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
+    """Return the model for the kind of motion whose noise this is; ``gravity_world`` (3,) m/s^2."""
+    if isinstance(noise, TwistNoise):
+        return TwistModel(noise)
+    return ImuModel(noise, gravity_world)
+
+
+def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:
+    """Return the belief carried over a measured motion; as it is where there was none, before the first frame."""
+    if motion is None:
+        return belief
+    return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
