@@ -97,6 +97,19 @@ def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequenc
     assert "world is its own" in scores.notes["nees_pose_mean"]
 
 
+@pytest.mark.parametrize(("motion", "tilt_is_an_error"), [("imu", True), ("twist", False)])
+def test_a_tilted_start_counts_where_an_imu_measures_the_vertical(
+    make_sequence, make_run, drive, motion, tilt_is_an_error
+):
+    """Placed by the whole pose, an IMU's run would have its tilt, which it states to 3 mrad, given away."""
+    sequence = make_sequence(drive(200), track_count=3, motion=motion)
+    tilted = se3_exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])) @ drive(200)
+    _, orientation, position, _ = nees(stating(make_run, sequence, tilted, np.broadcast_to(COV, (200, 6, 6))), sequence)
+    # (0.05 rad / 0.003 rad)^2 / 3 = 93; along 200 m the position is off by 10 m and more. Else rounding is left.
+    assert (orientation > 50.0) == (position > 50.0) == tilt_is_an_error
+    assert tilt_is_an_error or max(orientation, position) < 1e-12
+
+
 def test_a_world_of_its_own_needs_the_truth_of_its_first_pose(make_sequence, make_run, drive):
     sequence = make_sequence(drive(50), track_count=3)
     late = replace(sequence, truth=Truth(sequence.truth.t_ns[20:], sequence.truth.T_world_imu[20:]))
