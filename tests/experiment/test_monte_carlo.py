@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toolkit.experiment.monte_carlo import mean_nees, spread_of
+from toolkit.report.seeds_md import seeds_report, seeds_text
 
 from toolkit.datasets import is_drawn_from_a_seed
-from toolkit.experiment.monte_carlo import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.metrics_json import to_text
-from toolkit.report.seeds_md import seeds_report, seeds_text
 
 
 def test_spread_is_numpys():

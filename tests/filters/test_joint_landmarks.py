@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from filters.kalman.belief import initial_belief
 
 from filters.kalman import iterated, joint_landmarks
-from filters.kalman.belief import initial_belief
 from filters.kalman.diagnostics import Innovation
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates

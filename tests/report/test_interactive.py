@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 from matplotlib.figure import Figure
+from toolkit.experiment.monte_carlo import OverSeeds
+from toolkit.report.comparison import Comparison
+from toolkit.report.interactive import columns_of, compare, compare_over_seeds, figures, table
 
 from toolkit.audit import faults
 from toolkit.datasets import load_sequence
 from toolkit.errors import VislamError
 from toolkit.estimator import LADDER, find
-from toolkit.experiment.monte_carlo import OverSeeds
-from toolkit.report.comparison import Comparison
-from toolkit.report.interactive import columns_of, compare, compare_over_seeds, figures, table
 from toolkit.report.table import comparison_table
 
 FRAMES = 20

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from toolkit.report.comparison import Comparison, Row
 
 from toolkit.errors import VislamError
 from toolkit.estimator import discover
 from toolkit.metrics import Scores, known_metrics
-from toolkit.report.comparison import Comparison, Row
 from toolkit.report.report_md import report_text
 from toolkit.report.table import Table, as_markdown, as_text, change_lines, comparison_table, heading, shown_metrics
 from toolkit.report.terminal import comparison_text
