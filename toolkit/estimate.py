@@ -147,6 +147,9 @@ class Run:
 
     @property
     def final_is_causal(self) -> bool:
-        """Say whether the final word is what was said at each frame, as a filter's is."""
+        """Say whether the final output repeats the causal one, poses and covariances, as a filter's does."""
         causal, final = self.causal, self.final
-        return causal is not None and final is not None and np.array_equal(causal.T_world_imu, final.T_world_imu)
+        if causal is None or final is None or not np.array_equal(causal.T_world_imu, final.T_world_imu):
+            return False
+        covs = (causal.cov, final.cov)
+        return all(cov is None for cov in covs) or (all(cov is not None for cov in covs) and np.array_equal(*covs))
