@@ -151,5 +151,6 @@ class Run:
         causal, final = self.causal, self.final
         if causal is None or final is None or not np.array_equal(causal.T_world_imu, final.T_world_imu):
             return False
-        covs = (causal.cov, final.cov)
-        return all(cov is None for cov in covs) or (all(cov is not None for cov in covs) and np.array_equal(*covs))
+        if causal.cov is None or final.cov is None:
+            return causal.cov is final.cov
+        return np.array_equal(causal.cov, final.cov, equal_nan=True)

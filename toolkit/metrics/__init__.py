@@ -1,7 +1,8 @@
 """Score a run. Every module here is a metric file, found by being here; other packages bring more of them.
 
 A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with all that tables and files
-say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``.
+say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why
+its metrics belong to the causal output alone, where they do.
 Read :mod:`toolkit.metrics._shared.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
@@ -31,6 +32,7 @@ __all__ = [
     "evaluate",
     "known_metrics",
     "metrics_called",
+    "repeated",
     "score_run",
     "unavailable",
 ]
