@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.reprojection import median_one_step_px
+from toolkit.audit.parts.intervals import Intervals, median_one_step_px
 from toolkit.audit.parts.robust import spread
 from toolkit.geometry import Array, se3
 from toolkit.sequence import Sequence

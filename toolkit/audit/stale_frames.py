@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.neighbours import Neighbours, neighbours
-from toolkit.audit.parts.tracks import by_track, split
+from toolkit.audit.parts.tracks import Neighbours, by_track, neighbours, split
 from toolkit.geometry import Array, BoolArray
 from toolkit.sequence import Observations, Sequence
 

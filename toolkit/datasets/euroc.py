@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.asl_table import columns_of, read_stamps, read_table
 from toolkit.datasets.io.euroc_calibration import (
     ACCEL_FACTOR,
     GYRO_FACTOR,
@@ -27,6 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth
 from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, interpolate_poses

@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid
-from toolkit.datasets.io.stamps import stamps_ns
-from toolkit.datasets.io.stereo_rows import observations
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid, observations, stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma

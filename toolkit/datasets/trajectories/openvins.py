@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.stamps import stamps_ns
+from toolkit.datasets.io.fields import stamps_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.estimate import Trajectory
