@@ -110,7 +110,7 @@ def _sightings(fields: Fields, frame_count: int) -> Observations:
 def _measured_noise(fields: Fields, t_ns: IntArray, v_mps: Array, w_radps: Array) -> TwistNoise:
     """Return densities of twists of measured variance, each held over one median step: sigma sqrt(dt).
 
-    Samples that scatter more than the file says, because somebody added noise to them, are believed.
+    Where the samples scatter more than the file states, because noise was added to them, their scatter is used.
     """
     root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
     v_sigma = np.maximum(np.sqrt(fields.constant("v_var", 3, 1)[:, 0]), white_sigma(v_mps))

@@ -11,7 +11,7 @@ from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, TwistSamples, check_runnable
 
-# With fewer intervals than this the camera has no say.
+# With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30
 
 
@@ -31,7 +31,7 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Put both side by side; None where too few intervals are known for a verdict."""
+    """Put both side by side; None where too few intervals are known."""
     rows = np.flatnonzero(camera.known)
     if rows.size < LEAST_INTERVALS:
         return None

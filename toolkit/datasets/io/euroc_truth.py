@@ -23,7 +23,7 @@ from toolkit.sequence import ImuSamples, Truth
 # Long enough that the noise of single truth poses hardly counts, short enough that the gyro's mean is the rotation.
 _STEP_NS = NS_PER_S // 10
 _AXES = "xyz"
-# Position, quaternion, velocity, gyro bias and accelerometer bias, in the data set's words and in vicon2gt's.
+# Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
 _HEADINGS = (
     (
         tuple(f"p_RS_R_{a}" for a in _AXES) + tuple(f"q_RS_{a}" for a in "xyzw"),
@@ -38,14 +38,14 @@ _HEADINGS = (
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The truth to use, and in words which it is and why."""
+    """The truth to use, and a sentence with its file and the reason."""
 
     truth: Truth
     reason: str
 
 
 def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
-    """Return the truth of a recording; of several, the one that turns most nearly as the gyro says.
+    """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
 
     Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged.
     """
@@ -60,9 +60,9 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
     best, least = ranked[0]
     if not np.isfinite(least):
         raise DataError(f"{best}: the truth and the IMU share no 0.2 s; check that both are of one recording and clock")
-    told = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
+    scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
     among = "" if len(ranked) == 1 else ", the better of what the folder holds"
-    return Choice(found[best], f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {told})")
+    return Choice(found[best], f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters})")
 
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
@@ -102,7 +102,7 @@ def _read_csv(path: Path) -> Truth:
 def rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
     """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed.
 
-    A truth whose axes are not the IMU's turns about other axes than the gyro says. Infinite where the two share
+    A truth whose axes are not the IMU's rotates about other axes than the gyro measures. Infinite where the two share
     no 0.2 s.
     """
     sample_t_ns, gyro_radps = _usable(imu)

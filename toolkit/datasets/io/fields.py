@@ -141,7 +141,7 @@ def probable_unit(stamps_s: Array) -> str | None:
     step = float(np.median(np.abs(np.diff(stamps_s)))) if stamps_s.size > 1 else 0.0
     if largest < _LATEST_S and step < _LONGEST_STEP_S:
         return None
-    # Absolute stamps tell their unit by their size (the epoch began 1.3e9 to 1.8e9 s ago), relative ones by their step.
+    # The size of absolute stamps shows their unit (the epoch began 1.3e9 to 1.8e9 s ago), the step of relative ones.
     for scale, name in _UNITS:
         if largest * scale > 1e8 or step * scale > 1e-3:
             return name

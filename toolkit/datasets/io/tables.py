@@ -70,7 +70,7 @@ def _first_sentence(error: ValueError) -> str:
 
 @dataclass(frozen=True, eq=False)
 class AslTable:
-    """Rows of one table: stamps (N,) ns in the file's order, and the columns asked for (N, C)."""
+    """Rows of one table: stamps (N,) ns in the file's order, and the requested columns (N, C)."""
 
     t_ns: IntArray
     values: Array
@@ -105,10 +105,10 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
         raise DataError(f"{path}: not a text file; copy it again") from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    words = [line.partition(",")[0].strip() for line in lines if line.strip() and not line.startswith("#")]
-    if not words:
+    entries = [line.partition(",")[0].strip() for line in lines if line.strip() and not line.startswith("#")]
+    if not entries:
         raise DataError(f"{path}: holds no rows; copy the whole recording")
     try:
-        return np.array([int(word) for word in words], dtype=np.int64)
+        return np.array([int(entry) for entry in entries], dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: a stamp is not in whole nanoseconds ({error}); export it again") from error
