@@ -1,4 +1,4 @@
-"""Normalised innovation squared: does the filter believe its own residuals as much as it should?
+"""Normalised innovation squared: are the innovations as large as their stated covariance expects?
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
