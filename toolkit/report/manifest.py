@@ -3,18 +3,20 @@
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from msgspec import UNSET, UnsetType
 
 import toolkit
 from toolkit.experiment.monte_carlo import OverSeeds
 from toolkit.experiment.workers import usable_cpus
 from toolkit.report.comparison import Comparison
-from toolkit.report.metrics_json import Json
+from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
 
-SCHEMA = "vislam.manifest/1"
 _PACKAGES = {
     "toolkit": "vislam-toolkit",
     "numpy": "numpy",
@@ -26,54 +28,68 @@ _PACKAGES = {
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
 
 
-def build(comparison: Comparison, command: str, seed: int) -> Json:
+def manifest_document(comparison: Comparison, command: str, seed: int) -> Manifest:
     """Return the manifest of a comparison made by ``command`` with ``seed``."""
-    return {
-        **_made_by(command),
-        "sequence": _sequence(comparison.sequence),
-        "start": comparison.prior.source,
-        "estimators": [run.estimator for run in comparison.runs if run.timings is not None],
-        "references": [run.estimator for run in comparison.runs if run.timings is None],
-        "seeds": {"sequence": seed},
-        "threads": {"cpus": usable_cpus(), **{name: os.environ.get(name) for name in _THREAD_VARIABLES}},
-        **_machine(),
-    }
+    return _manifest(
+        command,
+        comparison.sequence,
+        start=comparison.prior.source,
+        estimators=tuple(run.estimator for run in comparison.runs if run.timings is not None),
+        references=tuple(run.estimator for run in comparison.runs if run.timings is None),
+        seeds=SeedsUsed(sequence=seed),
+        threads={name: os.environ.get(name) for name in _THREAD_VARIABLES},
+    )
 
 
-def build_over_seeds(over: OverSeeds, first: Sequence, command: str) -> Json:
+def seeds_manifest_document(over: OverSeeds, first: Sequence, command: str) -> Manifest:
     """Return the manifest of a comparison over seeds; ``first`` is the recording of the first seed."""
-    return {
-        **_made_by(command),
-        "sequence": _sequence(first),
-        "start": over.start,
-        "estimators": list(over.estimators),
-        "seeds": {"sequence": over.seeds[0], "count": len(over.seeds)},
-        "threads": {"cpus": usable_cpus(), "workers": over.workers, "per_worker": 1},
-        **_machine(),
-    }
+    return _manifest(
+        command,
+        first,
+        start=over.start,
+        estimators=over.estimators,
+        references=UNSET,
+        seeds=SeedsUsed(sequence=over.seeds[0], count=len(over.seeds)),
+        threads={"workers": over.workers, "per_worker": 1},
+    )
 
 
-def _made_by(command: str) -> Json:
-    return {
-        "schema": SCHEMA,
-        "command": command,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"python": platform.python_version(), **{name: _version(p) for name, p in _PACKAGES.items()}},
-        "git_revision": git_revision(Path(toolkit.__file__).parent),
-    }
+def _manifest(
+    command: str,
+    sequence: Sequence,
+    *,
+    start: str,
+    estimators: tuple[str, ...],
+    references: tuple[str, ...] | UnsetType,
+    seeds: SeedsUsed,
+    threads: Mapping[str, int | str | None],
+) -> Manifest:
+    """Return a manifest with what is asked of this machine and installation: versions, revision, processors."""
+    versions = {name: _version(package) for name, package in _PACKAGES.items()}
+    return Manifest(
+        schema="vislam.manifest/1",
+        command=command,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions={"python": platform.python_version(), **versions},
+        git_revision=git_revision(Path(toolkit.__file__).parent),
+        sequence=_recording(sequence),
+        start=start,
+        estimators=estimators,
+        references=references,
+        seeds=seeds,
+        threads={"cpus": usable_cpus(), **threads},
+        cpu=cpu_model(),
+        os=platform.platform(),
+    )
 
 
-def _sequence(sequence: Sequence) -> Json:
-    return {
-        "name": sequence.name,
-        "hash": sequence.content_hash(),
-        "format": sequence.provenance.format,
-        "source": sequence.provenance.source,
-    }
-
-
-def _machine() -> Json:
-    return {"cpu": cpu_model(), "os": platform.platform()}
+def _recording(sequence: Sequence) -> Recording:
+    return Recording(
+        name=sequence.name,
+        hash=sequence.content_hash(),
+        format=sequence.provenance.format,
+        source=sequence.provenance.source,
+    )
 
 
 def git_revision(package: Path) -> str | None:

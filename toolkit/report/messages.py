@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 from toolkit.audit import Finding
 from toolkit.report.comparison import Comparison, Row
-from toolkit.report.metrics_json import path_length_m
+from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import COLUMNS
 from toolkit.sequence import Sequence
 

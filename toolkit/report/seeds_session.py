@@ -1,6 +1,5 @@
 """From a simulated source to a run directory over many seeds; what ``vislam compare --seeds`` does."""
 
-import json
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -10,13 +9,8 @@ from toolkit.estimator import EstimatorEntry, find_all
 from toolkit.experiment.monte_carlo import OverSeeds, in_order
 from toolkit.experiment.trial import Trial, sequence_of
 from toolkit.experiment.workers import outcomes_of
-from toolkit.files import check_parent, replaced_directory
-from toolkit.report import manifest, seeds_json, seeds_report_json
-from toolkit.report.figures import over_seeds as figures
-from toolkit.report.figures import save
-from toolkit.report.metrics_json import to_text
-from toolkit.report.run_directory import MANIFEST, REPORT, check_run_directory, is_run_directory
-from toolkit.report.seeds_md import seeds_report
+from toolkit.files import check_parent
+from toolkit.report.run_directory import check_run_directory, write_over_seeds
 from toolkit.report.session import STARTS, ProgressFor, Request, changes_of, unique_names
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -90,19 +84,3 @@ def run_over_seeds(
         changes=changes_of(request, entries),
     )
     return over, first
-
-
-def write_over_seeds(over: OverSeeds, first: Sequence, target: Path, *, command: str) -> None:
-    """Write the run directory of a comparison over seeds, in the place of an earlier one if there is one.
-
-    Raises OutputError where ``target`` cannot be written or holds something else; nothing is left behind then.
-    """
-    with replaced_directory(target, is_run_directory) as directory:
-        (directory / "seeds.json").write_text(to_text(seeds_json.build(over)), encoding="utf-8")
-        report = json.dumps(seeds_report_json.build(over), allow_nan=False) + "\n"
-        (directory / REPORT).write_text(report, encoding="utf-8")
-        (directory / "figures").mkdir()
-        captions = save(figures.draw(over), directory / "figures")
-        (directory / "report.md").write_text(seeds_report(over, captions), encoding="utf-8")
-        told = manifest.build_over_seeds(over, first, command)
-        (directory / MANIFEST).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")

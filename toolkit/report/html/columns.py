@@ -3,7 +3,6 @@
 from typing import Any, Literal
 
 from toolkit.metrics import describe
-from toolkit.report.metrics_json import METRIC_KEYS
 from toolkit.report.table import COLUMNS
 
 Best = Literal["least", "most", "one", ""]
@@ -56,7 +55,7 @@ def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
     """Return the columns of the table in its order: the usual ones first, then every other metric."""
     usual = {column.key: column for column in COLUMNS}
     meanings = describe()
-    others = [key for key in (*METRIC_KEYS, *sorted(keys_present - set(METRIC_KEYS))) if key not in usual]
+    others = [key for key in (*meanings, *sorted(keys_present - meanings.keys())) if key not in usual]
     return [
         {
             "key": key,
