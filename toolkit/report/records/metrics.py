@@ -38,7 +38,7 @@ PROMISED_KEYS = (
     "cpu_s",
     "peak_rss_mb",
 )
-_PROMISED = {"required": list(PROMISED_KEYS)}
+ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
 
 MotionKind = Literal["twist", "imu"]
 Motion = Annotated[MotionKind, Meta(description="body velocities or raw IMU between the frames")]
@@ -85,7 +85,7 @@ class ScoredRun(Struct, frozen=True, kw_only=True):
     status: Annotated[
         Status, Meta(description="ran to a plausible end; ran to the end and left what is plausible; could not go on")
     ]
-    metrics: Annotated[dict[str, Value], Meta(description="by metric key", extra_json_schema=_PROMISED)]
+    metrics: Annotated[dict[str, Value], ALL_PROMISED]
     notes: Notes
     log: Annotated[tuple[str, ...], Meta(description="what the estimator had to recover from")]
 

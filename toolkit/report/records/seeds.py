@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.estimate import Output, Status
-from toolkit.report.records.metrics import PROMISED_KEYS, Count, Motion, Notes, Value, check_promised
+from toolkit.report.records.metrics import ALL_PROMISED, Count, Motion, Notes, Value, check_promised
 
 
 class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
@@ -57,10 +57,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
     ) = UNSET
     status: Annotated[tuple[Status, ...], Meta(description="one a seed")]
     counts: Annotated[dict[Status, Count], Meta(description="how many seeds ended each way")]
-    metrics: Annotated[
-        dict[str, MetricOverSeeds],
-        Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)}),
-    ]
+    metrics: Annotated[dict[str, MetricOverSeeds], ALL_PROMISED]
     notes: Notes
     over_seeds: WholeRuns
 
