@@ -10,11 +10,15 @@ from toolkit.experiment.monte_carlo import mean_nees, spread_of
 from toolkit.report.seeds_md import seeds_report, seeds_text
 
 from toolkit.datasets import is_drawn_from_a_seed
+from toolkit.documents import parse, to_text
+from toolkit.errors import DataError
+from toolkit.experiment.monte_carlo import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
-from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
-from toolkit.report.metrics_json import to_text
+from toolkit.report.records import Seeds
+from toolkit.report.scores_json import seeds_document
+from toolkit.report.seeds_md import seeds_report, seeds_text
 
 
 def test_spread_is_numpys():
@@ -76,11 +80,14 @@ def test_an_estimator_without_any_answer_keeps_a_line(over):
 
 @pytest.fixture
 def document(over):
-    return json.loads(to_text(seeds_json.build(over)))
+    return json.loads(to_text(seeds_document(over)))
 
 
-def test_seeds_json_obeys_its_schema(document):
-    assert seeds_json.violations(document) == []
+def test_seeds_json_is_read_back(over):
+    assert parse(to_text(seeds_document(over)), Seeds) == seeds_document(over)
+
+
+def test_seeds_json_has_every_metric_and_every_seed(document):
     assert list(document["runs"][0]["metrics"]) == list(describe())
     assert document["runs"][2]["status"] == ["ok", "diverged", "ok", "ok"]
     assert document["runs"][0]["over_seeds"]["nees_pose_band"] == list(nees_band(6, 4))
@@ -88,27 +95,33 @@ def test_seeds_json_obeys_its_schema(document):
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    ("spoil", "told"),
     [
-        lambda d: d.update(schema="vislam.seeds/2"),
-        lambda d: d.pop("runs"),
-        lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"),
-        lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(),
-        lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"),
-        lambda d: d["runs"][0]["counts"].update(ok=9),
-        lambda d: d["runs"][0]["status"].__setitem__(0, "fine"),
-        lambda d: d["runs"][3]["notes"].clear(),
+        (lambda d: d.update(schema="vislam.seeds/2"), "vislam.seeds/2"),
+        (lambda d: d.pop("runs"), "the document: lacks runs"),
+        (lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"), r"runs\[0\]: metrics.ate_se3_m is missing"),
+        (
+            lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(),
+            r"runs\[0\]: metrics.ate_none_m.values does not have an entry a seed",
+        ),
+        (
+            lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"),
+            r"runs\[0\].metrics.ate_none_m.mean: expected number or null, got string",
+        ),
+        (lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean=None), r"runs\[0\].metrics.ate_none_m: n is 4"),
+        (lambda d: d["runs"][0]["metrics"]["ate_none_m"].pop("most"), r"runs\[0\].metrics.ate_none_m: lacks most"),
+        (lambda d: d["runs"][0]["counts"].update(ok=9), r"runs\[0\]: counts does not count status"),
+        (lambda d: d["runs"][0]["status"].__setitem__(0, "fine"), r"runs\[0\].status\[0\]: cannot be 'fine'"),
+        (lambda d: d["runs"][3]["notes"].clear(), r"runs\[3\]: metrics.ate_none_m has no value, and notes"),
+        (lambda d: d["seeds"].pop(), "the document: hashes does not have an entry a seed"),
+        (lambda d: d["hashes"].append(d["seeds"].append(7)), r"runs\[0\].status does not have an entry a seed"),
     ],
 )
-def test_the_validator_notices(document, spoil):
+def test_a_spoilt_document_is_refused_with_the_place(document, spoil, told):
     spoiled = copy.deepcopy(document)
     spoil(spoiled)
-    assert seeds_json.violations(spoiled)
-
-
-@pytest.mark.parametrize("document", [None, [], {"runs": [3], "seeds": [1]}])
-def test_the_validator_survives_anything(document):
-    assert seeds_json.violations(document)
+    with pytest.raises(DataError, match=told):
+        parse(json.dumps(spoiled), Seeds)
 
 
 def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):

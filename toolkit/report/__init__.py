@@ -1,4 +1,4 @@
 """What a comparison leaves behind: the table, the JSON contract, trajectories, figures and the manifest.
 
-Reading order: session -> comparison -> table -> metrics_json -> run_directory -> figures.
+Reading order: session -> comparison -> table -> records -> scores_json -> run_directory -> figures.
 """

@@ -1,23 +1,62 @@
 """The files a check of the gate leaves behind: JUnit XML, Markdown and JSON, each only where it is asked for."""
 
+import math
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-import toolkit
+from toolkit.documents import to_text
 from toolkit.errors import OutputError
 from toolkit.files import check_parent, replaced_file
-from toolkit.gate.verdict import Check
-from toolkit.report.gate_json import gate_json
+from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.gate_junit import gate_junit
 from toolkit.report.gate_words import gate_markdown
 from toolkit.report.manifest import cpu_model, git_revision
-from toolkit.report.metrics_json import to_text
+from toolkit.report.records.check import CheckDocument, VerdictRecord
+
+
+def check_document(check: Check) -> CheckDocument:
+    """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
+    return CheckDocument(
+        schema="vislam.check/1",
+        baseline=check.baseline,
+        passed=check.passed,
+        failures=len(check.failures),
+        false_alarm_rate=check.false_alarm_rate,
+        tests=check.tests,
+        releases=dict(check.releases),
+        seconds=check.seconds,
+        notes=check.notes,
+        verdicts=tuple(_verdict(verdict) for verdict in check.verdicts),
+    )
+
+
+def _verdict(verdict: Verdict) -> VerdictRecord:
+    return VerdictRecord(
+        sequence=verdict.sequence,
+        estimator=verdict.estimator,
+        output=verdict.output,
+        metric=verdict.metric,
+        finding=verdict.finding,
+        words=verdict.words,
+        before=_finite(verdict.before),
+        after=_finite(verdict.after),
+        change_percent=_finite(verdict.change_percent),
+        allowed_percent=_finite(verdict.allowed_percent),
+        p=_finite(verdict.p),
+        seen_percent=_finite(verdict.seen_percent),
+        fails=verdict.fails,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
 
 WRITERS: Mapping[str, Callable[[Check], str]] = {
     "junit": gate_junit,
     "markdown": gate_markdown,
-    "json": lambda check: to_text(gate_json(check)),
+    "json": lambda check: to_text(check_document(check)),
 }
 
 
@@ -45,6 +84,6 @@ def made_here(command: str) -> dict[str, str]:
     return {
         "command": command,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git_revision": git_revision(Path(toolkit.__file__).parent) or "not from a checkout",
+        "git_revision": git_revision() or "not from a checkout",
         "cpu": cpu_model(),
     }
