@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.errors import OutputError
 from toolkit.report.gate_files import check_document, check_writable, write_check
-from toolkit.report.gate_words import gate_markdown, gate_text
+from toolkit.report.gate_text import gate_markdown, gate_text
 from toolkit.report.records import read_check
 
 

@@ -1,13 +1,16 @@
 """The run directory: everything one comparison leaves behind, written at once or not at all."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from toolkit.datasets.trajectories import tum
 from toolkit.documents import schema_name, to_line, to_text, told_schema
-from toolkit.estimate import Trajectory
-from toolkit.experiment.comparison import Comparison
+from toolkit.estimate import Landmarks, Trajectory
+from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
-from toolkit.files import check_replaceable, replaced_directory
+from toolkit.experiment.pipeline import Case
+from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.figures import drawn, save
 from toolkit.report.figures.alignment import truth_during
@@ -15,7 +18,6 @@ from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import metrics_document, seeds_document
-from toolkit.report.trajectory_files import write_landmarks, write_tum
 
 METRICS, SEEDS = "metrics.json", "seeds.json"
 REPORT, MANIFEST = "report.json", "manifest.json"
@@ -29,6 +31,32 @@ def check_run_directory(target: Path) -> None:
 def is_run_directory(directory: Path) -> bool:
     """Say whether a directory holds a manifest of ours; many programs write a file of that name."""
     return told_schema(directory / MANIFEST) == schema_name(Manifest)
+
+
+def directories_for(cases: Sequence[Case], out: Path) -> tuple[Path, ...]:
+    """Return the run directory of each case: ``out`` for a single one, else folders in it by the sequences' names.
+
+    Raises OutputError where one cannot be written or holds something else.
+    """
+    names = unique_names(case.name for case in cases)
+    directories = (out,) if len(names) == 1 else tuple(out / name for name in names)
+    if len(names) > 1:
+        check_parent(out)
+    for directory in directories:
+        check_run_directory(directory)
+    return directories
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Turn sequence names into directory names, all different; a second ``drive`` becomes ``drive-2``."""
+    taken: list[str] = []
+    for name in names:
+        plain = plain_name(name) or "sequence"
+        candidate, n = plain, 2
+        while candidate in taken:
+            candidate, n = f"{plain}-{n}", n + 1
+        taken.append(candidate)
+    return taken
 
 
 @dataclass(frozen=True)
@@ -63,13 +91,25 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
         (directory / folder).mkdir()
     truth = truth_during(comparison.sequence)
     if truth is not None:
-        write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
+        _write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
+            _write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
     for run in comparison.runs:
-        write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+        _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+
+
+def _write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory as a TUM file."""
+    path.write_text(tum.text(trajectory), encoding="utf-8")
+
+
+def _write_landmarks(landmarks: Landmarks, path: Path) -> None:
+    """Write landmarks as CSV, one a row: track id and position in the world in metres."""
+    rows = zip(landmarks.track_ids.tolist(), landmarks.points_world.tolist(), strict=True)
+    lines = [f"{track_id},{x:.15g},{y:.15g},{z:.15g}" for track_id, (x, y, z) in rows]
+    path.write_text("\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n", encoding="utf-8")
 
 
 def _write_text(path: Path, text: str) -> None:

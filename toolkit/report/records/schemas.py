@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from toolkit.documents import schema
-from toolkit.gate.baseline_json import BaselineRecord
+from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
 
 # By the name of the schema's file, without its ending.

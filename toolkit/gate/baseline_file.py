@@ -1,16 +1,22 @@
-"""A baseline as JSON that people can read and review: the values of all seeds of a metric on one line.
+"""A baseline as a file: JSON that people can read and review, the values of all seeds of a metric on one line.
 
-The contract is ``vislam.baseline/1`` (docs/gate.md).
+The contract is ``vislam.baseline/1`` (docs/gate.md). Whatever is wrong with a file is said in one line, with the place.
 """
 
 import json
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
+from toolkit import documents
 from toolkit.estimate import Output, Status
-from toolkit.gate.baseline import Baseline, Bounds, Case, Criterion, Measured, Series, Values, Worse
+from toolkit.gate import releases
+from toolkit.gate.baseline import Baseline, BaselineError, Bounds, Case, Criterion, Measured, Series, Values, Worse
+from toolkit.settings import changes_of, settings_of
+
+_REMEDY = "make the baseline with vislam baseline"
 
 Percent = Annotated[float, Meta(ge=0)]
 Seed = Annotated[int, Meta(ge=0)]
@@ -86,6 +92,40 @@ class BaselineRecord(Struct, frozen=True, kw_only=True):
     false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
     bounds: BoundsRecord
     sequences: Annotated[tuple[CaseRecord, ...], Meta(min_length=1)]
+    settings: Annotated[
+        dict[str, Any], Meta(description="those of every run that are no defaults; a default that changes is measured")
+    ] = {}
+
+
+def load_baseline(path: Path) -> Baseline:
+    """Read a baseline from its file, or from a folder the one made with the releases installed here.
+
+    Raises BaselineError where there is none, or it is not one.
+    """
+    if path.is_dir():
+        return _of_these_releases(path)
+    return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+
+
+def _of_these_releases(folder: Path) -> Baseline:
+    known = {path: load_baseline(path) for path in sorted(folder.glob("*.json"))}
+    fitting = {path: one for path, one in known.items() if not releases.differences(one.releases)}
+    if len(fitting) == 1:
+        return next(iter(fitting.values()))
+    here = ", ".join(f"{name} {release}" for name, release in releases.installed().items())
+    if not fitting:
+        raise BaselineError(f"{folder}: none of {len(known)} baselines is for {here}; make one with vislam baseline")
+    raise BaselineError(f"{folder}: {', '.join(path.name for path in fitting)} are all for {here}; name one of them")
+
+
+def check_releases(baseline: Baseline, name: str) -> None:
+    """Raise BaselineError where the baseline was made with other releases than are installed."""
+    others = releases.differences(baseline.releases)
+    if others:
+        raise BaselineError(
+            f"{name}: made with {'; '.join(others)}, which alone may change results; make a baseline with these "
+            "releases, or compare all the same with --allow-other-releases"
+        )
 
 
 def to_text(baseline: Baseline) -> str:
@@ -101,6 +141,7 @@ def document(baseline: Baseline) -> BaselineRecord:
         releases=dict(baseline.releases),
         false_alarm_rate=baseline.false_alarm_rate,
         bounds=_bounds_record(baseline.bounds),
+        settings=changes_of(baseline.settings),
         sequences=tuple(_case_record(case, measured) for case, measured in baseline.cases),
     )
 
@@ -113,6 +154,7 @@ def from_document(record: BaselineRecord) -> Baseline:
         _bounds(record.bounds),
         record.false_alarm_rate,
         {name: str(value) for name, value in record.made_by.items()},
+        settings_of(record.settings, "the baseline's settings"),
     )
 
 
