@@ -28,9 +28,9 @@ class RecordingFormat(Protocol):
     """A module that reads one kind of recording; the first line of its docstring is its summary."""
 
     def recognises(self, path: Path) -> bool:
-        """Say from a glance at the content, never from the name alone, whether the path is of this format.
+        """Return whether the path is of this format, from the beginning of its content and never from its name alone.
 
-        A damaged recording of the format should still be recognised: ``load`` then says what is wrong with it.
+        A damaged recording of the format should still be recognised, so that ``load`` can report what is wrong.
         """
 
     def load(self, path: Path) -> Sequence:

@@ -1,7 +1,8 @@
 """Score a run. Every module here is a metric file, found by being here; other packages bring more of them.
 
 A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with all that tables and files
-say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``.
+say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why
+its metrics belong to the causal output alone, where they do.
 Read :mod:`toolkit.metrics._shared.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
@@ -31,6 +32,7 @@ __all__ = [
     "evaluate",
     "known_metrics",
     "metrics_called",
+    "repeated",
     "score_run",
     "unavailable",
 ]
@@ -137,10 +139,28 @@ def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
     return Scores(values, notes)
 
 
+def repeated(causal: Scores) -> Scores:
+    """Return the scores of a final output that only repeats the causal one: the same, but what is causal alone."""
+    values, notes = dict(causal.values), dict(causal.notes)
+    for file in _found().files:
+        if reason := _causal_only(file):
+            keys = [metric.key for metric in file.METRICS]
+            values |= dict.fromkeys(keys)
+            notes |= dict.fromkeys(keys, reason)
+    return Scores(values, notes)
+
+
 def _score_file(file: MetricFile, evaluation: Evaluation) -> Scores:
     """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
     try:
+        if evaluation.output != "causal" and (reason := _causal_only(file)):
+            raise Unavailable(reason)
         return file.score(evaluation)
-    except Unavailable as reason:
+    except Unavailable as lacking:
         keys = [metric.key for metric in file.METRICS]
-        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(reason)))
+        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(lacking)))
+
+
+def _causal_only(file: MetricFile) -> str:
+    """Return why a file's metrics belong to the causal output alone; nothing where they do not."""
+    return str(getattr(file, "CAUSAL_ONLY", ""))

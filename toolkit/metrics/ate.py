@@ -75,7 +75,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def _tilt_remark(evaluation: Evaluation, scores: Scores) -> str:
-    """Say that the two worlds do not agree on the vertical, where an IMU measures it and it matters; else nothing."""
+    """Return a remark where the verticals disagree, an IMU measures them and that explains the error; else nothing."""
     se3_m, yaw_m = scores.values["ate_se3_m"], scores.values["ate_yaw_m"]
     if evaluation.sequence.motion_kind != "imu" or se3_m is None or yaw_m is None:
         return ""

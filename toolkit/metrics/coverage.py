@@ -1,4 +1,4 @@
-"""How much of the sequence the other numbers speak of."""
+"""Over how much of the sequence the other metrics are computed."""
 
 import numpy as np
 

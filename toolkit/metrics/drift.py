@@ -1,4 +1,4 @@
-"""Where the run ends: the distance between the last true and estimated positions, over the path."""
+"""End drift: the distance between the last true and estimated positions, over the path."""
 
 import numpy as np
 

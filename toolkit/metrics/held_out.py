@@ -1,6 +1,6 @@
-"""Held-out reprojection: tracks no estimator ever saw, each sighting predicted from the others of its track.
+"""Held-out reprojection: tracks no estimator is given, each sighting predicted from the others of its track.
 
-Needs no ground truth and cannot be won by overfitting: the points come from the estimated poses alone.
+Needs no ground truth, and overfitting does not lower it: the points come from the estimated poses alone.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ METRICS = (
         in_contract=True,
     ),
 )
-# With two other views at least, one that is wrong can be told from the motion.
+# Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
 FEWEST_VIEWS = 3
 
 

@@ -1,4 +1,4 @@
-"""In-sample reprojection: the estimator's own landmarks, seen from its own poses, against what it was given."""
+"""In-sample reprojection: the estimator's own landmarks, projected from its own poses, against its observations."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Normalised estimation error squared: is the error as large as the estimator says it is?
+"""Normalised estimation error squared: are the errors as large as the stated covariance expects?
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
@@ -50,7 +50,9 @@ METRICS = (
         in_contract=True,
     ),
 )
-_PLACED = "the estimate's world is its own: its first pose was placed on the truth's, whose noise there counts in full"
+_PLACED = (
+    "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
+)
 
 
 def score(evaluation: Evaluation) -> Scores:

@@ -1,4 +1,4 @@
-"""Normalised innovation squared: does the filter believe its own residuals as much as it should?
+"""Normalised innovation squared: are the innovations as large as their stated covariance expects?
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
@@ -9,6 +9,7 @@ from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 70
+CAUSAL_ONLY = "innovations belong to the causal output"
 METRICS = (
     Metric(
         "nis_mean",
@@ -29,8 +30,6 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def _nis_per_dof(evaluation: Evaluation) -> float:
-    if evaluation.output != "causal":
-        raise Unavailable("innovations belong to the causal output")
     nis, dof = evaluation.run.info.get("nis"), evaluation.run.info.get("nis_dof")
     if nis is None or dof is None:
         raise Unavailable("the estimator reports no innovations")

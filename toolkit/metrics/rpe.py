@@ -1,4 +1,4 @@
-"""Relative pose error over one second and over 100 metres: drift, whatever happened before.
+"""Relative pose error over one second and over 100 metres: drift, independent of earlier errors.
 
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
 """
@@ -37,7 +37,7 @@ METRICS = (
     ),
 )
 INTERVAL_M = 100.0
-# A pair may be longer than asked for by this much, or it spans a gap and is left out: 1.5 steps of the matched
+# A pair may be longer than the interval by this much; else it spans a gap and is left out: 1.5 steps of the matched
 # stamps for the second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as evo does).
 _LATEST_IN_STEPS = 1.5
 _LONGEST_OVER_INTERVAL = 1.1

@@ -15,10 +15,10 @@ class Metric:
 
     ``meaning`` is one line with the unit; ``unit`` is as it stands in a table, "1" for a ratio and "" for a count.
     ``heading`` are the two lines above its column, ``name`` the same in one line where it is not given. ``best`` is
-    which value is best: the least, the most, the one nearest 1, or none that is. ``table`` says when the table of a
-    comparison has a column for it unless it is asked for by name, ``over_seeds`` whether the table over seeds has.
+    which value is best: the least, the most, the one nearest 1, or none that is. ``table`` is when the table of a
+    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one.
     ``in_contract`` marks the keys that every ``vislam.metrics/1`` document has; it counts for the toolkit's own
-    metrics only. ``gate_name`` is what the accuracy gate calls it, "" where the gate does not judge it.
+    metrics only. ``gate_name`` is what the accuracy gate calls it, "" where the gate does not test it.
     """
 
     key: str
