@@ -22,6 +22,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from IPython import get_ipython
+from toolkit.report.interactive import compare, compare_over_seeds, figures, table
 
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
@@ -33,7 +34,6 @@ from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
 from toolkit.progress import SILENT, silent
 from toolkit.report.gate_words import gate_text
-from toolkit.report.interactive import compare, compare_over_seeds, figures, table
 from toolkit.runner import run
 from toolkit.sequence import Packet, StereoFrame
 

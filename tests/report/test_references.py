@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toolkit.report.comparison import Comparison
+from toolkit.report.references import reference_runs
 
 from toolkit.datasets import load_references, load_sequence
 from toolkit.errors import DataError
@@ -15,10 +17,8 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.metrics import cost, score_run
 from toolkit.progress import SILENT
-from toolkit.report.comparison import Comparison
 from toolkit.report.figures import errors_over_time, frame_times
 from toolkit.report.metrics_json import violations
-from toolkit.report.references import reference_runs
 from toolkit.report.session import Request, compare_all
 from toolkit.report.terminal import comparison_text
 from toolkit.runner import Progress
