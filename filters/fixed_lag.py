@@ -2,15 +2,16 @@
 
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
 causal answer is the newest state, its final answer each state as it left the window, with the covariance the window
-had for it. A variable that makes the window's system indeterminate, such as a landmark that fell behind the camera, is
-held where it is, and the log says so.
+had for it. A landmark that fell behind the camera is dropped and begins anew with its next sighting; a variable that
+makes the window's system indeterminate is held where it is. The log says so.
 """
 
 from dataclasses import replace
 
-import gtsam
+import numpy as np
 
 from filters.smoothing.graph_builder import Growth
+from filters.smoothing.indeterminate import Recovery, behind_camera
 from filters.smoothing.lag_window import LagWindow
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -33,6 +34,7 @@ class FixedLag:
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
+        self._rig = setup.rig
         self._window = LagWindow(self._lag_ns)
         self._growth = Growth(setup)
         self._first_in_window = 0
@@ -47,10 +49,11 @@ class FixedLag:
         while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
             self._complete(self._first_in_window)
             self._first_in_window += 1
-        recovered = self._window.add(grown, t_ns)
-        self._log += [f"frame {packet.index}: {line}" for line in recovered]
+        recovery = self._window.add(grown, t_ns)
         self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, t_ns))
-        self._read(self._window.values(), packet)
+        self._note(packet, recovery)
+        self._read(packet)
+        self._drop_landmarks_behind(packet)
         return self._states[-1]
 
     def finish(self) -> Finished:
@@ -65,19 +68,38 @@ class FixedLag:
         cov = self._window.state_cov(self._growth.motion.keys(k), state.T_world_imu[:3, :3])
         self._states[k] = replace(state, cov=cov)
 
-    def _read(self, values: gtsam.Values, packet: Packet) -> None:
+    def _read(self, packet: Packet) -> None:
         """Take over every state and landmark of the window; what leaves it stays as last read."""
+        values = self._window.values()
         motion, window = self._growth.motion, range(self._first_in_window, packet.index + 1)
         stamps_ns = [s.t_ns for s in self._states[self._first_in_window :]] + [packet.frame.t_ns]
         self._states[self._first_in_window :] = [motion.read(values, k, stamps_ns[k - window[0]]) for k in window]
         self._complete(packet.index)
-        self._forget_before(packet.frame.t_ns - self._lag_ns)
+        self._forget({i for i, t_ns in self._last_seen_ns.items() if t_ns < packet.frame.t_ns - self._lag_ns})
         in_window = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
         self._points |= in_window
         self._growth.solved(self._states[-1], in_window)
 
-    def _forget_before(self, oldest_ns: int) -> None:
-        """Let the landmarks go that were last seen before the window."""
-        left = {i for i, t_ns in self._last_seen_ns.items() if t_ns < oldest_ns}
-        self._growth.forget(left)
-        self._last_seen_ns = {i: t_ns for i, t_ns in self._last_seen_ns.items() if i not in left}
+    def _drop_landmarks_behind(self, packet: Packet) -> None:
+        """Drop what is no longer in front of the camera that sees it, before it is linearised there."""
+        seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
+        points = np.array([self._points[i] for i in seen]).reshape(-1, 3)
+        rows = np.flatnonzero(behind_camera(points, self._states[-1].T_world_imu, self._rig))
+        behind = {seen[row] for row in rows}
+        if behind:
+            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
+            recovery = self._window.drop(behind)
+            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
+
+    def _note(self, packet: Packet, recovery: Recovery) -> None:
+        """Keep the log of a recovery, and no point of what it dropped."""
+        self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
+        self._forget(recovery.dropped)
+        for i in recovery.dropped:
+            self._points.pop(i, None)
+
+    def _forget(self, landmark_ids: set[int]) -> None:
+        """Let landmarks go that are not in the window any more."""
+        self._growth.forget(landmark_ids)
+        for i in landmark_ids:
+            self._last_seen_ns.pop(i, None)

@@ -60,7 +60,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
         return
     seen = joint_landmarks.look(joint, frame, at, rig)
     accepted = joint_landmarks.admitted(joint, seen, innovation)
-    measurement = Measurement(joint, frame, at, rig, accepted & (seen.depth_m > 0.0))
+    measurement = Measurement(joint, frame, at, rig, accepted)
     if not measurement.rows.any():
         return
     best, converged = most_probable(measurement)

@@ -79,11 +79,14 @@ def columns(joint: JointBelief) -> slice:
 
 
 def admitted(joint: JointBelief, seen: Seen, innovation: Innovation) -> BoolArray:
-    """Return which landmarks' residuals (L,) pass the gate, and count them."""
+    """Return which landmarks (L,) are in front of the camera with residuals that pass the gate, and count them.
+
+    A point behind the camera has an image by the formula, which may be the measured one, but no camera sees it.
+    """
     H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
     predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
     nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
-    accepted = np.asarray(nis < STEREO_GATE)
+    accepted = (nis < STEREO_GATE) & (seen.depth_m > 0.0)
     innovation.add(nis, np.full(len(nis), 3), accepted)
     return accepted
 

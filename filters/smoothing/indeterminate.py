@@ -1,12 +1,35 @@
-"""What to do when GTSAM finds a system indeterminate: whom it names, and how to hold it where it is."""
+"""What to do when GTSAM finds a system indeterminate, which variable it names, and what makes a landmark one.
+
+GTSAM's stereo factor has no gradient where its landmark is behind the camera. A landmark that is seen at too small a
+disparity first and at larger ones next is moved by a Gauss-Newton step in metres, taken with the slope of depth at the
+small disparity: it passes the camera where the right disparity is more than twice the first. Linearised there the
+landmark would be indeterminate.
+"""
 
 import re
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
+from toolkit.geometry import Array, BoolArray, se3_inverse, transform
+from toolkit.sequence import StereoRig
+
 # What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
 WEAK_SIGMA = 1.0
+
+
+class Recovery(NamedTuple):
+    """What had to be recovered, a line each, and the track ids of the landmarks that were dropped for it."""
+
+    log: list[str]
+    dropped: set[int]
+
+
+def behind_camera(points: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
+    """Say which points (N, 3) m in the world are not in front of the camera of a pose (4, 4)."""
+    T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
+    return np.asarray(transform(T_cam_world, points)[:, 2] <= 0.0)
 
 
 def variable_named(refusal: RuntimeError) -> int:

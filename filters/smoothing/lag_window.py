@@ -5,9 +5,10 @@ state deep in the tree: its marginal then costs twice the update. Here the elimi
 then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
 root: what the window says in the end of the one and first of the other is nearly free, and the update is no dearer.
 
-A variable that makes the system indeterminate is held weakly where it is. A state that does so the first time is a
-matter of rounding in the normal equations, as in seconds of an accurate IMU alone: the window is then solved by QR,
-ten times dearer, until vision has been back for as long as it reaches.
+A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
+frame is dropped. A state that does so the first time is a matter of rounding in the normal equations, as in seconds of
+an accurate IMU alone: the window is then solved by QR, ten times dearer, until vision has been back for as long as it
+reaches. Either way a new tree is built of the factors of the old, and says what the old one said.
 """
 
 from collections.abc import Iterable
@@ -15,7 +16,7 @@ from collections.abc import Iterable
 import gtsam
 
 from filters.smoothing.graph_builder import Grown
-from filters.smoothing.indeterminate import variable_named, weak_hold, without_gaps
+from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
 from filters.smoothing.marginals import state_cov
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
@@ -32,71 +33,130 @@ class LagWindow:
         self._lag_ns = lag_ns
         self._by_qr_from_ns: int | None = None
         self._isam = self._empty_tree()
+        self._values = gtsam.Values()
+        self._oldest_ns = 0
         self._state_stamps_ns: dict[int, int] = {}
         self._landmark_stamps_ns: dict[int, int] = {}
+        # What the trees before this one marginalised is linear in these variables, where they are linearised.
+        self._fixed: set[int] = set()
 
-    def add(self, grown: Grown, t_ns: int) -> list[str]:
-        """Take in what a packet at a time adds, and solve; return what had to be recovered, a line each.
+    def add(self, grown: Grown, t_ns: int) -> Recovery:
+        """Take in what a packet at a time adds, and solve; return what had to be recovered.
 
-        Raises EstimatorError where the system stays indeterminate whatever is held.
+        Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
         """
-        self._state_stamps_ns |= dict.fromkeys(grown.state_keys, t_ns)
-        self._landmark_stamps_ns |= dict.fromkeys(map(L, grown.landmark_ids), t_ns)
-        factors, values = grown.factors, grown.values
+        back = Recovery([], set())
         if self._by_qr_from_ns is not None and grown.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
             self._by_qr_from_ns = None
-            factors, values = self._emptied(factors, values)
-        log: list[str] = []
-        for _ in range(MOST_RECOVERIES):
-            try:
-                self._update(factors, values, t_ns - self._lag_ns)
-            except RuntimeError as refusal:
-                # What was new is in the tree by now, but the tree is not to be used any more.
-                key = variable_named(refusal)
-                rounding = kind_of(key) != "l" and self._by_qr_from_ns is None
-                if rounding:
-                    self._by_qr_from_ns = t_ns
-                factors, values = self._emptied(gtsam.NonlinearFactorGraph(), gtsam.Values())
-                if not rounding:
-                    factors.add(weak_hold(key, values))
-                remedy = "to rounding: solved by QR for some frames" if rounding else "and is held weakly where it was"
-                log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
-            else:
-                return log
-        raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+            back = self.rebuild()
+        self._state_stamps_ns |= dict.fromkeys(grown.state_keys, t_ns)
+        self._landmark_stamps_ns |= dict.fromkeys(map(L, grown.landmark_ids), t_ns)
+        self._oldest_ns = t_ns - self._lag_ns
+        news = self._solved(grown.factors, grown.values)
+        return Recovery(back.log + news.log, back.dropped | news.dropped)
+
+    def rebuild(self) -> Recovery:
+        """Build the tree anew; what it says, now and later, is the same but for rounding."""
+        return self._solved(*self._emptied())
+
+    def drop(self, track_ids: Iterable[int]) -> Recovery:
+        """Take landmarks out with their sightings in the window; what older sightings told the others stays told."""
+        keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
+        slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
+        slots = [slot for slot in slots if any(_goes_with(key, factors.at(slot)) for key in keys)]
+        self._landmark_stamps_ns |= dict.fromkeys(keys, self._oldest_ns - 1)
+        return self._solved(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots)
 
     def values(self) -> gtsam.Values:
-        """Return the latest values of the window."""
-        return self._isam.calculateEstimate()
+        """Return the latest values of the window, and of what the last packet made leave it."""
+        return self._values
 
     def state_cov(self, keys: list[int], R_world_imu: Array) -> Array:
         """Return the covariance of one state, in the order and on the side of an Estimate."""
         return state_cov(self._isam, keys, R_world_imu)
 
-    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, oldest_ns: int) -> None:
-        old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < oldest_ns]
-        old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < oldest_ns]
+    def _solved(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int] = ()
+    ) -> Recovery:
+        """Add factors and values, take some factors out, and solve until nothing is indeterminate."""
+        log: list[str] = []
+        held, dropped = set[int](), set[int]()
+        for _ in range(MOST_RECOVERIES):
+            try:
+                self._update(factors, values, dropped_slots)
+            except RuntimeError as refusal:
+                # What was new is in the tree by now, but the tree is not to be used any more.
+                key, dropped_slots = variable_named(refusal), ()
+                if kind_of(key) != "l" and self._by_qr_from_ns is None:
+                    self._by_qr_from_ns = self._newest_ns()
+                    factors, values = self._emptied()
+                    remedy = "to rounding: solved by QR for some frames"
+                elif key in held and kind_of(key) == "l":
+                    factors, values = self._without(key, *self._emptied())
+                    dropped.add(gtsam.Symbol(key).index())
+                    remedy = "though held, and was dropped"
+                else:
+                    factors, values = self._emptied()
+                    factors.add(weak_hold(key, values))
+                    held.add(key)
+                    remedy = "and is held weakly where it was"
+                log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
+            else:
+                return Recovery(log, dropped)
+        raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+
+    def _newest_ns(self) -> int:
+        return max(self._state_stamps_ns.values())
+
+    def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int]) -> None:
+        old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < self._oldest_ns]
+        old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < self._oldest_ns]
         # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it. The
         # states are at every step: CCOLAMD takes no place beyond the number of variables it orders.
         moved = [*(self._landmark_stamps_ns if old_states else old_landmarks), *self._state_stamps_ns]
         known = [key for key in moved if self._isam.valueExists(key)]
-        self._isam.update(factors, values, [], self._order(oldest_ns), gtsam.KeyList(), _key_list(known))
+        slots, fixed = list(dropped_slots), _key_list(self._fixed)
+        self._isam.update(factors, values, slots, self._order(), fixed, _key_list(known))
+        # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.
+        self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
-        if leaving:
-            self._isam.marginalizeLeaves(_key_list(leaving))
+        still_there = [key for key in leaving if self._isam.valueExists(key)]
+        if still_there:
+            self._isam.marginalizeLeaves(_key_list(still_there))
+        self._forget(leaving)
+
+    def _forget(self, leaving: Iterable[int]) -> None:
         for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns):
             for key in stamps_ns.keys() & leaving:
                 del stamps_ns[key]
+        self._fixed.difference_update(leaving)
 
-    def _emptied(
-        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
-    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Begin a new tree; return all that was in the old one, and what is given, to be taken in."""
-        everything, everywhere = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
-        everything.push_back(factors)
-        everywhere.insert(values)
+    def _emptied(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Begin a new tree; return all that was in the old one, to be taken in.
+
+        GTSAM's marginal factors do not know where they were linearised: they go on saying the same only where their
+        variables stay linearised there. The tree that made them sees to that; the next one must be told.
+        """
+        factors, values = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
+        self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
-        return everything, everywhere
+        return factors, values
+
+    def _without(
+        self, key: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Return factors and values less a landmark and its sightings; what the prior has of it is marginalised."""
+        kept = gtsam.NonlinearFactorGraph()
+        for factor in (factors.at(i) for i in range(factors.size())):
+            if not _goes_with(key, factor):
+                kept.add(factor)
+        if kept.keys().count(key):
+            self._landmark_stamps_ns[key] = self._oldest_ns - 1
+            kept.add(weak_hold(key, values))
+        else:
+            values.erase(key)
+            self._forget([key])
+        return kept, values
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params = gtsam.ISAM2Params()
@@ -106,13 +166,13 @@ class LagWindow:
         params.setFactorization("CHOLESKY" if self._by_qr_from_ns is None else "QR")
         return gtsam.ISAM2(params)
 
-    def _order(self, oldest_ns: int) -> gtsam.KeyGroupMap:
+    def _order(self) -> gtsam.KeyGroupMap:
         """Return the place of every variable in the elimination; those to leave have none, which is the first.
 
         Places must be consecutive: CCOLAMD, unchecked, wants fewer of them than variables.
         """
-        landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns >= oldest_ns]
-        states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= oldest_ns]
+        landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns >= self._oldest_ns]
+        states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= self._oldest_ns]
         some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_ns) + len(self._state_stamps_ns)
         groups, place = gtsam.KeyGroupMap(), int(some_leave)
         for key in landmarks:
@@ -123,6 +183,12 @@ class LagWindow:
         for key, t_ns in states:
             groups.insert2(key, place_of[t_ns])
         return groups
+
+
+def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
+    """Say whether a factor goes when a landmark does: a sighting, or what is linear and concerns nothing else."""
+    keys: list[int] = factor.keys()
+    return landmark in keys and (len(keys) == 1 or not isinstance(factor, gtsam.LinearContainerFactor))
 
 
 def _oldest_beside_newest(stamps_ns: list[int]) -> list[int]:

@@ -72,13 +72,13 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
     add = LagWindow.add
 
     def spied(window, grown, t_ns):
-        log, tree = add(window, grown, t_ns), window._isam
+        recovery, tree = add(window, grown, t_ns), window._isam
         marginals = gtsam.Marginals(without_gaps(tree.getFactorsUnsafe()), tree.getLinearizationPoint())
         for k, stamp_ns in enumerate(sequence.frames_t_ns.tolist()):
             if t_ns - round(LAG_S * NS_PER_S) <= stamp_ns <= t_ns:
                 R_world_imu = window.values().atPose3(motion.keys(k)[0]).rotation().matrix()
                 last[k] = state_cov(marginals, motion.keys(k), R_world_imu)
-        return log
+        return recovery
 
     monkeypatch.setattr(LagWindow, "add", spied)
     final = run_through(FixedLag(setup_of(sequence), LAG_S), sequence)

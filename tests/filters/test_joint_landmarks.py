@@ -1,0 +1,44 @@
+"""Which landmarks of a joint belief a frame may correct, whichever way the update is made."""
+
+import numpy as np
+import pytest
+
+from filters.kalman import iterated, joint_landmarks
+from filters.kalman.belief import initial_belief
+from filters.kalman.diagnostics import Innovation
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import AtLatestEstimates
+from toolkit.geometry import Array, transform
+from toolkit.models import stereo
+from toolkit.sequence import StereoFrame
+from toolkit.simulation import FLIGHT, simulate
+
+SEQUENCE = simulate(FLIGHT, 0)
+
+
+def belief_with_a_landmark(depth_m: float) -> JointBelief:
+    """Return a belief whose only landmark has that depth in the camera and is uncertain by 0.1 m."""
+    assert SEQUENCE.prior is not None
+    joint = JointBelief(initial_belief(SEQUENCE.prior, "imu"))
+    joint.clone(0)
+    point = transform(joint.clones[0] @ SEQUENCE.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]]))
+    joint.add_landmarks(np.array([7]), point, np.zeros((3, joint.cov.shape[0])), 0.01 * np.eye(3))
+    return joint
+
+
+def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
+    """Return a frame that shows the landmark where the projection's formula puts it, but for ``off_px`` (3,)."""
+    uv_px = stereo.predict(joint.points, joint.clones[0], SEQUENCE.rig).uv_px + off_px
+    return StereoFrame(0, np.array([7]), uv_px)
+
+
+@pytest.mark.parametrize("correct", [joint_landmarks.correct, iterated.correct], ids=["single", "iterated"])
+@pytest.mark.parametrize(("depth_m", "accepted"), [(4.0, 1), (-4.0, 0)], ids=["in front", "behind"])
+def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residual(correct, depth_m, accepted):
+    """A residual of half a pixel passes the gate on either side: what differs is the side alone."""
+    joint, innovation = belief_with_a_landmark(depth_m), Innovation()
+    cov, point = joint.cov.copy(), joint.points.copy()
+    correct(joint, frame_of(joint, np.array([0.5, 0.0, 0.5])), AtLatestEstimates(), SEQUENCE.rig, innovation)
+    assert (innovation.tested, innovation.accepted) == (1, accepted)
+    assert np.array_equal(joint.cov, cov) == (not accepted)
+    assert np.array_equal(joint.points, point) == (not accepted)
