@@ -23,12 +23,12 @@ from itertools import pairwise
 import matplotlib.pyplot as plt
 import numpy as np
 from recordings import real
-
-from toolkit.datasets import load_sequence
-from toolkit.estimator import ladder
 from toolkit.report.comparison import Row
 from toolkit.report.interactive import compare, compare_over_seeds, figures, table
 from toolkit.report.seeds_table import consistency_lines
+
+from toolkit.datasets import load_sequence
+from toolkit.estimator import ladder
 from toolkit.sequence import Sequence
 
 # %matplotlib inline
@@ -125,7 +125,7 @@ print(f"the least of all has {min(score, key=score.get)}")
 # %%
 SEEDS, FRAMES = 8, 25
 over = compare_over_seeds("flight", ["ladder"], SEEDS, max_frames=FRAMES)
-table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose", "NEES in band")
+table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
 figures(over)["nees_over_seeds"]

@@ -168,7 +168,7 @@ print("two-view:", find("two-view").summary())
 
 # %%
 over = compare_over_seeds("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=40)
-table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose", "NEES in band")
+table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
 figures(over)["nees_over_seeds"]

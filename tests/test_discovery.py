@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from toolkit import estimator
+from toolkit import discovery
 from toolkit.errors import EstimatorError
 from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, discover, find, find_all, ladder
 
@@ -21,7 +21,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "__init__.py").write_text('"""Somebody\'s estimators."""\n')
     monkeypatch.syspath_prepend(str(tmp_path))
     point = EntryPoint(PACKAGE, PACKAGE, ENTRY_POINT_GROUP)
-    monkeypatch.setattr(estimator, "entry_points", lambda group: [point] if group == ENTRY_POINT_GROUP else [])
+    monkeypatch.setattr(discovery, "entry_points", lambda group: [point] if group == ENTRY_POINT_GROUP else [])
     yield folder
     for module in [m for m in sys.modules if m.partition(".")[0] == PACKAGE]:
         del sys.modules[module]
@@ -64,7 +64,7 @@ def test_several_packages_are_found_together(package, tmp_path, monkeypatch):
     write(package, "zebra.py", "build = print")
     (other / "ant.py").write_text("")
     points = [EntryPoint(name, name, ENTRY_POINT_GROUP) for name in (PACKAGE, "other_estimators")]
-    monkeypatch.setattr(estimator, "entry_points", lambda group: points)
+    monkeypatch.setattr(discovery, "entry_points", lambda group: points)
     assert list(discover()) == ["ant", "zebra"]
 
 
@@ -130,6 +130,6 @@ def test_an_unknown_name_lists_the_known_ones(package):
 
 def test_an_entry_point_to_nowhere_is_told(monkeypatch):
     point = EntryPoint("gone", "gone_package", ENTRY_POINT_GROUP)
-    monkeypatch.setattr(estimator, "entry_points", lambda group: [point])
+    monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
     with pytest.raises(EstimatorError, match="names gone_package, which is not a package"):
         discover()

@@ -23,7 +23,7 @@ from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.progress import silent
-from toolkit.report.table import Table, as_markdown, as_text, comparison_table
+from toolkit.report.table import Table, as_markdown, as_text, columns_asked, comparison_table
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, as_values, settings_of
 
@@ -107,8 +107,7 @@ class Result:
 
     def table(self, *columns: str) -> "ShownTable":
         """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
-        chosen = "all" if columns == ("all",) else columns or None
-        return ShownTable(comparison_table(self.comparison, chosen))
+        return ShownTable(comparison_table(self.comparison, columns_asked(columns)))
 
     @cached_property
     def figures(self) -> Mapping[str, "Figure"]:
@@ -174,9 +173,9 @@ class _Values(Mapping[str, float | None]):
 
     def __getitem__(self, key: str) -> float | None:
         if key not in self._keys:
-            from toolkit.settings import nearest
+            from toolkit.errors import did_you_mean
 
-            raise KeyError(f"no metric is called {key}{nearest(key, list(self._keys))}")
+            raise KeyError(f"no metric is called {key}{did_you_mean(key, list(self._keys))}")
         return self._value_of(key)
 
     def __iter__(self) -> Iterator[str]:

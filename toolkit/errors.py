@@ -3,11 +3,13 @@
 A message says what is wrong, where (file, field, row) and what to do, in one line.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import ClassVar
 
 
 class VislamError(Exception):
-    """Anything the toolkit refuses to do, told in one line."""
+    """Anything the toolkit refuses to do, with a message of one line."""
 
     exit_status: ClassVar[int] = 1
 
@@ -28,3 +30,24 @@ class EstimatorError(VislamError):
     """An estimator that is unknown, unavailable or cannot go on with its run."""
 
     exit_status = 5
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return the known name most like a misspelt one, whatever the case of its letters, or "" where none is close."""
+    by_folded = {candidate.casefold(): candidate for candidate in known}
+    close = get_close_matches(name.casefold(), by_folded, n=1)
+    return by_folded[close[0]] if close else ""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about a name nobody knows: the nearest known one, or nothing where none is close."""
+    close = nearest(name, known)
+    return f"; did you mean {close}?" if close else ""
+
+
+def no_such(kind: str, name: str, known: Iterable[str]) -> str:
+    """Return the message for a name nobody knows: the nearest known one, then all of them."""
+    names = list(known)
+    close = nearest(name, names)
+    hint = f" (did you mean {close}?)" if close else ""
+    return f"no {kind} is called {name}{hint}; there are {', '.join(names)}"

@@ -147,6 +147,10 @@ class Run:
 
     @property
     def final_is_causal(self) -> bool:
-        """Say whether the final word is what was said at each frame, as a filter's is."""
+        """Say whether the final output repeats the causal one, poses and covariances, as a filter's does."""
         causal, final = self.causal, self.final
-        return causal is not None and final is not None and np.array_equal(causal.T_world_imu, final.T_world_imu)
+        if causal is None or final is None or not np.array_equal(causal.T_world_imu, final.T_world_imu):
+            return False
+        if causal.cov is None or final.cov is None:
+            return causal.cov is final.cov
+        return np.array_equal(causal.cov, final.cov, equal_nan=True)

@@ -8,16 +8,12 @@ where no estimator is named; ``OPTIONS`` names the settings that it alone reads.
 """
 
 import ast
-import importlib
-import importlib.util
-import pkgutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Literal, Protocol, cast
 
-from toolkit.errors import EstimatorError
+from toolkit.discovery import FoundModule, MissingDependency, announced
+from toolkit.errors import EstimatorError, no_such
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
 from toolkit.progress import SILENT, Progress
@@ -61,11 +57,10 @@ Build = Callable[[Setup], Estimator]
 
 @dataclass(frozen=True)
 class EstimatorEntry:
-    """One discovered estimator: its name, the module it lives in and the file it was found in."""
+    """One discovered estimator: its name and the module it lives in."""
 
     name: str
-    module: str
-    path: Path
+    found: FoundModule
 
     def summary(self) -> str:
         """Return the first line of the module's docstring, without importing the module."""
@@ -98,7 +93,7 @@ class EstimatorEntry:
                 raise EstimatorError(f"estimator {self.name} has no option {option}; it has {known}")
 
     def _tree(self) -> ast.Module:
-        return ast.parse(self.path.read_text(encoding="utf-8"))
+        return ast.parse(self.found.path.read_text(encoding="utf-8"))
 
     def _constants(self) -> dict[str, object]:
         """Return the module's top-level assignments of literals, alone or in tuples, by name."""
@@ -129,29 +124,17 @@ class EstimatorEntry:
         other error in the module is a defect and passes through.
         """
         try:
-            module = importlib.import_module(self.module)
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.split(".")[0] in (self.module.split(".")[0], "toolkit"):
-                raise
-            raise EstimatorError(f"estimator {self.name} is unavailable: it needs the package {error.name}") from error
+            module = self.found.load()
+        except MissingDependency as missing:
+            raise EstimatorError(f"estimator {self.name} is unavailable: {missing}") from missing
         if not callable(getattr(module, "build", None)):
-            raise EstimatorError(f"estimator {self.name}: {self.path.name} defines no function build(setup)")
+            raise EstimatorError(f"estimator {self.name}: {self.found.path.name} defines no function build(setup)")
         return cast(Build, module.build)
 
 
 def discover() -> dict[str, EstimatorEntry]:
     """Find every estimator of every announced package, by name, importing none of them."""
-    found: dict[str, EstimatorEntry] = {}
-    for package in sorted({point.value for point in entry_points(group=ENTRY_POINT_GROUP)}):
-        spec = importlib.util.find_spec(package)
-        if spec is None or spec.submodule_search_locations is None:
-            raise EstimatorError(f"the entry point {ENTRY_POINT_GROUP} names {package}, which is not a package here")
-        for folder in spec.submodule_search_locations:
-            for module in pkgutil.iter_modules([folder]):
-                if module.ispkg or module.name.startswith("_"):
-                    continue
-                name = module.name.replace("_", "-")
-                found[name] = EstimatorEntry(name, f"{package}.{module.name}", Path(folder) / f"{module.name}.py")
+    found = {one.name: EstimatorEntry(one.name, one) for one in announced(ENTRY_POINT_GROUP, EstimatorError)}
     return dict(sorted(found.items()))
 
 
@@ -187,5 +170,5 @@ def find(name: str) -> EstimatorEntry:
     """Return the estimator of that name, or raise EstimatorError with the names there are."""
     known = discover()
     if name not in known:
-        raise EstimatorError(f"no estimator is called {name}; there are {', '.join(known)}")
+        raise EstimatorError(no_such("estimator", name, known))
     return known[name]

@@ -7,14 +7,13 @@ its source.
 
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import VislamError
+from toolkit.errors import VislamError, did_you_mean
 
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Scalar = bool | int | float | str
@@ -167,12 +166,6 @@ def describe() -> tuple[Described, ...]:
     return tuple(_described(Settings, ""))
 
 
-def nearest(name: str, known: list[str]) -> str:
-    """Return the words that name the known names most like another, or nothing where none is."""
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
 def _value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -185,7 +178,7 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
     for key, value in given.items():
         if key not in hints:
             known = [described.key for described in describe()] + ["estimators"]
-            raise SettingsError(f"{place}: there is no setting {prefix}{key}{nearest(prefix + key, known)}")
+            raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
 

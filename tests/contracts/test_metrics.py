@@ -7,10 +7,11 @@ import pytest
 
 from toolkit import metrics
 from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS
 from toolkit.geometry import se3
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
 
-KEYS = [
+CONTRACT = [
     "ate_none_m",
     "ate_se3_m",
     "ate_yaw_m",
@@ -40,6 +41,7 @@ KEYS = [
     "cpu_s",
     "peak_rss_mb",
 ]
+KEYS = [*CONTRACT, "frame_cpu_ms_mean"]
 
 
 T_NS = np.array([0, 100_000_000, 200_000_000])
@@ -72,7 +74,18 @@ def bare_run(poses):
 
 
 def test_the_keys_are_those_of_metrics_json_in_its_order():
+    assert list(metrics.contract_keys()) == CONTRACT
     assert list(metrics.describe()) == KEYS
+
+
+def test_no_two_columns_have_the_same_name():
+    names = [name for metric in metrics.known_metrics() for name in {metric.key, metric.name}]
+    assert len(set(names)) == len(names)
+
+
+def test_every_metric_the_gate_judges_has_a_name_there():
+    judged = {COVERAGE, *DEFAULT_BOUNDS.simulated, *DEFAULT_BOUNDS.recorded}
+    assert judged == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
 
 
 @pytest.mark.parametrize("key", KEYS)

@@ -17,7 +17,7 @@ from toolkit.estimator import discover, find
 from toolkit.geometry import Array, about_z, se3_inverse, so3_exp
 from toolkit.sequence import Observations, Sequence, TwistNoise
 from toolkit.simulation import FLIGHT, Scenario, simulate
-from toolkit.simulation.scenes import Stage
+from toolkit.simulation.scenes import Scene
 from toolkit.simulation.sensors import Odometer
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
 from toolkit.simulation.world import room
@@ -33,7 +33,7 @@ LOWEST_SOUND_RUNG = 20
 CHANCE = 1.25
 
 
-def stage_along(progress: Callable[[Array], Array], duration_s: float) -> Stage:
+def scene_along(progress: Callable[[Array], Array], duration_s: float) -> Scene:
     """Return a flight through a room, turning at half a radian a second, with its clock slowed or stopped at will."""
     count = int(np.ceil(duration_s / KNOT_S)) + 4 * MARGIN
     knots = UniformKnots(-MARGIN * KNOT_S, KNOT_S)
@@ -47,23 +47,23 @@ def stage_along(progress: Callable[[Array], Array], duration_s: float) -> Stage:
     trajectory = FreeTrajectory(
         VectorSpline(knots, position), RotationSpline(knots, about_z(0.5 * s) @ tilt @ upright_to_imu)
     )
-    return Stage(
+    return Scene(
         trajectory, room(np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 4.5]), 800, np.random.default_rng(1))
     )
 
 
-def moving(duration_s: float) -> Stage:
-    return stage_along(lambda t_s: t_s, duration_s)
+def moving(duration_s: float) -> Scene:
+    return scene_along(lambda t_s: t_s, duration_s)
 
 
-def halting(duration_s: float) -> Stage:
-    return stage_along(lambda t_s: t_s - np.clip(t_s - HALT_AT_S, 0.0, HALT_S), duration_s)
+def halting(duration_s: float) -> Scene:
+    return scene_along(lambda t_s: t_s - np.clip(t_s - HALT_AT_S, 0.0, HALT_S), duration_s)
 
 
-def recorded(kind: str, stage: Callable[[float], Stage], duration_s: float, tracks: int) -> Sequence:
+def recorded(kind: str, scene: Callable[[float], Scene], duration_s: float, tracks: int) -> Sequence:
     motion = replace(FLIGHT.motion, rate_hz=100.0) if kind == "imu" else ODOMETER
     camera = replace(FLIGHT.camera, rate_hz=RATE_HZ, max_tracks=tracks)
-    scenario: Scenario = replace(FLIGHT, stage=stage, motion=motion, camera=camera, duration_s=duration_s)
+    scenario: Scenario = replace(FLIGHT, scene=scene, motion=motion, camera=camera, duration_s=duration_s)
     return simulate(scenario, SEED)
 
 

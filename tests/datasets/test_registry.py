@@ -14,11 +14,6 @@ from toolkit.datasets import built_in_names, formats, load_sequence
 from toolkit.errors import DataError
 
 
-def test_every_module_of_the_package_is_a_format_or_has_built_ins() -> None:
-    for module in datasets._modules().values():
-        assert isinstance(module, datasets.RecordingFormat | datasets.BuiltIns)
-
-
 def test_every_format_has_a_summary() -> None:
     assert {"course-npz", "utias-mat", "openvins-sim"} <= formats().keys()
     assert all(summary.endswith(".") or len(summary) > 20 for summary in formats().values())

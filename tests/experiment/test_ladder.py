@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from toolkit.discovery import FoundModule
 from toolkit.errors import EstimatorError
 from toolkit.estimator import EstimatorEntry, find_all, ladder
 
@@ -22,7 +23,7 @@ from toolkit.estimator import EstimatorEntry, find_all, ladder
 def test_a_rung_is_read_without_importing(tmp_path: Path, source: str, rung: int | None, change: str) -> None:
     path = tmp_path / "one.py"
     path.write_text(source)
-    entry = EstimatorEntry("one", "nowhere.one", path)
+    entry = EstimatorEntry("one", FoundModule("nowhere.one", path))
     assert (entry.rung(), entry.change()) == (rung, change)
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toolkit.experiment.monte_carlo import mean_nees, spread_of
+from toolkit.report.seeds_md import seeds_report, seeds_text
 
 from toolkit.datasets import is_drawn_from_a_seed
-from toolkit.experiment.monte_carlo import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.metrics_json import to_text
-from toolkit.report.seeds_md import seeds_report, seeds_text
 
 
 def test_spread_is_numpys():
@@ -115,8 +115,8 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
     for text in (seeds_text(over), seeds_report(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
-        assert "too sure of itself" in text
-    assert max(map(len, seeds_text(over).splitlines())) <= 118
+        assert "too sure of itself" in " ".join(text.split())
+    assert max(map(len, seeds_text(over).splitlines())) <= 100
 
 
 def test_both_figures_are_drawn(over, tmp_path):

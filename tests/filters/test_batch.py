@@ -18,17 +18,23 @@ def error_since_the_start(poses: Array, truth: Array) -> float:
     return float(np.sqrt(np.square(relative[:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
-def test_it_beats_the_filter_it_starts_from(scenario, run_estimator):
-    """It sees the future and keeps every correlation: over five seeds a third of the filter's error, or less."""
-    sequences = [simulate(replace(scenario, duration_s=10.0), seed) for seed in range(2)]
-    error_m = {
-        name: np.mean(
+@pytest.mark.parametrize(
+    ("scenario", "duration_s", "most"),
+    # Measured 0.68 and 0.40; with ten seconds, which take five times as long, 0.51 and 0.36.
+    [(DRIVE, 4.0, 0.75), (FLIGHT, 2.0, 0.5)],
+    ids=["drive", "flight"],
+)
+def test_it_beats_the_filter_it_starts_from(scenario, duration_s, most, run_estimator):
+    """It sees the future and relinearises: less error than msckf-fej under each of five seeds, by far on average."""
+    sequences = [simulate(replace(scenario, duration_s=duration_s), seed) for seed in range(5)]
+    filtered_m, smoothed_m = (
+        np.array(
             [error_since_the_start(run_estimator(name, s).final.T_world_imu, s.truth.T_world_imu) for s in sequences]
         )
-        for name in ("ekf", "batch")
-    }
-    assert error_m["batch"] < 0.7 * error_m["ekf"]
+        for name in ("msckf-fej", "batch")
+    )
+    assert (smoothed_m < filtered_m).all()
+    assert smoothed_m.mean() < most * filtered_m.mean()
 
 
 def test_it_knows_no_answer_before_the_end(run_estimator):

@@ -94,7 +94,20 @@ def test_a_world_of_its_own_is_placed_by_the_first_pose_and_says_so(make_sequenc
     scores = score_run(stating(make_run, sequence, poses, np.broadcast_to(COV, (200, 6, 6))), "causal", sequence)
     # A perfect estimate: what is left is rounding, far below the covariance.
     assert scores.values["nees_pose_mean"] < 1e-12
-    assert "world is its own" in scores.notes["nees_pose_mean"]
+    assert "its own world frame" in scores.notes["nees_pose_mean"]
+
+
+@pytest.mark.parametrize(("motion", "tilt_is_an_error"), [("imu", True), ("twist", False)])
+def test_a_tilted_start_counts_where_an_imu_measures_the_vertical(
+    make_sequence, make_run, drive, motion, tilt_is_an_error
+):
+    """Placed by the whole pose, an IMU's run would have its tilt, which it states to 3 mrad, given away."""
+    sequence = make_sequence(drive(200), track_count=3, motion=motion)
+    tilted = se3_exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])) @ drive(200)
+    _, orientation, position, _ = nees(stating(make_run, sequence, tilted, np.broadcast_to(COV, (200, 6, 6))), sequence)
+    # (0.05 rad / 0.003 rad)^2 / 3 = 93; along 200 m the position is off by 10 m and more. Else rounding is left.
+    assert (orientation > 50.0) == (position > 50.0) == tilt_is_an_error
+    assert tilt_is_an_error or max(orientation, position) < 1e-12
 
 
 def test_a_world_of_its_own_needs_the_truth_of_its_first_pose(make_sequence, make_run, drive):

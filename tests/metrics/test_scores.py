@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit import metrics
+from toolkit.errors import VislamError
 from toolkit.metrics import Scores, score_run
 from toolkit.metrics._shared.scores import Unavailable, evaluate
 
@@ -55,6 +56,13 @@ def test_cost_is_read_off_the_timings(case):
     assert (values["total_s"], values["cpu_s"], values["peak_rss_mb"]) == (0.6, 0.7, 123.0)
 
 
+def test_processor_time_a_frame_includes_the_finish(make_sequence, make_run, drive):
+    sequence = make_sequence(drive(20), track_count=3)
+    run = make_run(sequence.frames_t_ns, drive(20))
+    values = score_run(run, "causal", sequence).values
+    assert values["frame_cpu_ms_mean"] == pytest.approx(1e3 * run.timings.cpu_s / len(run.timings.step_s))
+
+
 def test_a_failed_run_with_a_partial_trajectory_is_scored(make_sequence, make_run, drive):
     sequence = make_sequence(drive(150), track_count=60)
     run = make_run(sequence.frames_t_ns[:75], sequence.truth.T_world_imu[:75], status="failed")
@@ -101,13 +109,41 @@ def test_a_defect_in_a_metric_passes_through(case, monkeypatch):
         case()
 
 
-def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case):
-    source = 'from toolkit.metrics import Scores\nORDER = 99\nMETRICS = {"answer": "the answer (1)"}\n'
-    (tmp_path / "dropped_in.py").write_text(source + "def score(evaluation):\n    return Scores({'answer': 42.0})\n")
+DROPPED_IN = """from toolkit.metrics import Metric, Scores
+
+ORDER = 99
+METRICS = (Metric("answer", "the answer (1)", "1", ("the", "answer"), table="always"),)
+
+
+def score(evaluation):
+    return Scores({"answer": 42.0})
+"""
+
+
+@pytest.fixture
+def found_anew():
+    """Forget which metric files were found, before and after the test."""
+    metrics._found.cache_clear()
+    yield
+    metrics._found.cache_clear()
+
+
+def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case, found_anew):
+    (tmp_path / "dropped_in.py").write_text(DROPPED_IN)
     monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
-    metrics._metric_files.cache_clear()
-    try:
-        assert list(metrics.describe())[-1] == "answer"
-        assert case().values["answer"] == 42.0
-    finally:
-        metrics._metric_files.cache_clear()
+    assert list(metrics.describe())[-1] == "answer"
+    assert case().values["answer"] == 42.0
+    assert "answer" not in metrics.contract_keys()
+
+
+def test_two_files_cannot_declare_the_same_key(tmp_path, monkeypatch, found_anew):
+    (tmp_path / "again.py").write_text(DROPPED_IN.replace('"answer"', '"pairs"'))
+    monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
+    with pytest.raises(VislamError, match="more than one metric file declares pairs"):
+        metrics.describe()
+
+
+def test_a_metric_is_chosen_by_its_key_or_its_name():
+    assert [m.key for m in metrics.metrics_called(["NIS mean", "ate_se3_m"])] == ["nis_mean", "ate_se3_m"]
+    with pytest.raises(VislamError, match=r"no column is called ATE SE3 \(did you mean ATE SE\(3\)\?\); there are"):
+        metrics.metrics_called(["pairs", "ATE SE3"])

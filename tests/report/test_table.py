@@ -1,15 +1,17 @@
-"""The table says everything a reader needs, in 120 columns, in text and in Markdown."""
+"""The table says everything a reader needs, in 100 characters, in text and in Markdown."""
 
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from toolkit.metrics import Scores
 from toolkit.report.comparison import Comparison, Row
+
+from toolkit.errors import VislamError
+from toolkit.estimator import discover
+from toolkit.metrics import Scores, known_metrics
 from toolkit.report.report_md import report_text
-from toolkit.report.table import COLUMNS, as_markdown, as_text, comparison_table
+from toolkit.report.table import Table, as_markdown, as_text, change_lines, comparison_table, heading, shown_metrics
 from toolkit.report.terminal import comparison_text
 
 
@@ -31,25 +33,84 @@ def test_outputs_that_differ_have_lines_of_their_own(comparison: Comparison) -> 
 
 def test_text_and_markdown_have_the_same_cells(comparison: Comparison) -> None:
     table = comparison_table(comparison)
-    in_markdown = [line.strip("| ").split(" | ") for line in as_markdown(table).splitlines()[2:]]
+    in_markdown = [line.replace("|", " ").split() for line in as_markdown(table).splitlines()[2:]]
     in_text = [line.split() for line in as_text(table).splitlines()[-len(table.rows) :]]
     assert in_markdown == in_text == [list(row) for row in table.rows]
 
 
-def test_alignments_pairs_and_coverage_are_named(comparison: Comparison) -> None:
+def shared_by_all(comparison: Comparison, **values: float) -> Comparison:
+    """Return the comparison with the same values of some metrics in every row."""
+    rows = (replace(row, scores=Scores(row.scores.values | values, {})) for row in comparison.rows)
+    return replace(comparison, rows=tuple(rows))
+
+
+def test_alignments_are_named(comparison: Comparison) -> None:
     text = as_text(comparison_table(comparison))
-    for word in ("SE(3)", "yaw", "pairs", "cover"):
+    for word in ("SE(3)", "yaw", "held-"):
         assert word in text
 
 
-def test_no_line_is_wider_than_120_columns(comparison: Comparison) -> None:
-    assert max(map(len, comparison_text(comparison).splitlines())) <= 120
+def test_pairs_and_coverage_are_columns_where_rows_differ_or_lack_them(comparison: Comparison) -> None:
+    heads = [lines[0] for lines in comparison_table(comparison).headings]  # one run of it gave no answer
+    assert heads[3:5] == ["cover", "pairs"]
+    assert "scored:" not in comparison_text(comparison)
 
 
-def test_a_table_with_all_columns_fits_120_columns() -> None:
-    words = len("dead-reckoning  causal  diverged")
-    numbers = sum(2 + max(len("12.34"), *map(len, column.heading)) for column in COLUMNS)
-    assert words + numbers <= 120
+def test_pairs_and_coverage_that_all_rows_share_stand_above_the_table(comparison: Comparison) -> None:
+    same = shared_by_all(comparison, pairs=120.0, coverage_percent=97.5)
+    assert comparison_text(same).splitlines()[1] == "scored: coverage 97.5 %, pairs 120"
+    assert "pairs" not in as_text(comparison_table(same))
+
+
+def test_pairs_that_differ_are_told_with_columns_that_leave_them_out(comparison: Comparison) -> None:
+    same = shared_by_all(comparison, pairs=120.0, coverage_percent=100.0)
+    first = same.rows[0]
+    fewer = replace(first, scores=Scores(first.scores.values | {"pairs": 90.0}, {}))
+    text = comparison_text(replace(same, rows=(fewer, *same.rows[1:])), ("ate_se3_m",))
+    assert text.splitlines()[1] == "scored: coverage 100.0 %, pairs 90 to 120"
+
+
+def test_no_line_is_wider_than_100_characters(comparison: Comparison) -> None:
+    assert max(map(len, comparison_text(comparison).splitlines())) <= 100
+
+
+def test_the_widest_default_table_fits_100_characters() -> None:
+    """The longest estimator names, every column there can be, numbers of five characters, and a ladder below."""
+    metrics = [metric for metric in known_metrics() if metric.table != "on request"]
+    names = [*discover(), "openvins (est.txt)"]
+    rows = tuple((name, "causal", "diverged", *["12.34"] * len(metrics)) for name in names)
+    labels = (("estimator", "", ""), ("output", "", ""), ("status", "", ""))
+    under = tuple(change_lines((name, entry.change()) for name, entry in discover().items()))
+    table = Table((*labels, *map(heading, metrics)), rows, len(labels), under)
+    assert max(map(len, as_text(table).splitlines())) <= 100
+
+
+def test_a_ladders_changes_stand_under_the_table(comparison: Comparison) -> None:
+    laddered = replace(comparison, changes={"steady": "no error growth", "late": "+ the future"})
+    table = comparison_table(laddered)
+    assert table.headings == comparison_table(comparison).headings
+    assert as_text(table).splitlines()[-2:] == ["steady  no error growth", "late    + the future"]
+    assert as_markdown(table).splitlines()[-1] == "- late    + the future"
+
+
+def test_columns_are_chosen_by_key_or_name_in_the_given_order(comparison: Comparison) -> None:
+    table = comparison_table(comparison, ("NIS mean", "ate_se3_m", "ATE Sim(3)"))
+    assert [lines[:2] for lines in table.headings[3:]] == [("NIS", "mean"), ("ATE", "SE(3)"), ("ATE", "Sim(3)")]
+
+
+def test_all_columns_are_every_metric_with_a_value(comparison: Comparison) -> None:
+    shown = {metric.key for metric in shown_metrics(comparison, "all")}
+    with_value = {key for row in comparison.lines for key, value in row.scores.values.items() if value is not None}
+    assert shown == with_value
+
+
+def test_an_unknown_column_is_answered_with_the_nearest(comparison: Comparison) -> None:
+    with pytest.raises(VislamError, match=r"no column is called ate_se3 \(did you mean ate_se3_m\?\)"):
+        comparison_table(comparison, ("ate_se3",))
+
+
+def test_a_table_without_rows_keeps_its_headings() -> None:
+    assert as_text(Table((("name",), ("m",)), (), 1)).split() == ["name", "m", "----", "-"]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log
 from toolkit.simulation.scenes import hall, road
 from toolkit.simulation.trajectory import (
     RotationSpline,
-    Trajectory,
+    SmoothTrajectory,
     UniformKnots,
     VectorSpline,
     blending_matrix,
@@ -19,29 +19,29 @@ AT_S = np.linspace(0.5, 19.5, 191)
 
 
 @pytest.fixture(params=sorted(TRAJECTORIES))
-def trajectory(request: pytest.FixtureRequest) -> Trajectory:
+def trajectory(request: pytest.FixtureRequest) -> SmoothTrajectory:
     return TRAJECTORIES[request.param]
 
 
-def test_velocity_is_the_derivative_of_position(trajectory: Trajectory) -> None:
+def test_velocity_is_the_derivative_of_position(trajectory: SmoothTrajectory) -> None:
     before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
     difference = (after.T_world_imu[:, :3, 3] - before.T_world_imu[:, :3, 3]) / (2.0 * STEP_S)
     # Central differences err by step^2 / 6 times the third derivative, about 1e-8, and by rounding / step.
     np.testing.assert_allclose(trajectory.at(AT_S).v_world, difference, atol=1e-7)
 
 
-def test_acceleration_is_the_derivative_of_velocity(trajectory: Trajectory) -> None:
+def test_acceleration_is_the_derivative_of_velocity(trajectory: SmoothTrajectory) -> None:
     difference = (trajectory.at(AT_S + STEP_S).v_world - trajectory.at(AT_S - STEP_S).v_world) / (2.0 * STEP_S)
     np.testing.assert_allclose(trajectory.at(AT_S).a_world, difference, atol=1e-7)
 
 
-def test_angular_velocity_is_the_derivative_of_rotation_in_the_body(trajectory: Trajectory) -> None:
+def test_angular_velocity_is_the_derivative_of_rotation_in_the_body(trajectory: SmoothTrajectory) -> None:
     before, after = trajectory.at(AT_S - STEP_S), trajectory.at(AT_S + STEP_S)
     turn = np.swapaxes(before.T_world_imu[:, :3, :3], 1, 2) @ after.T_world_imu[:, :3, :3]
     np.testing.assert_allclose(trajectory.at(AT_S).w_imu, so3_log(turn) / (2.0 * STEP_S), atol=1e-7)
 
 
-def test_acceleration_and_angular_velocity_have_no_kinks(trajectory: Trajectory) -> None:
+def test_acceleration_and_angular_velocity_have_no_kinks(trajectory: SmoothTrajectory) -> None:
     """At the knots too: a jump would make an IMU's samples no longer integrable."""
     t_s = np.arange(0.0, 20.0, 1e-3)
     motion = trajectory.at(t_s)
@@ -103,10 +103,10 @@ def test_a_flight_turns_and_accelerates_about_every_axis() -> None:
     assert 0.7 < np.linalg.norm(motion.v_world, axis=1).mean() < 1.3
 
 
-@pytest.mark.parametrize("stage", [road, hall])
-def test_a_longer_recording_begins_like_a_shorter_one(stage: object) -> None:
+@pytest.mark.parametrize("scene", [road, hall])
+def test_a_longer_recording_begins_like_a_shorter_one(scene: object) -> None:
     t_s = np.linspace(0.0, 5.0, 51)
-    assert callable(stage)
-    short, long = stage(5.0).trajectory.at(t_s), stage(50.0).trajectory.at(t_s)
+    assert callable(scene)
+    short, long = scene(5.0).trajectory.at(t_s), scene(50.0).trajectory.at(t_s)
     drift: Array = se3_log(se3_inverse(short.T_world_imu) @ long.T_world_imu)
     np.testing.assert_allclose(drift, 0.0, atol=1e-9)

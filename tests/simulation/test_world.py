@@ -13,9 +13,9 @@ from toolkit.simulation.world import follow, room, visibility
 
 def view(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return poses (K, 4, 4), landmarks (M, 3) and their visibility (K, M) over 10 s."""
-    stage = scenario.stage(10.0)
-    poses = stage.trajectory.at(np.arange(0.0, 10.0, 1.0 / scenario.camera.rate_hz)).T_world_imu
-    return poses, stage.points, visibility(stage.points, poses, scenario.rig, scenario.camera)
+    scene = scenario.scene(10.0)
+    poses = scene.trajectory.at(np.arange(0.0, 10.0, 1.0 / scenario.camera.rate_hz)).T_world_imu
+    return poses, scene.points, visibility(scene.points, poses, scenario.rig, scenario.camera)
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)

@@ -1,7 +1,7 @@
 """An extrinsic whose translation belongs to its inverse.
 
 A file can hold a rotation IMU -> camera beside the camera's position in the IMU frame; inverted like a proper
-transform it puts the camera at p = -R_imu_cam t instead of t. Turning tells them apart: the camera's velocity
+transform it puts the camera at p = -R_imu_cam t instead of t. Rotation distinguishes the two: the camera's velocity
 differs from the IMU's by w x p. The measured share s of the way from the given p to the candidate t is a
 regression over the whole file; real odometry misplaces p by some decimetres, which is allowed for.
 """
@@ -15,7 +15,7 @@ from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import Array, se3
 
-# Without so much turning the regression is a matter of the camera's own errors, and nothing is said.
+# Largest standard error of the share: beyond it there was too little rotation, and no fault is reported.
 LARGEST_ERROR = 0.1
 # Standard errors by which the measured lever arm must lie beyond the middle between the two candidates.
 BEYOND_MIDDLE = 3.0
@@ -24,7 +24,7 @@ NEAR_CANDIDATE = 4.0
 # How far from the true lever arm (m) a regression on real odometry lands. Measured: 0.6 to 1 m towards
 # the other one on KITTI, whose INS velocities slip sideways in turns by 0.35 m times the turning rate.
 LEVER_ARM_SIGMA_M = 0.3
-# Log-likelihood ratio from which the candidate is believed.
+# Log-likelihood ratio from which the candidate is accepted.
 LOG_ODDS = 3.0
 
 

@@ -13,7 +13,7 @@ from toolkit.sequence import Sequence
 class Finding:
     """One fault found in a recording, as it is reported.
 
-    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` says
+    ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means
     that the fault is harmful and still there, so that a check of the recording has to fail.
     """
 
@@ -26,9 +26,9 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Symptom:
-    """What a check saw: how often, in words, and the sequence without it.
+    """What a check found: a count, a description, and the sequence without the fault.
 
-    ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` says in words what
+    ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
     the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks.
     """
 
@@ -52,11 +52,11 @@ class Evidence:
 
     @cached_property
     def intervals(self) -> Intervals | None:
-        """What the motion samples and the camera say of each interval; None where that cannot be compared."""
+        """The motion over each interval by the samples and by the camera; None where that cannot be compared."""
         return compare(self.sequence, self.camera_motion) if is_comparable(self.sequence) else None
 
     def after(self, remedy: Sequence) -> "Evidence":
-        """Return the evidence after a repair; what the tracks say is kept where the repair left them alone."""
+        """Return the evidence after a repair; the camera's motion is kept where the repair left them alone."""
         now, before = Evidence(remedy), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
         if same_tracks and "camera_motion" in self.__dict__:

@@ -13,7 +13,7 @@ from toolkit.audit.parts.robust import median_error
 from toolkit.geometry import Array
 from toolkit.sequence import Sequence, TwistSamples
 
-# Measured speed below which the vehicle stands, and the samples a standstill needs to say anything.
+# Measured speed below which the vehicle stands, and the fewest samples of a standstill that is used.
 STANDING_MPS = 0.05
 LEAST_STANDING = 50
 # A bias beyond these (rad/s) and beyond five standard errors more. The camera's own rotation is off by up to
@@ -24,7 +24,7 @@ SIGMAS = 5.0
 
 
 class _Reading(NamedTuple):
-    """Gyro readings (M, 3) rad/s that should be zero, the least bias told from them, and where they come from."""
+    """Gyro readings (M, 3) rad/s that should be zero, the least bias they can show, and where they come from."""
 
     residual_radps: Array
     least_radps: float

@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.reprojection import median_one_step_px
+from toolkit.audit.parts.intervals import Intervals, median_one_step_px
 from toolkit.audit.parts.robust import spread
 from toolkit.geometry import Array, se3
 from toolkit.sequence import Sequence
@@ -89,7 +88,7 @@ def _named(turn: Array) -> str:
 
 
 def _reprojections(sequence: Sequence, T_imu_cam: Array) -> str:
-    """Say what the turn does to the one-step stereo reprojection, where there are velocities to compute it."""
+    """Return the change of the one-step stereo reprojection as text, or "" without velocities to compute it."""
     if sequence.motion_kind == "imu":
         return ""
     given_px, turned_px = (median_one_step_px(sequence, T) for T in (sequence.rig.T_imu_cam, T_imu_cam))

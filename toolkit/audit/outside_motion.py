@@ -3,7 +3,7 @@
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.frames import keep_frames
+from toolkit.audit.parts.subsets import keep_frames
 
 
 def check(evidence: Evidence) -> Symptom | None:

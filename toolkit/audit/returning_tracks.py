@@ -1,7 +1,7 @@
 """Track ids that are absent for some frames and then come back.
 
-A tracker that lost a point and names it again has recognised it: an estimator that believes the id closes a
-loop for free, and one that meets a re-used id follows two different points as one.
+If the tracker recognised the point, an estimator that uses the id closes a loop without detecting one; if it re-used
+the id, two different points are estimated as one.
 """
 
 from dataclasses import replace

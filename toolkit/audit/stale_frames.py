@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.neighbours import Neighbours, neighbours
-from toolkit.audit.parts.tracks import by_track, split
+from toolkit.audit.parts.tracks import Neighbours, by_track, neighbours, split
 from toolkit.geometry import Array, BoolArray
 from toolkit.sequence import Observations, Sequence
 
@@ -20,7 +19,7 @@ from toolkit.sequence import Observations, Sequence
 LEAST_SHARE = 0.9
 # Tracks that must survive into the frame: fewer could repeat by chance where pixels are rounded.
 LEAST_TRACKS = 4
-# Upper quartile of the pixel steps that tells a moving camera (far points hardly move). Measured: at least 0.96 px
+# Upper quartile of the pixel steps above which the camera moves (far points hardly move). Measured: at least 0.96 px
 # beside a stale frame, at most 0.05 px with the vehicle parked.
 MOVING_PX = 0.5
 

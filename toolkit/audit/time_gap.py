@@ -1,4 +1,4 @@
-"""Holes in time: in the motion samples, where nothing tells how the vehicle moved, and in the frames.
+"""Holes in time: in the motion samples, where the motion is not measured, and in the frames.
 
 A hole in the frames alone is information, for the motion samples bridge it. A hole in the motion samples is a
 fault: whatever is put there is invented, and no noise model covers it. The longest stretch without such a
@@ -8,7 +8,7 @@ hole is kept; stitching the rest on would need a pose nobody measured.
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.frames import keep_frames
+from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import IntArray
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

@@ -3,8 +3,7 @@
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.frames import keep_frames
-from toolkit.audit.parts.samples import keep_samples
+from toolkit.audit.parts.subsets import keep_frames, keep_samples
 from toolkit.geometry import IntArray
 
 # What a cast of NaN to int64 gives.

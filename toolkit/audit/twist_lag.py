@@ -3,8 +3,8 @@
 With w_k the sample and c_k the camera's rotation over k -> k + 1, the lag s in c_k = (1 - s) w_k + s w_(k+1) is
 0 where the sample at the start describes the interval, 1 where that at the end does, 1/2 for their mean. Fitting
 it by least squares favours 1/2 on noisy samples, for a mean has half the noise; the change of the neighbouring
-camera rotations serves as an instrument, which follows the change of the samples but knows nothing of their
-noise, so the answer does not depend on the noise at all.
+camera rotations serves as an instrument, which follows the change of the samples and is independent of their
+noise, so the estimate does not depend on the noise.
 """
 
 from dataclasses import replace

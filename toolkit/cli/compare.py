@@ -16,6 +16,7 @@ from toolkit.cli.arguments import (
     epilog,
     kept_faults,
     named_file,
+    names,
 )
 
 if TYPE_CHECKING:
@@ -67,6 +68,9 @@ def add_to(subcommands: Subcommands) -> None:
     parser.add_argument(
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
     )
+    parser.add_argument(
+        "--columns", metavar="NAME,...", type=names, default=(), help="of the table: metrics by key or name, or all"
+    )
     add_settings_arguments(parser)
     add_workers_argument(parser)
     parser.set_defaults(command=command)
@@ -78,8 +82,10 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.run_directory import MadeBy, write_run
     from toolkit.report.session import directories_for
+    from toolkit.report.table import columns_asked
     from toolkit.report.terminal import comparison_text
 
+    columns = columns_asked(options.columns)
     asked = _configuration(options)
     plan, progress_for = _plan(asked, options.workers), of_this_process()
     cases = prepared_cases(plan, progress_for)
@@ -87,7 +93,7 @@ def command(options: argparse.Namespace) -> int:
     made_by = MadeBy(shlex.join(options.command_line), asked)
     all_ok = True
     for comparison, directory in zip(comparisons(plan, cases, progress_for), directories, strict=True):
-        print_above(comparison_text(comparison))
+        print_above(comparison_text(comparison, columns))
         with progress_for(f"{comparison.name}: figures and report"):
             write_run(comparison, directory, made_by)
         print_above(f"\nresults: {directory}\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import epilog
@@ -25,18 +26,21 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(_options: argparse.Namespace) -> int:
     """Print the lists."""
+    from toolkit import datasets, metrics
     from toolkit.audit import faults
-    from toolkit.datasets import built_in_names, formats
     from toolkit.estimator import discover
-    from toolkit.metrics import describe
     from toolkit.report.terminal import listing_text
 
     sections = {
         "estimators": {name: entry.summary() for name, entry in discover().items()},
-        "built-in sequences": dict.fromkeys(built_in_names(), ""),
-        "formats": formats(),
-        "metrics": describe(),
+        "built-in sequences": dict.fromkeys(datasets.built_in_names(), ""),
+        "formats": datasets.formats() | _marked(datasets.unavailable()),
+        "metrics": metrics.describe() | _marked(metrics.unavailable()),
         "faults": faults(),
     }
     print("\n\n".join(listing_text(title, entries) for title, entries in sections.items()))
     return 0
+
+
+def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:
+    return {name: f"unavailable: {why}" for name, why in unavailable.items()}

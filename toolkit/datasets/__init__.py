@@ -1,23 +1,25 @@
-"""Recordings: one module a source. A file dropped into this package is a new format or a new built-in sequence.
+"""Read recordings. Every module here is a format or offers built-in sequences, found by being here.
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, and one that simulates a part of them is
 :class:`DrawnFromASeed`. It imports nothing heavy at its top, because all modules are imported to recognise a path.
-Parts they share live in the sub-package ``parts``.
+Read ``course_npz`` first, then the others; parts they share are in ``io``, formats of trajectories in ``trajectories``.
+
+A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
 """
 
-import importlib
-import pkgutil
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
+from toolkit.discovery import MissingDependency, announced, modules_in
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.sequence import Sequence
 
+ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
 
 
@@ -26,9 +28,9 @@ class RecordingFormat(Protocol):
     """A module that reads one kind of recording; the first line of its docstring is its summary."""
 
     def recognises(self, path: Path) -> bool:
-        """Say from a glance at the content, never from the name alone, whether the path is of this format.
+        """Return whether the path is of this format, from the beginning of its content and never from its name alone.
 
-        A damaged recording of the format should still be recognised: ``load`` then says what is wrong with it.
+        A damaged recording of the format should still be recognised, so that ``load`` can report what is wrong.
         """
 
     def load(self, path: Path) -> Sequence:
@@ -61,25 +63,52 @@ class BuiltIns(Protocol):
     BUILT_IN: Mapping[str, Maker]
 
 
+class _Found(NamedTuple):
+    """The modules by the name a user reads, and why others cannot be used, by name."""
+
+    modules: Mapping[str, ModuleType]
+    missing: Mapping[str, str]
+
+
 @cache
-def _modules() -> Mapping[str, ModuleType]:
-    """Import every module directly in this package, by the name a user reads."""
-    found = [m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg]
-    return {name.replace("_", "-"): importlib.import_module(f"{__name__}.{name}") for name in found}
+def _found() -> _Found:
+    """Import every module of this package and of the announced ones.
+
+    Raises DataError where two have the same name, or one is neither a format nor has built-in sequences.
+    """
+    modules: dict[str, ModuleType] = {}
+    missing: dict[str, str] = {}
+    for found in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP, DataError)):
+        if found.name in modules:
+            raise DataError(f"two dataset modules are called {found.name}, the second is {found.path}; rename one")
+        try:
+            module = found.load()
+        except MissingDependency as dependency:
+            missing[found.name] = str(dependency)
+            continue
+        if not isinstance(module, RecordingFormat | BuiltIns):
+            raise DataError(f"{found.path}: defines neither recognises(path) and load(path) nor BUILT_IN")
+        modules[found.name] = module
+    return _Found(modules, missing)
 
 
 def _readers() -> dict[str, RecordingFormat]:
-    return {name: module for name, module in _modules().items() if isinstance(module, RecordingFormat)}
+    return {name: module for name, module in _found().modules.items() if isinstance(module, RecordingFormat)}
 
 
 def formats() -> dict[str, str]:
     """Return the summary of every format a path can have, by name."""
-    return {name: (_modules()[name].__doc__ or "").partition("\n")[0] for name in _readers()}
+    return {name: (_found().modules[name].__doc__ or "").partition("\n")[0] for name in _readers()}
+
+
+def unavailable() -> dict[str, str]:
+    """Return the dataset modules that cannot be imported here, by name, with the dependency they lack."""
+    return dict(_found().missing)
 
 
 def built_ins() -> dict[str, Maker]:
     """Return the maker of every built-in sequence, by name."""
-    offers = [module for module in _modules().values() if isinstance(module, BuiltIns)]
+    offers = [module for module in _found().modules.values() if isinstance(module, BuiltIns)]
     return {name: make for offer in offers for name, make in sorted(offer.BUILT_IN.items())}
 
 
@@ -131,7 +160,8 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
             return reader
     empty = path.is_file() and path.stat().st_size == 0
     what = "the file is empty and so of no known format" if empty else "its content is of no known format"
-    raise DataError(f"{source}: {what}; there are {', '.join(formats())}")
+    lacking = "".join(f"; {name} is unavailable: {why}" for name, why in unavailable().items())
+    raise DataError(f"{source}: {what}; there are {', '.join(formats())}{lacking}")
 
 
 def _check_readable(path: Path, source: str) -> None:

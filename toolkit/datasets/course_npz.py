@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count
+from toolkit.datasets.io.fields import Fields, check_frame_count, observations, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, SparseArray, glance, opened
-from toolkit.datasets.io.stamps import stamps_ns
-from toolkit.datasets.io.stereo_rows import observations
 from toolkit.geometry import Array, se3_inverse
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, TwistSamples

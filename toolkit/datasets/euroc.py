@@ -3,10 +3,10 @@
 A folder with ``mav0/`` (or ``mav0`` itself), or a lean one: imu.csv, cam_timestamps_ns.txt and a truth table. No front
 end undistorts its images here, so what the pair would see is simulated at the real camera stamps: a rectified pair
 with the left camera's intrinsics and extrinsic and the real baseline, in a room around the trajectory. The sequence's
-name and provenance say so, and with them every report.
+name and provenance state this, and with them every report.
 
-Errors of the truth reach the estimators as disagreement of tracks and IMU; ``parts/euroc_calibration`` says what the
-noise makes of it.
+Errors of the truth reach the estimators as disagreement of tracks and IMU; ``io/euroc_calibration`` has
+the noise densities that allow for it.
 The body is the IMU; quaternions are Hamilton, w first.
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016).
 """
@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.asl_table import columns_of, read_stamps, read_table
 from toolkit.datasets.io.euroc_calibration import (
     ACCEL_FACTOR,
     GYRO_FACTOR,
@@ -27,6 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth
 from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, interpolate_poses

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.stamps import stamps_ns
+from toolkit.datasets.io.fields import stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.models.noise import pixel_covariance

@@ -15,10 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.io.csv_table import find_table, first_line, read_columns
-from toolkit.datasets.io.fields import Fields, check_frame_count
-from toolkit.datasets.io.stamps import stamps_ns
-from toolkit.datasets.io.stereo_rows import observations
+from toolkit.datasets.io.fields import Fields, check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.tables import find_table, first_line, read_columns
 from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError

@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid
-from toolkit.datasets.io.stamps import stamps_ns
-from toolkit.datasets.io.stereo_rows import observations
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid, observations, stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
@@ -112,7 +110,7 @@ def _sightings(fields: Fields, frame_count: int) -> Observations:
 def _measured_noise(fields: Fields, t_ns: IntArray, v_mps: Array, w_radps: Array) -> TwistNoise:
     """Return densities of twists of measured variance, each held over one median step: sigma sqrt(dt).
 
-    Samples that scatter more than the file says, because somebody added noise to them, are believed.
+    Where the samples scatter more than the file states, because noise was added to them, their scatter is used.
     """
     root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
     v_sigma = np.maximum(np.sqrt(fields.constant("v_var", 3, 1)[:, 0]), white_sigma(v_mps))

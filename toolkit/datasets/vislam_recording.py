@@ -92,7 +92,7 @@ def save(sequence: Sequence, directory: Path) -> None:
 
 
 def _cause(directory: Path, error: OSError) -> str:
-    """Say what stands in the way of a folder: a file in its path, or what the system says."""
+    """Return why a folder cannot be written: a file in its path, or the system's error message."""
     in_the_way = next((parent for parent in directory.parents if parent.is_file()), None)
     return f"{in_the_way} is a file" if in_the_way else error.strerror or str(error)
 
@@ -262,7 +262,7 @@ def _check_whole(sequence: Sequence, text: Text, file: Path) -> None:
     """Raise DataError where the two files are not of one recording or the observations point to no frame."""
     if text.get("counts") != _counts(sequence):
         raise DataError(
-            f"{file}: counts say {text.get('counts')}, {_ARRAYS} holds {_counts(sequence)}; copy both files again"
+            f"{file}: counts are {text.get('counts')}, {_ARRAYS} holds {_counts(sequence)}; copy both files again"
         )
     observations = sequence.observations
     if not len(observations) == observations.track_id.size == len(observations.uv_px):

@@ -63,6 +63,11 @@ class Row:
         return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
 
     @property
+    def answered(self) -> bool:
+        """Say whether any run gave this kind of output."""
+        return any(self.output in outcome.outputs for outcome in self.outcomes)
+
+    @property
     def repeats_causal(self) -> bool:
         """Say whether this is a final answer that only repeats the causal one, as a filter's does."""
         return self.output == "final" and self._final_is_causal

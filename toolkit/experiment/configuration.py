@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.settings import Settings, SettingsError, as_values, nearest, read_toml, settings_of
+from toolkit.errors import did_you_mean
+from toolkit.settings import Settings, SettingsError, as_values, read_toml, settings_of
 
 # The table of a configuration that says what to compare; all others are settings.
 COMPARE = "compare"
@@ -49,7 +50,7 @@ def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place
     known = [field.name for field in msgspec.structs.fields(Request)]
     for key in request:
         if key not in known:
-            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{nearest(key, known)}")
+            raise SettingsError(f"{place}: there is no {COMPARE}.{key}{did_you_mean(key, known)}")
     try:
         asked = msgspec.convert(dict(request), Request)
     except msgspec.ValidationError as error:

@@ -10,7 +10,7 @@ from toolkit.estimate import Output, Run, Status
 from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics import Evaluation, Scores, score_run
+from toolkit.metrics import Evaluation, Scores, repeated, score_run
 from toolkit.metrics._shared.consistency import body_errors, nees_over_time
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.progress import Progress
@@ -85,7 +85,12 @@ def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
 
 def outcome_of(run: Run, sequence: Sequence, seed: int) -> Outcome:
     """Score every output of a run."""
-    outputs = {output: _scored(run, output, sequence) for output in OUTPUTS if run.trajectory(output) is not None}
+    given = [output for output in OUTPUTS if run.trajectory(output) is not None]
+    if run.final_is_causal:
+        causal = _scored(run, "causal", sequence)
+        outputs: dict[Output, Scored] = {"causal": causal, "final": replace(causal, scores=repeated(causal.scores))}
+    else:
+        outputs = {output: _scored(run, output, sequence) for output in given}
     return Outcome(seed, run.estimator, run.status, outputs, run.log, sequence.content_hash(), run.final_is_causal, run)
 
 

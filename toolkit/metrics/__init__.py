@@ -1,30 +1,49 @@
-"""Judge a run: every module here is one file of metrics, discovered by being here.
+"""Score a run. Every module here is a metric file, found by being here; other packages bring more of them.
 
-A metric file defines ``METRICS`` (key -> one line with the unit, in the order of a table), ``ORDER`` (where
-its keys stand among those of other files) and ``score(evaluation) -> Scores``. What several files need lives in
-:mod:`toolkit.metrics._shared`.
-What each number means and what it is blind to: docs/metrics.md.
+A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with all that tables and files
+say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why
+its metrics belong to the causal output alone, where they do.
+Read :mod:`toolkit.metrics._shared.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
+
+A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
 """
 
-import importlib
-import pkgutil
+from collections.abc import Iterable
 from functools import cache
-from typing import Protocol, cast
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 
+from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
+from toolkit.errors import VislamError, no_such
 from toolkit.estimate import Output, Run
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.sequence import Sequence
 
-__all__ = ["Evaluation", "Scores", "describe", "score_run"]
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "Evaluation",
+    "Metric",
+    "Scores",
+    "Unavailable",
+    "contract_keys",
+    "describe",
+    "evaluate",
+    "known_metrics",
+    "metrics_called",
+    "repeated",
+    "score_run",
+    "unavailable",
+]
+
+ENTRY_POINT_GROUP = "toolkit.metrics"
 
 
 class MetricFile(Protocol):
-    """What a module of this package defines."""
+    """What a metric file defines."""
 
-    METRICS: dict[str, str]
+    METRICS: tuple[Metric, ...]
     ORDER: int
 
     def score(self, evaluation: Evaluation) -> Scores:
@@ -34,17 +53,70 @@ class MetricFile(Protocol):
         """
 
 
+class _Found(NamedTuple):
+    """The metric files by their ORDER, and why others cannot be used, by name."""
+
+    files: tuple[MetricFile, ...]
+    missing: dict[str, str]
+
+
 @cache
-def _metric_files() -> tuple[MetricFile, ...]:
-    """Import every module of this package, in the order of their keys."""
-    names = sorted(f"{__name__}.{m.name}" for m in pkgutil.iter_modules(__path__) if not m.ispkg)
-    files = [cast(MetricFile, importlib.import_module(name)) for name in names]
-    return tuple(sorted(files, key=lambda file: file.ORDER))
+def _found() -> _Found:
+    """Import every metric file of this package and of the announced ones.
+
+    Raises VislamError where two files declare the same key.
+    """
+    files: list[MetricFile] = []
+    missing: dict[str, str] = {}
+    for module in (*_own_modules(), *announced(ENTRY_POINT_GROUP)):
+        try:
+            files.append(cast(MetricFile, module.load()))
+        except MissingDependency as dependency:
+            missing[module.name] = str(dependency)
+    keys = [metric.key for file in files for metric in file.METRICS]
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    if twice:
+        raise VislamError(f"more than one metric file declares {', '.join(twice)}; rename one of them")
+    return _Found(tuple(sorted(files, key=lambda file: file.ORDER)), missing)
+
+
+def _own_modules() -> list[FoundModule]:
+    return sorted(modules_in(__name__, __path__), key=lambda module: module.module)
+
+
+def known_metrics() -> tuple[Metric, ...]:
+    """Return every metric there is, in the order of tables and files."""
+    return tuple(metric for file in _found().files for metric in file.METRICS)
 
 
 def describe() -> dict[str, str]:
-    """Return every metric's key with its one-line description, unit included, in the order of a table."""
-    return {key: line for file in _metric_files() for key, line in file.METRICS.items()}
+    """Return every metric's key with its one-line meaning, unit included, in the order of tables and files."""
+    return {metric.key: metric.meaning for metric in known_metrics()}
+
+
+def unavailable() -> dict[str, str]:
+    """Return the metric files that cannot be imported here, by name, with the dependency they lack."""
+    return dict(_found().missing)
+
+
+def contract_keys() -> tuple[str, ...]:
+    """Return the keys that every ``vislam.metrics/1`` document has, in its order."""
+    files = sorted((cast(MetricFile, module.load()) for module in _own_modules()), key=lambda file: file.ORDER)
+    return tuple(metric.key for file in files for metric in file.METRICS if metric.in_contract)
+
+
+def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
+    """Return the metrics of the given keys or names ("ate_se3_m" or "ATE SE(3)"), in the given order.
+
+    Raises VislamError for a name that no metric has, with the nearest one.
+    """
+    known = known_metrics()
+    by_name = {metric.name: metric for metric in known} | {metric.key: metric for metric in known}
+    chosen = tuple(names)
+    for name in chosen:
+        if name not in by_name:
+            raise VislamError(no_such("column", name, by_name))
+    return tuple(by_name[name] for name in chosen)
 
 
 def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
@@ -57,18 +129,38 @@ def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
-        for file in _metric_files():
+        for file in _found().files:
             scores = _score_file(file, evaluation)
-            if list(scores.values) != list(file.METRICS):
-                raise ValueError(f"{file} scored {list(scores.values)}, it promises {list(file.METRICS)}")
+            declared = [metric.key for metric in file.METRICS]
+            if list(scores.values) != declared:
+                raise ValueError(f"{file} scored {list(scores.values)}, it declares {declared}")
             values |= scores.values
             notes |= scores.notes
+    return Scores(values, notes)
+
+
+def repeated(causal: Scores) -> Scores:
+    """Return the scores of a final output that only repeats the causal one: the same, but what is causal alone."""
+    values, notes = dict(causal.values), dict(causal.notes)
+    for file in _found().files:
+        if reason := _causal_only(file):
+            keys = [metric.key for metric in file.METRICS]
+            values |= dict.fromkeys(keys)
+            notes |= dict.fromkeys(keys, reason)
     return Scores(values, notes)
 
 
 def _score_file(file: MetricFile, evaluation: Evaluation) -> Scores:
     """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
     try:
+        if evaluation.output != "causal" and (reason := _causal_only(file)):
+            raise Unavailable(reason)
         return file.score(evaluation)
-    except Unavailable as reason:
-        return Scores(dict.fromkeys(file.METRICS), dict.fromkeys(file.METRICS, str(reason)))
+    except Unavailable as lacking:
+        keys = [metric.key for metric in file.METRICS]
+        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(lacking)))
+
+
+def _causal_only(file: MetricFile) -> str:
+    """Return why a file's metrics belong to the causal output alone; nothing where they do not."""
+    return str(getattr(file, "CAUSAL_ONLY", ""))

@@ -5,17 +5,53 @@ import numpy as np
 from toolkit.geometry import Array
 from toolkit.metrics._shared.alignment import Alignment, fit_sim3, fit_yaw
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.relative import angles_deg, lengths, rmse
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import angles_deg, lengths, rmse
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 10
-METRICS = {
-    "ate_none_m": "RMSE of position with only the first pose placed, nothing fitted (m)",
-    "ate_se3_m": "RMSE of position after fitting rotation and translation (m)",
-    "ate_yaw_m": "RMSE of position after fitting heading and translation (m)",
-    "ate_sim3_m": "RMSE of position after fitting rotation, translation and scale (m)",
-    "ate_se3_deg": "RMSE of the rotation angle after the fit of ate_se3_m (deg)",
-}
+METRICS = (
+    Metric(
+        "ate_none_m",
+        "RMSE of position with only the first pose placed, nothing fitted (m)",
+        "m",
+        ("ATE", "none"),
+        over_seeds=True,
+        in_contract=True,
+    ),
+    Metric(
+        "ate_se3_m",
+        "RMSE of position after fitting rotation and translation (m)",
+        "m",
+        ("ATE", "SE(3)"),
+        table="always",
+        gate_name="position error (ATE, SE(3))",
+        in_contract=True,
+    ),
+    Metric(
+        "ate_yaw_m",
+        "RMSE of position after fitting heading and translation (m)",
+        "m",
+        ("ATE", "yaw"),
+        table="always",
+        over_seeds=True,
+        gate_name="position error (ATE, yaw)",
+        in_contract=True,
+    ),
+    Metric(
+        "ate_sim3_m",
+        "RMSE of position after fitting rotation, translation and scale (m)",
+        "m",
+        ("ATE", "Sim(3)"),
+        in_contract=True,
+    ),
+    Metric(
+        "ate_se3_deg",
+        "RMSE of the rotation angle after the fit of ate_se3_m (deg)",
+        "deg",
+        ("ATE rot", "SE(3)"),
+        in_contract=True,
+    ),
+)
 # A world this far from level (deg), which explains more than half of the squared error of the fit that keeps the
 # vertical, is worth a remark; a straight path leaves its roll undetermined and explains nothing by it.
 _TILTED_DEG, _EXPLAINED = 1.0, 0.5
@@ -39,7 +75,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def _tilt_remark(evaluation: Evaluation, scores: Scores) -> str:
-    """Say that the two worlds do not agree on the vertical, where an IMU measures it and it matters; else nothing."""
+    """Return a remark where the verticals disagree, an IMU measures them and that explains the error; else nothing."""
     se3_m, yaw_m = scores.values["ate_se3_m"], scores.values["ate_yaw_m"]
     if evaluation.sequence.motion_kind != "imu" or se3_m is None or yaw_m is None:
         return ""

@@ -5,17 +5,45 @@ import numpy as np
 from toolkit.estimate import Timings
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 90
-METRICS = {
-    "frame_ms_mean": "mean wall-clock time of a step, the first included (ms)",
-    "frame_ms_p95": "95th percentile of the same (ms)",
-    "frame_ms_max": "longest step (ms)",
-    "total_s": "wall-clock time of all steps and the finish (s)",
-    "cpu_s": "processor time of all threads (s)",
-    "peak_rss_mb": "peak resident memory of the process (MB)",
-}
+METRICS = (
+    Metric(
+        "frame_ms_mean",
+        "mean wall-clock time of a step, the first included (ms)",
+        "ms",
+        ("frame", "mean"),
+        in_contract=True,
+    ),
+    Metric("frame_ms_p95", "95th percentile of the same (ms)", "ms", ("frame", "p95"), in_contract=True),
+    Metric("frame_ms_max", "longest step (ms)", "ms", ("frame", "max"), in_contract=True),
+    Metric(
+        "total_s",
+        "wall-clock time of all steps and the finish (s)",
+        "s",
+        ("total", ""),
+        table="always",
+        in_contract=True,
+    ),
+    Metric("cpu_s", "processor time of all threads (s)", "s", ("CPU", ""), in_contract=True),
+    Metric(
+        "peak_rss_mb",
+        "peak resident memory of the process (MB)",
+        "MB",
+        ("peak", "memory"),
+        decimals=0,
+        in_contract=True,
+    ),
+    Metric(
+        "frame_cpu_ms_mean",
+        "processor time of all threads, the finish included, over the number of steps (ms)",
+        "ms",
+        ("CPU", "frame"),
+        table="always",
+        over_seeds=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -31,6 +59,7 @@ def score(evaluation: Evaluation) -> Scores:
             "total_s": lambda: timings.total_s,
             "cpu_s": lambda: timings.cpu_s,
             "peak_rss_mb": lambda: _measured(timings.peak_rss_mb),
+            "frame_cpu_ms_mean": lambda: 1e3 * timings.cpu_s / _steps_ms(timings).size,
         }
     )
 

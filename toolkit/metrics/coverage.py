@@ -1,15 +1,36 @@
-"""How much of the sequence the other numbers speak of."""
+"""Over how much of the sequence the other metrics are computed."""
 
 import numpy as np
 
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 80
-METRICS = {
-    "coverage_percent": "frames with a finite pose, of those within the truth's time range if there is one (percent)",
-    "pairs": "matched pairs of true and estimated poses (count)",
-}
+METRICS = (
+    Metric(
+        "coverage_percent",
+        "frames with a finite pose, of those within the truth's time range if there is one (percent)",
+        "%",
+        ("cover", ""),
+        name="coverage",
+        decimals=1,
+        best="most",
+        table="where rows differ",
+        gate_name="coverage",
+        in_contract=True,
+    ),
+    Metric(
+        "pairs",
+        "matched pairs of true and estimated poses (count)",
+        "",
+        ("pairs", ""),
+        decimals=0,
+        best="",
+        table="where rows differ",
+        count=True,
+        in_contract=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:

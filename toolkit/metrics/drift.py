@@ -1,14 +1,20 @@
-"""Where the run ends: the distance between the last true and estimated positions, over the path."""
+"""End drift: the distance between the last true and estimated positions, over the path."""
 
 import numpy as np
 
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 40
-METRICS = {
-    "end_drift_percent": "position error at the end with only the first pose placed, over the true path (percent)"
-}
+METRICS = (
+    Metric(
+        "end_drift_percent",
+        "position error at the end with only the first pose placed, over the true path (percent)",
+        "%",
+        ("end", "drift"),
+        in_contract=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:

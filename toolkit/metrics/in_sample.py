@@ -1,18 +1,31 @@
-"""In-sample reprojection: the estimator's own landmarks, seen from its own poses, against what it was given."""
+"""In-sample reprojection: the estimator's own landmarks, projected from its own poses, against its observations."""
 
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.reprojection import median_px, observation_errors_px, remark, rmse_px
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import median_px, reprojection_errors_px, rmse_px, scored_remark
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.models import stereo
 
 ORDER = 50
-METRICS = {
-    "reproj_median_px": "median reprojection error of the estimator's landmarks, in-sample (px)",
-    "reproj_rmse_px": "RMSE of the same, each observation's error capped at 100 px (px)",
-}
+METRICS = (
+    Metric(
+        "reproj_median_px",
+        "median reprojection error of the estimator's own landmarks, in-sample (px)",
+        "px",
+        ("reproj", "own"),
+        in_contract=True,
+    ),
+    Metric(
+        "reproj_rmse_px",
+        "RMSE of the same, each observation's error capped at 100 px (px)",
+        "px",
+        ("own", "RMSE"),
+        name="reproj own RMSE",
+        in_contract=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -20,7 +33,7 @@ def score(evaluation: Evaluation) -> Scores:
     errors_px = errors(evaluation)
     scores = evaluate({"reproj_median_px": lambda: median_px(errors_px), "reproj_rmse_px": lambda: rmse_px(errors_px)})
     lacking = "lack a landmark, a second sighting or a pose of their frame"
-    return scores.remarked(METRICS, remark(errors_px, len(evaluation.sequence.visible), lacking))
+    return scores.remarked(scores.values, scored_remark(errors_px, len(evaluation.sequence.visible), lacking))
 
 
 def errors(evaluation: Evaluation) -> Array:
@@ -38,7 +51,7 @@ def errors(evaluation: Evaluation) -> Array:
     T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)
-    return observation_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)
+    return reprojection_errors_px(uv_predicted_px, observations.uv_px[known], points_cam[:, 2] > 0.0)
 
 
 def _seen_again(track_ids: IntArray) -> BoolArray:

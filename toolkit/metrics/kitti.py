@@ -9,14 +9,27 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.relative import angles_deg, lengths, relative_errors
-from toolkit.metrics._shared.scores import Scores, Unavailable
+from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 
 ORDER = 30
-METRICS = {
-    "kitti_t_percent": "mean translation error over segments of 100 ... 800 m (percent)",
-    "kitti_r_deg_per_m": "mean rotation error over segments of 100 ... 800 m (deg/m)",
-}
+METRICS = (
+    Metric(
+        "kitti_t_percent",
+        "mean translation error over segments of 100 ... 800 m (percent)",
+        "%",
+        ("KITTI", "trans"),
+        in_contract=True,
+    ),
+    Metric(
+        "kitti_r_deg_per_m",
+        "mean rotation error over segments of 100 ... 800 m (deg/m)",
+        "deg/m",
+        ("KITTI", "rot"),
+        decimals=3,
+        in_contract=True,
+    ),
+)
 SEGMENT_LENGTHS_M = np.arange(100.0, 801.0, 100.0)
 START_EVERY = 10
 

@@ -1,4 +1,4 @@
-"""Normalised estimation error squared: is the error as large as the estimator says it is?
+"""Normalised estimation error squared: are the errors as large as the stated covariance expects?
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
@@ -7,16 +7,52 @@ import numpy as np
 
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores
+from toolkit.metrics._shared.scores import Metric, Scores
 
 ORDER = 75
-METRICS = {
-    "nees_pose_mean": "mean normalised error squared of the pose over its 6 degrees of freedom; 1 is consistent",
-    "nees_ori_mean": "the same of the orientation alone, over its 3 degrees of freedom",
-    "nees_pos_mean": "the same of the position alone, over its 3 degrees of freedom",
-    "nees_pose_in_band_percent": "poses whose NEES is within the two-sided 95 % chi-square band of one run (percent)",
-}
-_PLACED = "the estimate's world is its own: its first pose was placed on the truth's, whose noise there counts in full"
+METRICS = (
+    Metric(
+        "nees_pose_mean",
+        "mean normalised error squared of the pose over its 6 degrees of freedom; 1 is consistent",
+        "1",
+        ("NEES", "pose"),
+        best="one",
+        table="always",
+        over_seeds=True,
+        gate_name="consistency (NEES)",
+        in_contract=True,
+    ),
+    Metric(
+        "nees_ori_mean",
+        "the same of the orientation alone, over its 3 degrees of freedom",
+        "1",
+        ("NEES", "rot"),
+        best="one",
+        over_seeds=True,
+        in_contract=True,
+    ),
+    Metric(
+        "nees_pos_mean",
+        "the same of the position alone, over its 3 degrees of freedom",
+        "1",
+        ("NEES", "pos"),
+        best="one",
+        over_seeds=True,
+        in_contract=True,
+    ),
+    Metric(
+        "nees_pose_in_band_percent",
+        "poses whose NEES is within the two-sided 95 % chi-square band of one run (percent)",
+        "%",
+        ("NEES", "in band"),
+        decimals=1,
+        best="most",
+        in_contract=True,
+    ),
+)
+_PLACED = (
+    "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
+)
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -31,4 +67,4 @@ def score(evaluation: Evaluation) -> Scores:
             "nees_pose_in_band_percent": 100.0 * float(np.mean((nees.pose >= low) & (nees.pose <= high))),
         }
     )
-    return scores.remarked(METRICS, _PLACED if nees.placed else "")
+    return scores.remarked(scores.values, _PLACED if nees.placed else "")

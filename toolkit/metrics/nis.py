@@ -1,4 +1,4 @@
-"""Normalised innovation squared: does the filter believe its own residuals as much as it should?
+"""Normalised innovation squared: are the innovations as large as their stated covariance expects?
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4.
 """
@@ -6,10 +6,22 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 import numpy as np
 
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 70
-METRICS = {"nis_mean": "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent"}
+CAUSAL_ONLY = "innovations belong to the causal output"
+METRICS = (
+    Metric(
+        "nis_mean",
+        "sum of the normalised innovations squared over their degrees of freedom; 1 is consistent",
+        "1",
+        ("NIS", "mean"),
+        best="one",
+        over_seeds=True,
+        gate_name="consistency (NIS)",
+        in_contract=True,
+    ),
+)
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -18,8 +30,6 @@ def score(evaluation: Evaluation) -> Scores:
 
 
 def _nis_per_dof(evaluation: Evaluation) -> float:
-    if evaluation.output != "causal":
-        raise Unavailable("innovations belong to the causal output")
     nis, dof = evaluation.run.info.get("nis"), evaluation.run.info.get("nis_dof")
     if nis is None or dof is None:
         raise Unavailable("the estimator reports no innovations")

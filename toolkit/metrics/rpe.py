@@ -1,4 +1,4 @@
-"""Relative pose error over one second and over 100 metres: drift, whatever happened before.
+"""Relative pose error over one second and over 100 metres: drift, independent of earlier errors.
 
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
 """
@@ -11,18 +11,33 @@ import numpy as np
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.relative import angles_deg, lengths, relative_errors, rmse
-from toolkit.metrics._shared.scores import Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors, rmse
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.resampling import NS_PER_S
 
 ORDER = 20
-METRICS = {
-    "rpe_1s_m": "RMSE of the translation error over 1 s (m)",
-    "rpe_1s_deg": "RMSE of the rotation error over 1 s (deg)",
-    "rpe_100m_percent": "RMSE of the translation error over 100 m of true path (percent)",
-}
+METRICS = (
+    Metric("rpe_1s_m", "RMSE of the translation error over 1 s (m)", "m", ("RPE", "1 s"), decimals=3, in_contract=True),
+    Metric(
+        "rpe_1s_deg",
+        "RMSE of the rotation error over 1 s (deg)",
+        "deg",
+        ("RPE rot", "1 s"),
+        decimals=3,
+        in_contract=True,
+    ),
+    Metric(
+        "rpe_100m_percent",
+        "RMSE of the translation error over 100 m of true path (percent)",
+        "%",
+        ("RPE", "100 m"),
+        table="always",
+        gate_name="drift over 100 m",
+        in_contract=True,
+    ),
+)
 INTERVAL_M = 100.0
-# A pair may be longer than asked for by this much, or it spans a gap and is left out: 1.5 steps of the matched
+# A pair may be longer than the interval by this much; else it spans a gap and is left out: 1.5 steps of the matched
 # stamps for the second (the first stamp beyond it is at most one step late), a tenth for the 100 m (as evo does).
 _LATEST_IN_STEPS = 1.5
 _LONGEST_OVER_INTERVAL = 1.1
@@ -46,10 +61,6 @@ def score(evaluation: Evaluation) -> Scores:
             ),
         }
     )
-
-
-def _percent(error_m: float) -> float:
-    return error_m / INTERVAL_M * 100.0
 
 
 def _errors(evaluation: Evaluation, choose: Callable[[Matched], _Intervals]) -> Array:

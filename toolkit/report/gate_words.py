@@ -4,19 +4,11 @@ import textwrap
 from collections.abc import Iterable, Iterator
 
 from toolkit.gate.verdict import Check, Verdict
+from toolkit.metrics import known_metrics
 from toolkit.report.gate_table import failures_table, gate_table
 from toolkit.report.table import as_markdown, as_text
 
-_WIDTH = 118
-_PLAIN = {
-    "ate_se3_m": "position error (ATE, SE(3))",
-    "ate_yaw_m": "position error (ATE, yaw)",
-    "rpe_100m_percent": "drift over 100 m",
-    "nees_pose_mean": "consistency (NEES)",
-    "nis_mean": "consistency (NIS)",
-    "heldout_reproj_median_px": "held-out reprojection",
-    "coverage_percent": "coverage",
-}
+_WIDTH = 100
 
 
 def headline(check: Check) -> str:
@@ -39,11 +31,15 @@ def failure_lines(check: Check) -> Iterator[str]:
 def about(verdict: Verdict) -> str:
     """Return what a verdict is about, in words."""
     who = f"{verdict.estimator} {verdict.output}".strip()
-    what = _PLAIN.get(verdict.metric, verdict.metric)
+    what = _gate_name(verdict.metric)
     on = f"{verdict.sequence}, {who}" if who else verdict.sequence
     if verdict.finding == "missing":
         return f"{on}: {what} is missing"
     return f"{on}: {what} got worse" if verdict.finding == "regressed" else f"{on}: {what}"
+
+
+def _gate_name(key: str) -> str:
+    return next((m.gate_name for m in known_metrics() if m.key == key and m.gate_name), key)
 
 
 def note_lines(check: Check) -> Iterator[str]:

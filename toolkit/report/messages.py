@@ -5,14 +5,17 @@ from collections.abc import Callable, Iterator
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.metrics import unavailable
 from toolkit.report.metrics_json import path_length_m
-from toolkit.report.table import COLUMNS
+from toolkit.report.table import Columns, explained_metrics, shared_values
 from toolkit.sequence import Sequence
 
+# A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
+_MOSTLY_PERCENT = 80.0
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
-# Remarks on these are told beside the table, the others at the end of the report only.
+# Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
 _STATUS = {
@@ -35,6 +38,15 @@ def sequence_line(sequence: Sequence) -> str:
     return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
 
 
+def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield what stands above a table: the recording, then the matched pairs and the coverage the rows share."""
+    seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
+    yield sequence_line(comparison.sequence) + seeds
+    shared = ", ".join(shared_values(comparison, columns))
+    if shared:
+        yield f"scored: {shared}"
+
+
 def finding_lines(comparison: Comparison) -> Iterator[str]:
     """Yield a line a finding of the audit, or the good news that there is none."""
     if not comparison.findings:
@@ -50,10 +62,17 @@ def outcome(finding: Finding) -> str:
     return "not repaired" if finding.blocking else "for information"
 
 
-def status_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield a calm explanation of every run that did not end well, and what each run had to say on the way."""
+def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield what must be known before a table is believed: how runs ended, remarks on errors, what is missing."""
     if not len(comparison.sequence.observations):
         yield _BLIND
+    yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
+    yield from truth_lines(comparison)
+    yield from missing_lines(comparison, columns)
+
+
+def _ends(comparison: Comparison) -> Iterator[str]:
+    """Yield a calm explanation of every run that did not end well, and what each run had to say on the way."""
     for run in comparison.runs:
         if run.status in _STATUS:
             yield f"{run.estimator} {_STATUS[run.status]}"
@@ -63,27 +82,71 @@ def status_lines(comparison: Comparison) -> Iterator[str]:
             yield f"{run.estimator}: {len(run.log) - _LOG_ENTRIES} more entries are in the log in metrics.json"
 
 
+def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
+    """Yield the runs that did not end well, with the log of the first of each kind."""
+    for estimator in comparison.estimators:
+        for status in ("diverged", "failed"):
+            bad = [o for o in comparison.outcomes if o.estimator == estimator and o.status == status]
+            if bad:
+                log = bad[0].log
+                # A run that failed begins with the reason; the runner appends what diverged to the estimator's log.
+                why = f": {' '.join(log[0 if status == 'failed' else -1].split())}" if log else ""
+                seeds = f"seed{'s' if len(bad) > 1 else ''} {', '.join(str(o.seed) for o in bad)}"
+                yield f"{estimator} {status} under {seeds}{why}"
+    if not comparison.all_ok:
+        yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
+
+
+def consistency_lines(comparison: Comparison) -> Iterator[str]:
+    """Yield, over seeds, a verdict a row on whether its stated covariance is honest; equal verdicts once."""
+    if not comparison.over_seeds:
+        return
+    given: set[str] = set()
+    for row in comparison.rows:
+        nees = row.mean_nees
+        if nees is None:
+            yield f"{row.estimator} {row.output}: {row.reason('nees_pose_mean')}"
+            continue
+        verdict = f"{row.estimator}{{}}: in its band at {nees.in_band_percent:.0f} % of the frames"
+        if nees.in_band_percent < _MOSTLY_PERCENT:
+            above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
+            how = "too sure of itself" if above >= below else "less sure of itself than it could be"
+            verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
+        if verdict not in given:
+            given.add(verdict)
+            same = sum(r.estimator == row.estimator and _equal(r, row) for r in comparison.rows) > 1
+            yield verdict.format("" if same else f" {row.output}")
+
+
+def _equal(one: Row, other: Row) -> bool:
+    nees, others = one.mean_nees, other.mean_nees
+    return nees is not None and others is not None and nees.in_band_percent == others.in_band_percent
+
+
 def truth_lines(comparison: Comparison) -> Iterator[str]:
     """Yield what must be known before an error against the truth is believed."""
     return _remarks(comparison, lambda key: key.startswith(_AGAINST_TRUTH))
 
 
-def missing_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield, for each reason, the columns of the table that are empty for it, and whose where not everybody's.
+def missing_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield, for each reason, the metrics of the table without a value for it, and whose where not everybody's.
 
-    A run without any answer is explained by its status already and left out here.
+    A run without any answer is explained by its status already and left out here. Last come metric files that
+    could not be imported.
     """
-    rows = [row for row in comparison.lines if row.run.trajectory(row.output) is not None]
+    rows = [row for row in comparison.lines if row.answered]
     empty: dict[tuple[str, str], list[str]] = {}
-    for column in COLUMNS:
+    for metric in explained_metrics(comparison, columns):
         by_reason: dict[str, list[Row]] = {}
         for row in rows:
-            if row.scores.values.get(column.key) is None:
-                by_reason.setdefault(row.scores.notes.get(column.key, "not computed"), []).append(row)
+            if row.value(metric.key) is None:
+                by_reason.setdefault(row.reason(metric.key), []).append(row)
         for reason, affected in by_reason.items():
-            empty.setdefault((_whose(affected, rows), reason), []).append(column.name)
+            empty.setdefault((_whose(affected, rows), reason), []).append(metric.name)
     for (whose, reason), names in empty.items():
         yield f"no {', '.join(names)}{whose}: {reason}"
+    for name, why in unavailable().items():
+        yield f"the metrics of {name} are unavailable: {why}"
 
 
 def _whose(affected: list[Row], rows: list[Row]) -> str:
@@ -104,8 +167,8 @@ def remark_lines(comparison: Comparison) -> Iterator[str]:
 
 
 def _remarks(comparison: Comparison, wanted: Callable[[str], bool]) -> Iterator[str]:
-    """Yield each remark once, behind the metrics and the rows it is about."""
-    rows = [row for row in comparison.lines if row.run.trajectory(row.output) is not None]
+    """Yield each remark once, behind the metrics and the rows it is about; over seeds there are too many."""
+    rows = [] if comparison.over_seeds else [row for row in comparison.lines if row.answered]
     noted: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         for key, note in row.scores.notes.items():

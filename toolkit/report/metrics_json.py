@@ -7,44 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.metrics import contract_keys, known_metrics
 from toolkit.report.contract import object_violations, schema_violations
 from toolkit.sequence import Sequence
 
 SCHEMA = "vislam.metrics/1"
 
 # Every run of a valid document has these keys, in this order; more may follow in later versions of the toolkit.
-METRIC_KEYS = (
-    "ate_none_m",
-    "ate_se3_m",
-    "ate_yaw_m",
-    "ate_sim3_m",
-    "ate_se3_deg",
-    "rpe_1s_m",
-    "rpe_1s_deg",
-    "rpe_100m_percent",
-    "kitti_t_percent",
-    "kitti_r_deg_per_m",
-    "end_drift_percent",
-    "reproj_median_px",
-    "reproj_rmse_px",
-    "heldout_reproj_median_px",
-    "heldout_reproj_rmse_px",
-    "nis_mean",
-    "nees_pose_mean",
-    "nees_ori_mean",
-    "nees_pos_mean",
-    "nees_pose_in_band_percent",
-    "coverage_percent",
-    "pairs",
-    "frame_ms_mean",
-    "frame_ms_p95",
-    "frame_ms_max",
-    "total_s",
-    "cpu_s",
-    "peak_rss_mb",
-)
-
-_COUNTS = ("pairs",)
+METRIC_KEYS = contract_keys()
 
 Json = dict[str, object]
 _NUMBER = (int, float)
@@ -113,8 +83,9 @@ def _sequence(sequence: Sequence) -> Json:
 
 def _run(row: Row) -> Json:
     given, notes = row.scores.values, dict(row.scores.notes)
+    counts = {metric.key for metric in known_metrics() if metric.count}
     metrics: dict[str, float | None] = {}
-    for key in (*METRIC_KEYS, *sorted(given.keys() - set(METRIC_KEYS))):
+    for key in (*METRIC_KEYS, *(key for key in given if key not in METRIC_KEYS)):
         value = given.get(key)
         if value is None:
             metrics[key] = None
@@ -123,7 +94,7 @@ def _run(row: Row) -> Json:
             metrics[key] = None
             notes[key] = f"the value is {value}, which JSON cannot hold"
         else:
-            metrics[key] = int(value) if key in _COUNTS else float(value)
+            metrics[key] = int(value) if key in counts else float(value)
     return {
         "estimator": row.estimator,
         "output": row.output,

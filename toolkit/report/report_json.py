@@ -15,7 +15,7 @@ from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
 from toolkit.report.figures.top_view import last_word
-from toolkit.report.messages import missing_lines, outcome, remark_lines, sequence_line, status_lines, truth_lines
+from toolkit.report.messages import note_lines, outcome, remark_lines, sequence_line
 from toolkit.report.metrics_json import Json
 from toolkit.resampling import NS_PER_S
 
@@ -96,7 +96,7 @@ def _same_line(row: Row, other: Row) -> bool:
 def _words(comparison: Comparison) -> Json:
     return {
         "sequence": sequence_line(comparison.sequence),
-        "notes": [*status_lines(comparison), *truth_lines(comparison), *missing_lines(comparison)],
+        "notes": list(note_lines(comparison)),
         "remarks": list(remark_lines(comparison)),
         "start": comparison.prior.source,
         "audit": [

@@ -3,60 +3,70 @@
 from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.messages import finding_lines, missing_lines, remark_lines, sequence_line, status_lines, truth_lines
-from toolkit.report.table import as_markdown, comparison_table
+from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, remark_lines
+from toolkit.report.table import as_markdown, comparison_table, explained_metrics
 
-_HOW_TO_READ = """\
+_HOW_TO_READ_ONE = """\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
-estimator knew at each frame, a **final** line on what it said when it had seen everything; compare like with like.
+estimator knew at each frame, a **final** line on its answer after the last frame; compare like with like.
 A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
-read from that file and scored by the same rules.
+read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
+the matched pairs and the coverage above the table, or in it where the rows differ.
 
-- **pairs, cover**: how many poses were compared with the truth, and the share of the frames that have an answer at all.
-  An error over half a recording is not half an error: read it beside its coverage.
-- **ATE**: root mean square position error after the alignment that is named with it. SE(3) moves and turns the whole
-  trajectory to fit best; yaw moves it and turns it about the vertical only, so that errors in roll and pitch count.
-- **RPE 100 m**, **KITTI trans**: drift over pieces of the path, in percent of their length.
-- **end drift**: the error at the end of the path, in percent of its length.
-- **reproj own**: median distance in the image between a sighting and the estimator's own landmark.
-- **reproj held-out**: the same for one track in ten that no estimator ever saw. It needs no truth and cannot be won by
-  fitting the data too closely.
-- **NIS**: the normalised innovation squared over its degrees of freedom; 1 where an estimator's stated uncertainty is
-  honest, above 1 where it is too sure of itself.
-- **frame, total**: wall clock of one step and of the whole run.
+{metrics}
 
 `metrics.json` has every metric, and for each one that is missing the reason."""
 
-_TITLES = {
-    "start": "Where every estimator started",
-    "audit": "What the audit found in the recording",
-    "facts": "What to know about this recording",
-    "notes": "Notes",
-    "remarks": "Remarks on single numbers",
-}
+_OUTSIDE_BY_DESIGN = """\
+Some estimators may stay outside their band, and are compared all the same. A decoupled filter, like the seed report's,
+takes its map for exact when it corrects the pose and forgets that both share their errors: it counts the same
+information again and again, and its covariance shrinks whatever the error does. A plain joint filter keeps the
+correlations, but linearises one landmark at many different estimates of the same pose, and so believes to have
+measured its heading and position, which nothing measured. The rungs after it exist to mend this: for them, being
+outside the band is a defect of the estimator or of its noise."""
+_HOW_TO_READ_MANY = f"""\
+Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
+means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric.
+
+- **ok of N**: how many runs ended well. The others are named above and are in no mean.
+- **std**: the standard deviation of the first metric over the seeds.
+- **NEES band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
+  95 % chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their
+  errors, so the share itself scatters widely from one set of seeds to another.
+{{metrics}}
+
+{_OUTSIDE_BY_DESIGN}"""
 
 
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
     """Return the report; ``captions`` maps the file names of the figures, beside the report, to their captions."""
+    seeds = f", {len(comparison.seeds)} seeds" if comparison.over_seeds else ""
+    how_to_read = _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE
     parts = [
-        f"# {' / '.join(run.estimator for run in comparison.runs)} on {comparison.sequence.name}",
-        sequence_line(comparison.sequence) + ".",
+        f"# {' / '.join(comparison.estimators)} on {comparison.name}{seeds}",
+        *(f"{line}." for line in header_lines(comparison)),
         as_markdown(comparison_table(comparison)),
-        *_section("notes", [*status_lines(comparison), *truth_lines(comparison), *missing_lines(comparison)]),
-        *_section("remarks", remark_lines(comparison)),
-        *_section("start", [comparison.prior.source]),
-        *_section("audit", finding_lines(comparison)),
-        *_section("facts", comparison.sequence.provenance.facts),
+        *_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
+        *_section("Notes", note_lines(comparison)),
+        *_section("Remarks on single numbers", remark_lines(comparison)),
+        *_section("Where every estimator started", [comparison.prior.source]),
+        *_section("What the audit found in the recording", finding_lines(comparison)),
+        *_section("What to know about this recording", comparison.sequence.provenance.facts),
         "## Figures",
         *(f"![{caption}](figures/{name})\n\n*{caption}*" for name, caption in captions.items()),
         "## How to read the table",
-        _HOW_TO_READ,
+        how_to_read.format(metrics=_meanings(comparison)),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _section(key: str, entries: Iterable[str]) -> Iterator[str]:
+def _meanings(comparison: Comparison) -> str:
+    """Return a line for each metric of the table."""
+    return "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison))
+
+
+def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
     lines = [f"- {entry}" for entry in entries]
     if lines:
-        yield f"## {_TITLES[key]}"
+        yield f"## {title}"
         yield "\n".join(lines)

@@ -15,7 +15,6 @@ from toolkit.report import manifest, metrics_json, report_json, seeds_json, seed
 from toolkit.report.figures import drawn, over_seeds, save
 from toolkit.report.figures.alignment import truth_during
 from toolkit.report.report_md import report_text
-from toolkit.report.seeds_md import seeds_report
 from toolkit.report.trajectory_files import write_landmarks, write_tum
 
 MANIFEST = "manifest.json"
@@ -85,7 +84,7 @@ def _write_over_seeds(comparison: Comparison, directory: Path) -> None:
     _write_text(directory / REPORT, json.dumps(seeds_report_json.build(comparison), allow_nan=False) + "\n")
     (directory / "figures").mkdir()
     captions = save(over_seeds.draw(comparison), directory / "figures")
-    _write_text(directory / "report.md", seeds_report(comparison, captions))
+    _write_text(directory / "report.md", report_text(comparison, captions))
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:

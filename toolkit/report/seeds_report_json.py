@@ -5,10 +5,9 @@ import numpy as np
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.report.contract import field_violations, schema_violations
+from toolkit.report.messages import consistency_lines, header_lines, note_lines
 from toolkit.report.metrics_json import Json
 from toolkit.report.report_json import SCHEMA, numbers
-from toolkit.report.seeds_md import headline
-from toolkit.report.seeds_table import consistency_lines, status_lines
 
 _FIELDS: dict[str, tuple[type, ...]] = {"t_s": (list,), "runs": (list,), "words": (dict,)}
 
@@ -20,8 +19,8 @@ def build(over: Comparison) -> Json:
         "t_s": numbers(over.frames_s),
         "runs": [_run(group) for group in over.rows],
         "words": {
-            "sequence": headline(over),
-            "notes": list(status_lines(over)),
+            "sequence": "; ".join(header_lines(over)),
+            "notes": list(note_lines(over)),
             "verdicts": list(consistency_lines(over)),
             "start": over.prior.source,
         },

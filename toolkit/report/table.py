@@ -1,119 +1,196 @@
-"""The comparison as a table: the same cells for plain text and for Markdown."""
+"""Tables for a terminal and for Markdown, and the comparison of one sequence as such a table.
 
-from dataclasses import dataclass
-from typing import NamedTuple
+Which metrics have a column, under which heading and with how many decimals, is said by their own records in
+:mod:`toolkit.metrics`; tabulate renders the cells.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from typing import Literal, NamedTuple
+
+from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.metrics import Metric, known_metrics, metrics_called
 
-_SEPARATOR = "  "
-_MISSING = "-"
+MISSING = "-"
 _WIDEST_NUMBER = 5
-
-
-@dataclass(frozen=True)
-class Column:
-    """A metric in the table: its key, what stands above it (name, alignment, unit) and its decimals."""
-
-    key: str
-    heading: tuple[str, str, str]
-    decimals: int
-
-    @property
-    def name(self) -> str:
-        """Return the heading in one line, without the unit."""
-        return " ".join(filter(None, self.heading[:2]))
-
-
-# The heading's second line names the alignment of everything that is compared with the truth.
-COLUMNS = (
-    Column("pairs", ("pairs", "", ""), 0),
-    Column("coverage_percent", ("cover", "", "%"), 1),
-    Column("ate_se3_m", ("ATE", "SE(3)", "m"), 2),
-    Column("ate_yaw_m", ("ATE", "yaw", "m"), 2),
-    Column("rpe_100m_percent", ("RPE", "100 m", "%"), 2),
-    Column("kitti_t_percent", ("KITTI", "trans", "%"), 2),
-    Column("end_drift_percent", ("end", "drift", "%"), 2),
-    Column("reproj_median_px", ("reproj", "own", "px"), 2),
-    Column("heldout_reproj_median_px", ("reproj", "held-out", "px"), 2),
-    Column("nis_mean", ("NIS", "mean", "1"), 2),
-    Column("frame_ms_mean", ("frame", "mean", "ms"), 2),
-    Column("total_s", ("total", "", "s"), 2),
+_CELLS = DataRow("", "  ", "")
+_PLAIN_TEXT = TableFormat(
+    lineabove=None,
+    linebelowheader=Line("", "-", "  ", ""),
+    linebetweenrows=None,
+    linebelow=None,
+    headerrow=_CELLS,
+    datarow=_CELLS,
+    padding=0,
+    with_header_hide=None,
 )
-_LABELS = (("estimator", "", ""), ("output", "", ""), ("status", "", ""))
-_CHANGE = ("change", "", "")
+# The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
+_BANDED = "nees_pose_mean"
+
+# The columns of a table: None for the usual ones, "all", or metrics by key or name.
+Columns = None | Literal["all"] | tuple[str, ...]
 
 
 class Table(NamedTuple):
-    """Headings (one tuple of lines a column) and rows of cells; the first ``labels`` columns are words."""
+    """Headings (one tuple of lines a column), rows of cells, and lines that belong under the table.
+
+    The first ``labels`` columns are words, the others numbers.
+    """
 
     headings: tuple[tuple[str, ...], ...]
     rows: tuple[tuple[str, ...], ...]
     labels: int
+    under: tuple[str, ...] = ()
 
 
-def comparison_table(comparison: Comparison) -> Table:
-    """Return one row for each kind of output that says something of its own.
+class _Column(NamedTuple):
+    """Three lines of heading, and the cell of a row."""
 
-    Pairs and coverage always have a column, other metrics where some row has one.
+    heading: tuple[str, ...]
+    cell: Callable[[Row], str]
+
+
+def columns_asked(names: tuple[str, ...]) -> Columns:
+    """Return the columns that some names ask for: the usual ones where there are none, all for the one word "all".
+
+    Raises VislamError for a name that is no metric's.
     """
-    columns = [c for c in COLUMNS if c.key in ("pairs", "coverage_percent") or _has_value(comparison, c.key)]
-    changes = _changes(comparison)
-    rows = tuple(
-        (row.estimator, row.label, row.status, *change, *(_cell(row, column) for column in columns))
-        for row, change in zip(comparison.lines, changes, strict=True)
-    )
-    labels = (*_LABELS, _CHANGE) if comparison.changes else _LABELS
-    return Table((*labels, *(c.heading for c in columns)), rows, labels=len(labels))
+    if names == ("all",):
+        return "all"
+    metrics_called(names)
+    return names or None
 
 
-def _changes(comparison: Comparison) -> list[tuple[str, ...]]:
-    """Return a cell a row with what its estimator changes, told once an estimator; no cells without a ladder."""
-    if not comparison.changes:
-        return [()] * len(comparison.lines)
-    names = [row.estimator for row in comparison.lines]
-    return [("" if name in names[:i] else comparison.changes.get(name, ""),) for i, name in enumerate(names)]
+def comparison_table(comparison: Comparison, columns: Columns = None) -> Table:
+    """Return one row for each kind of output that differs from the others of its estimator.
+
+    Over seeds a cell is the mean over the runs that are ok. Under the table of a ladder stands what each estimator
+    changes. Raises VislamError for an unknown column.
+    """
+    ends = _ok_of(comparison) if comparison.over_seeds else _Column(("status", "", ""), lambda row: row.status)
+    chosen = (ends, *_metric_columns(comparison, columns))
+    rows = tuple((row.estimator, row.label, *(column.cell(row) for column in chosen)) for row in comparison.lines)
+    headings = (("estimator", "", ""), ("output", "", ""), *(column.heading for column in chosen))
+    under = change_lines((name, comparison.changes.get(name, "")) for name in comparison.estimators)
+    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under))
 
 
-def as_text(table: Table) -> str:
-    """Return the table with aligned columns, words to the left and numbers to the right."""
-    heading_lines = list(zip(*table.headings, strict=True))
-    lines = [line for line in heading_lines if any(line)]
-    widths = [max(len(cell) for cell in column) for column in zip(*lines, *table.rows, strict=True)]
-
-    def aligned(cells: tuple[str, ...]) -> str:
-        padded = (
-            cell.ljust(width) if i < table.labels else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        return _SEPARATOR.join(padded).rstrip()
-
-    rule = _SEPARATOR.join("-" * width for width in widths)
-    return "\n".join([*map(aligned, lines), rule, *map(aligned, table.rows)])
+def _ok_of(comparison: Comparison) -> _Column:
+    """Return the column of how many runs ended well."""
+    return _Column(("ok", "of", str(len(comparison.seeds))), lambda row: str(row.counts["ok"]))
 
 
-def as_markdown(table: Table) -> str:
-    """Return the table in Markdown; units stand in brackets behind the names."""
-    heads = [" ".join(filter(None, lines[:-1])) + (f" [{lines[-1]}]" if lines[-1] else "") for lines in table.headings]
-    rules = [":--" if i < table.labels else "--:" for i in range(len(heads))]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (heads, rules, *table.rows))
+def _metric_columns(comparison: Comparison, columns: Columns) -> Iterator[_Column]:
+    """Yield a column for each metric; over seeds also the spread of the first, and how long the NEES is in its band."""
+    for i, metric in enumerate(shown_metrics(comparison, columns)):
+        yield _Column(heading(metric), partial(_value, metric=metric))
+        if comparison.over_seeds and i == 0:
+            yield _Column((metric.heading[0], "std", metric.unit), partial(_std, metric=metric))
+        if comparison.over_seeds and metric.key == _BANDED:
+            yield _Column(("NEES", "band", "%"), _in_band)
 
 
-def _has_value(comparison: Comparison, key: str) -> bool:
-    return any(row.scores.values.get(key) is not None for row in comparison.lines)
+def _value(row: Row, metric: Metric) -> str:
+    return cell(row.value(metric.key), metric)
 
 
-def _cell(row: Row, column: Column) -> str:
-    value = row.scores.values.get(column.key)
+def _std(row: Row, metric: Metric) -> str:
+    spread = row.spread(metric.key)
+    return cell(None if spread is None else spread.std, metric)
+
+
+def _in_band(row: Row) -> str:
+    nees = row.mean_nees
+    return MISSING if nees is None else number(nees.in_band_percent, 1)
+
+
+def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
+    """Return the metrics that have a column; without any value a metric has one only if it is named.
+
+    Pairs and coverage, whose records say so, are a column where rows differ; else :func:`shared_values` has them.
+    """
+    if columns is not None and columns != "all":
+        return metrics_called(columns)
+    valued = [metric for metric in known_metrics() if any(v is not None for v in _values(comparison, metric))]
+    if columns == "all":
+        return tuple(valued)
+    if comparison.over_seeds:
+        return tuple(metric for metric in valued if metric.over_seeds)
+    differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
+    return (*differing, *(metric for metric in valued if metric.table == "always"))
+
+
+def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
+    """Return the metrics whose missing values a reader of the table wants explained."""
+    if columns is None and comparison.over_seeds:
+        return tuple(metric for metric in known_metrics() if metric.over_seeds)
+    if columns is None:
+        return tuple(metric for metric in known_metrics() if metric.table != "on request")
+    return known_metrics() if columns == "all" else metrics_called(columns)
+
+
+def shared_values(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
+    """Yield, in words, pairs and coverage where they have no column: one value, or from the least to the most."""
+    shown = shown_metrics(comparison, columns)
+    for metric in known_metrics():
+        values = sorted({value for value in _values(comparison, metric) if value is not None})
+        if metric.table == "where rows differ" and metric not in shown and values:
+            ends = " to ".join(dict.fromkeys(cell(value, metric) for value in (values[0], values[-1])))
+            yield " ".join(filter(None, (metric.name, ends, metric.unit)))
+
+
+def change_lines(changes: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Yield a line for each estimator that changes something against the rung before, aligned; none off a ladder."""
+    given = [(name, change) for name, change in changes if change]
+    width = max((len(name) for name, _ in given), default=0)
+    for name, change in given:
+        yield f"{name:<{width}}  {change}"
+
+
+def heading(metric: Metric) -> tuple[str, str, str]:
+    """Return the lines above a metric's column: what, which, unit."""
+    return (*metric.heading, metric.unit)
+
+
+def cell(value: float | None, metric: Metric) -> str:
+    """Return a metric's value as it stands in a table."""
     if value is None:
-        return _MISSING
-    if column.decimals == 0:
+        return MISSING
+    if metric.count:
         return f"{value:.0f}"
-    # An error of a few centimetres says nothing in two decimals.
-    return number(value, column.decimals + (abs(value) < 0.1))
+    # An error of a few centimetres needs three decimals to say anything.
+    return number(value, metric.decimals + (abs(value) < 0.1))
 
 
 def number(value: float, decimals: int) -> str:
     """Return a number with at most so many decimals in five characters, in powers of ten where it needs more."""
     texts = (f"{value:.{d}f}" for d in range(decimals, -1, -1))
-    # A diverged estimator may be light years away; its number must not tear the columns apart.
+    # The number of a diverged estimator may have any size and must not widen the table.
     return next((text for text in texts if len(text) <= _WIDEST_NUMBER), f"{value:.0e}")
+
+
+def as_text(table: Table) -> str:
+    """Return the table with aligned columns, words to the left and numbers to the right; nothing is wrapped or cut."""
+    # Headings as rows, because tabulate makes every column two characters wider than its heading.
+    heads = [line for line in zip(*table.headings, strict=True) if any(line)]
+    rows = [*heads, SEPARATING_LINE, *table.rows]
+    text = tabulate(rows, tablefmt=_PLAIN_TEXT, colalign=_sides(table), disable_numparse=True)
+    lines = [line.rstrip() for line in text.splitlines()]
+    return "\n".join([*lines, *(["", *table.under] if table.under else [])])
+
+
+def as_markdown(table: Table) -> str:
+    """Return the table in Markdown; units stand in brackets behind the names."""
+    heads = [" ".join(filter(None, lines[:-1])) + (f" [{lines[-1]}]" if lines[-1] else "") for lines in table.headings]
+    text = tabulate(table.rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
+    return "\n\n".join(filter(None, (text, "\n".join(f"- {line}" for line in table.under))))
+
+
+def _sides(table: Table) -> list[Literal["left", "right"]]:
+    return ["left" if i < table.labels else "right" for i in range(len(table.headings))]
+
+
+def _values(comparison: Comparison, metric: Metric) -> list[float | None]:
+    return [row.value(metric.key) for row in comparison.lines]

@@ -3,25 +3,34 @@
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 
+from tabulate import tabulate
+
 from toolkit.audit import Audit
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.messages import finding_lines, missing_lines, outcome, sequence_line, status_lines, truth_lines
-from toolkit.report.seeds_md import seeds_text
-from toolkit.report.table import as_text, comparison_table
+from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, outcome, sequence_line
+from toolkit.report.table import Columns, Table, as_text, comparison_table
 
-_WIDTH = 118
+_WIDTH = 100
+_INDENT = "  "
 
 
-def comparison_text(comparison: Comparison) -> str:
-    """Return the comparison as plain text, no line of prose wider than 118 columns."""
-    if comparison.over_seeds:
-        return seeds_text(comparison)
-    lines = [sequence_line(comparison.sequence), "", as_text(comparison_table(comparison)), ""]
+def comparison_text(comparison: Comparison, columns: Columns = None) -> str:
+    """Return the comparison as plain text, no line of prose wider than 100 columns.
+
+    Raises VislamError for an unknown column.
+    """
+    lines = [line for entry in header_lines(comparison, columns) for line in _wrapped(entry)]
+    lines += ["", as_text(comparison_table(comparison, columns)), ""]
     lines += _section("start", [comparison.prior.source])
     lines += _section("audit", finding_lines(comparison))
     lines += _section("facts", comparison.sequence.provenance.facts)
-    lines += _section("notes", [*status_lines(comparison), *truth_lines(comparison), *missing_lines(comparison)])
+    lines += _section("nees", consistency_lines(comparison))
+    lines += _section("notes", note_lines(comparison, columns))
     return "\n".join(lines)
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, subsequent_indent="  ")
 
 
 def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
@@ -36,12 +45,11 @@ def audit_text(audited: Audit) -> str:
     lines = [sequence_line(audited.sequence), ""]
     if not findings:
         return "\n".join([*lines, "no fault found"])
-    heading = ("fault", "count", "outcome", "detail")
-    cells = [(f.fault, str(f.count), outcome(f), f.detail) for f in findings]
-    widths = [max(len(row[i]) for row in (heading, *cells)) for i in range(3)]
-    for fault, count, done, detail in (heading, *cells):
-        start = f"{fault:<{widths[0]}}  {count:>{widths[1]}}  {done:<{widths[2]}}  "
-        lines.append(textwrap.fill(detail, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start)))
+    headings = (("fault",), ("outcome",), ("count",))
+    rows = tuple((f.fault, outcome(f), str(f.count)) for f in findings)
+    lines += [as_text(Table(headings, rows, labels=2)), ""]
+    for finding in findings:
+        lines += _wrapped(f"{finding.fault}: {finding.detail}")
     left = [f.fault for f in findings if f.blocking]
     lines += ["", f"not repaired: {', '.join(left)}" if left else "nothing is left that spoils a result"]
     return "\n".join(lines)
@@ -50,10 +58,6 @@ def audit_text(audited: Audit) -> str:
 def listing_text(title: str, entries: Mapping[str, str]) -> str:
     """Return names with their one-line summaries under a title."""
     width = max((len(name) for name in entries), default=0)
-    lines = [f"{title}:"]
-    for name, summary in entries.items():
-        start = f"  {name:<{width}}  "
-        lines.append(
-            textwrap.fill(summary, _WIDTH, initial_indent=start, subsequent_indent=" " * len(start)) or start.rstrip()
-        )
-    return "\n".join(lines)
+    columns = [None, _WIDTH - width - 2 * len(_INDENT)]
+    text = tabulate(entries.items(), tablefmt="plain", maxcolwidths=columns, disable_numparse=True)
+    return "\n".join([f"{title}:", *(f"{_INDENT}{line}".rstrip() for line in text.splitlines())])

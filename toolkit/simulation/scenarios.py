@@ -25,9 +25,9 @@ from toolkit.sequence import (
     TwistNoise,
 )
 from toolkit.simulation import sensors, world
-from toolkit.simulation.scenes import Stage, hall, road
-from toolkit.simulation.sensors import Imu, Measured, Odometer
-from toolkit.simulation.trajectory import Kinematics, Trajectory
+from toolkit.simulation.scenes import Scene, hall, road
+from toolkit.simulation.sensors import Imu, MotionMeasurements, Odometer
+from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 from toolkit.simulation.world import Camera
 
 START_NS = 1_600_000_000 * NS_PER_S
@@ -41,13 +41,13 @@ _UNUSED_ACCEL_BIAS_SIGMA = 0.01
 class Scenario:
     """Everything about a simulated recording but its seed.
 
-    ``stage`` builds the trajectory and the world for a duration. ``noise_scale`` multiplies every drawn
+    ``scene`` builds the trajectory and the world for a duration. ``noise_scale`` multiplies every drawn
     error (pixels, motion, biases, prior) and leaves the stated noise as it is, so that 0 gives exact
     measurements an estimator can still weigh.
     """
 
     name: str
-    stage: Callable[[float], Stage]
+    scene: Callable[[float], Scene]
     rig: StereoRig
     camera: Camera
     motion: Odometer | Imu
@@ -71,16 +71,16 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
     prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng = (
         np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(5)
     )
-    stage = scenario.stage(scenario.duration_s)
+    scene = scenario.scene(scenario.duration_s)
     frames_t_ns = sensors.stamps_ns(START_NS, scenario.camera.rate_hz, scenario.duration_s)
-    motion = stage.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
-    measured = _measure_motion(scenario, stage.trajectory, frames_t_ns, motion_rng)
+    motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
+    measured = _measure_motion(scenario, scene.trajectory, frames_t_ns, motion_rng)
     return Sequence(
         name=scenario.name,
         rig=scenario.rig,
         noise=scenario.motion.noise,
         frames_t_ns=frames_t_ns,
-        observations=_observe(scenario, stage.points, motion.T_world_imu, (tracks_rng, pixels_rng, outliers_rng)),
+        observations=_observe(scenario, scene.points, motion.T_world_imu, (tracks_rng, pixels_rng, outliers_rng)),
         motion=measured.samples,
         provenance=_provenance(scenario, seed),
         prior=_prior(scenario, motion, prior_rng),
@@ -90,8 +90,8 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
 
 
 def _measure_motion(
-    scenario: Scenario, trajectory: Trajectory, frames_t_ns: IntArray, rng: np.random.Generator
-) -> Measured:
+    scenario: Scenario, trajectory: SmoothTrajectory, frames_t_ns: IntArray, rng: np.random.Generator
+) -> MotionMeasurements:
     sensor, scale = scenario.motion, scenario.noise_scale
     if isinstance(sensor, Imu):
         t_ns = sensors.stamps_ns(START_NS, sensor.rate_hz, scenario.duration_s)
@@ -113,7 +113,7 @@ def _observe(
     return sensors.with_outliers(noisy, camera, outliers_rng)
 
 
-def _at_frames(measured: Measured, frames_t_ns: IntArray) -> Array:
+def _at_frames(measured: MotionMeasurements, frames_t_ns: IntArray) -> Array:
     """Return the bias (K, 6) of the last motion sample at or before each frame."""
     bias: Array = measured.bias[np.searchsorted(measured.samples.t_ns, frames_t_ns, side="right") - 1]
     return bias
@@ -185,7 +185,7 @@ _EUROC_IMU = Imu(200.0, ImuNoise(2e-3, 1.7e-4, 3e-3, 1.9e-5), bias_sigma=np.repe
 
 DRIVE = Scenario(
     name="drive",
-    stage=road,
+    scene=road,
     rig=_drive_rig(),
     camera=Camera(rate_hz=10.0, size_px=(1241, 376), depth_m=(3.0, 40.0), max_tracks=100, loss_per_frame=0.05),
     motion=_WHEEL_ODOMETER,
@@ -194,7 +194,7 @@ DRIVE_IMU = replace(DRIVE, name="drive-imu", motion=_CAR_IMU)
 # Beyond 7 m the disparity would come within five standard deviations of zero.
 FLIGHT = Scenario(
     name="flight",
-    stage=hall,
+    scene=hall,
     rig=_flight_rig(),
     camera=Camera(rate_hz=20.0, size_px=(752, 480), depth_m=(0.8, 7.0), max_tracks=100, loss_per_frame=0.02),
     motion=_EUROC_IMU,

@@ -1,4 +1,4 @@
-"""Where the scenarios play: the road of `drive` and the hall of `flight`; functions of time without any seed."""
+"""The scenes of the scenarios: the road of `drive` and the hall of `flight`; functions of time without any seed."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from toolkit.simulation.trajectory import (
     FreeTrajectory,
     RoadTrajectory,
     RotationSpline,
-    Trajectory,
+    SmoothTrajectory,
     UniformKnots,
     VectorSpline,
 )
@@ -32,14 +32,14 @@ _R_LEVEL_IMU = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """Where a scenario plays: the trajectory and the landmarks (M, 3) along it."""
+class Scene:
+    """A scene: the trajectory and the landmarks (M, 3) along it."""
 
-    trajectory: Trajectory
+    trajectory: SmoothTrajectory
     points: Array
 
 
-def road(duration_s: float) -> Stage:
+def road(duration_s: float) -> Scene:
     """Return a drive through hilly streets: 3 to 12 m/s, a right-angled corner every 20 s, slow in the corners."""
     reach_s = duration_s + _ROAD_LEAD_OUT_S
     knots, control_t_s = _knots(0.8, reach_s)
@@ -48,7 +48,7 @@ def road(duration_s: float) -> Stage:
     travelled_m = np.cumsum(0.02 * np.linalg.norm(trajectory.position.at(fine_t_s, 1), axis=1))
     even_m = np.arange(travelled_m[0], travelled_m[-1], _ROAD_POSE_SPACING_M)
     path = trajectory.at(np.interp(even_m, travelled_m, fine_t_s)).T_world_imu
-    return Stage(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, np.random.default_rng(_WORLD_SEED)))
+    return Scene(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, np.random.default_rng(_WORLD_SEED)))
 
 
 def _road_positions(t_s: Array) -> Array:
@@ -70,7 +70,7 @@ def _road_positions(t_s: Array) -> Array:
     return np.stack([np.interp(t_s, fine_s, axis) for axis in (x, y, z)], axis=-1)
 
 
-def hall(duration_s: float) -> Stage:
+def hall(duration_s: float) -> Scene:
     """Return a flight of about 1 m/s through a hall of 10 x 10 x 4.5 m, turning about and shaken on all axes."""
     knots, t_s = _knots(0.2, duration_s)
     position = np.stack(
@@ -88,7 +88,7 @@ def hall(duration_s: float) -> Stage:
     rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
     trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
     points = world.room(_HALL_LOWER_M, _HALL_UPPER_M, _HALL_LANDMARKS, np.random.default_rng(_WORLD_SEED))
-    return Stage(trajectory, points)
+    return Scene(trajectory, points)
 
 
 def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:

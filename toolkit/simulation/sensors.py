@@ -1,4 +1,4 @@
-"""What the sensors make of the truth: stereo pixels, body twists and IMU samples with known noise.
+"""Sensor measurements of the exact motion: stereo pixels, body twists and IMU samples with known noise.
 
 Continuous densities have Kalibr's names and units; a sample of white noise over dt has the standard deviation
 density / sqrt(dt), a step of a walk over dt has density * sqrt(dt) (Furgale et al., "Kalibr", IMU noise model).
@@ -12,7 +12,7 @@ from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
 from toolkit.models.stereo import project
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuNoise, ImuSamples, MotionSamples, Observations, StereoRig, TwistNoise, TwistSamples
-from toolkit.simulation.trajectory import Trajectory
+from toolkit.simulation.trajectory import SmoothTrajectory
 from toolkit.simulation.world import Camera, Tracks
 
 
@@ -34,7 +34,7 @@ class Imu:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MotionMeasurements:
     """Motion samples and the bias (S, 6), [accel, gyro], that is in each of them."""
 
     samples: MotionSamples
@@ -83,7 +83,7 @@ def with_outliers(clean: Observations, camera: Camera, rng: np.random.Generator)
 
 def measure_twist(
     odometer: Odometer, scale: float, t_ns: IntArray, T_world_imu: Array, rng: np.random.Generator
-) -> Measured:
+) -> MotionMeasurements:
     """Measure the exact mean body twist of each interval between stamps: log(T_k^-1 T_k+1) / dt, plus noise.
 
     Takes S + 1 stamps and poses and gives S samples; sample k describes the motion from k to k + 1.
@@ -98,12 +98,12 @@ def measure_twist(
     density = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density])
     measured = exact + scale * white * density / np.sqrt(dt_s)
     samples = TwistSamples(t_ns[:-1], measured[:, 3:], measured[:, :3] + gyro_bias, "start")
-    return Measured(samples, np.hstack([np.zeros_like(gyro_bias), gyro_bias]))
+    return MotionMeasurements(samples, np.hstack([np.zeros_like(gyro_bias), gyro_bias]))
 
 
 def measure_imu(
-    imu: Imu, scale: float, t_ns: IntArray, trajectory: Trajectory, gravity_world: Array, rng: np.random.Generator
-) -> Measured:
+    imu: Imu, scale: float, t_ns: IntArray, trajectory: SmoothTrajectory, gravity_world: Array, rng: np.random.Generator
+) -> MotionMeasurements:
     """Measure the instantaneous specific force and angular velocity at stamps (S,), plus noise and bias."""
     t_s = (t_ns - t_ns[0]) / NS_PER_S
     dt_s = 1.0 / imu.rate_hz
@@ -117,7 +117,7 @@ def measure_imu(
     walk_density = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3)
     bias = scale * _walk(imu.bias_sigma * start_rng.standard_normal(6), walk_density * np.sqrt(dt_s) * walk)
     measured = exact + bias + scale * white * density / np.sqrt(dt_s)
-    return Measured(ImuSamples(t_ns, measured[:, :3], measured[:, 3:]), bias)
+    return MotionMeasurements(ImuSamples(t_ns, measured[:, :3], measured[:, 3:]), bias)
 
 
 def _walk(start: Array, steps: Array) -> Array:

@@ -32,8 +32,8 @@ class Kinematics:
     w_imu: Array
 
 
-class Trajectory(Protocol):
-    """Anything that knows its motion at every instant (N,) s of its time."""
+class SmoothTrajectory(Protocol):
+    """A motion with exact derivatives at every instant; not the sampled poses of ``toolkit.estimate.Trajectory``."""
 
     def at(self, t_s: Array) -> Kinematics:
         """Return the motion at the instants (N,) s."""

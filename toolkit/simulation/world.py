@@ -1,4 +1,4 @@
-"""What there is to see and what a tracker makes of it: landmarks, visibility, and tracks with realistic lives."""
+"""Landmarks, their visibility from a stereo pair, and the tracks a tracker makes of them, with realistic lengths."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ _POSES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Camera:
-    """What limits the sight of a stereo pair and of its tracker.
+    """The limits of a stereo pair and of its tracker.
 
     A landmark is seen where its true projection lies ``border_px`` or more inside both images and its depth
     inside ``depth_m``; at most ``max_tracks`` are followed at a time, and a track that could go on ends at
@@ -97,7 +97,7 @@ def _in_view(points_cam: Array, rig: StereoRig, camera: Camera) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Who sees what: frame (N,), track id (N,) and landmark (N,) of each sighting, by frame then track."""
+    """The landmark each sighting is of: frame (N,), track id (N,) and landmark (N,), by frame then track."""
 
     frame: IntArray
     track_id: IntArray

@@ -1,16 +1,17 @@
-"""What the motion samples and the camera each say about the motion between two frames, side by side."""
+"""The motion between two frames as the motion samples and as the camera measure it, side by side."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.vision import CameraMotion
+from toolkit.audit.parts.vision import CameraMotion, usable_pairs
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
+from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, TwistSamples, check_runnable
 
-# With fewer intervals than this the camera has no say.
+# With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30
 
 
@@ -30,7 +31,7 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Put both side by side; None where too few intervals are known for a verdict."""
+    """Put both side by side; None where too few intervals are known."""
     rows = np.flatnonzero(camera.known)
     if rows.size < LEAST_INTERVALS:
         return None
@@ -58,3 +59,20 @@ def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Arra
     at_frames = integral[np.searchsorted(knots_s, frame_s)]
     means: Array = np.diff(at_frames, axis=0) / np.diff(frame_s)[:, None]
     return means
+
+
+def median_one_step_px(sequence: Sequence, T_imu_cam: Array) -> float:
+    """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
+
+    Points triangulated in one frame are moved by the twist samples (``sequence`` has twists) through the
+    extrinsic ``T_imu_cam`` and projected into the next.
+    """
+    pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
+    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
+    T_before_after_imu = se3_exp(dt_s * np.concatenate([mean[:, 3:], mean[:, :3]], axis=1))
+    T_after_before = se3_inverse(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
+    points = transform(T_after_before[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
+    points[:, 2] = np.maximum(points[:, 2], 0.1)
+    residual_px = uv_px[pairs.after] - project(points, sequence.rig)
+    return float(np.median(np.sqrt(np.mean(residual_px**2, axis=1))))

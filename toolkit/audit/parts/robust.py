@@ -1,4 +1,4 @@
-"""Statistics that a few wild intervals cannot move."""
+"""Statistics robust to a few outlying intervals."""
 
 from typing import NamedTuple
 

@@ -2,7 +2,7 @@
 
 Points triangulated in the earlier frame are projected into the later one; Gauss-Newton on that residual with
 Cauchy weights, from "no motion", all intervals of a recording at once. A residual is weighted by the noise of
-both its measurements, J_after R J_after^T + R: the far points tell the rotation, the near ones the translation.
+both its measurements, J_after R J_after^T + R: far points determine the rotation, near ones the translation.
 Source: Geiger, Ziegler & Stiller, "StereoScan" (2011), section III-A, with the two-view covariance added.
 """
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.neighbours import Neighbours, neighbours
+from toolkit.audit.parts.tracks import Neighbours, neighbours
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log, skew
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
@@ -18,7 +18,7 @@ from toolkit.sequence import Sequence, StereoRig
 
 # After so many the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of where it would end.
 ITERATIONS = 6
-# Sum of the weights below which an interval's motion is not believed: six unknowns, three equations a track.
+# Sum of the weights below which an interval's motion is not used: six unknowns, three equations a track.
 LEAST_SUPPORT = 8.0
 # A residual that is this many times the scatter of its interval has half the weight.
 CAUCHY_SIGMAS = 2.0
@@ -33,7 +33,7 @@ CHI2_3_MEDIAN = 2.366
 class CameraMotion(NamedTuple):
     """Twist of the camera over each of the K - 1 intervals, in its own axes: (K - 1, 3) rad/s, (K - 1, 3) m/s.
 
-    ``known`` (K - 1,) says where enough tracks agreed; elsewhere the rows are zero.
+    ``known`` (K - 1,) is True where enough tracks agreed; elsewhere the rows are zero.
     """
 
     w_radps: Array

@@ -1,1 +1,5 @@
-"""What several recording formats share: fields with checks, streaming, tables, stamps, truth files."""
+"""Parts of the recording formats; no file here is a format.
+
+Read ``fields`` (named arrays with their checks) and ``tables`` (CSV) first; ``npz_archive`` streams large arrays,
+``opencv_yaml`` reads calibrations, ``truth_file`` ground truth, ``euroc_*`` and ``tracks_along`` belong to EuRoC.
+"""

@@ -1,7 +1,8 @@
 """The ground truth of a EuRoC recording: found beside the sensors, read in its dialects, and chosen by the gyro.
 
 Of V1_01_easy two truths are in use: the original, whose orientation is off by degrees, and one computed again from
-the motion capture and the IMU (Geneva & Huang, "vicon2gt", 2020). Names do not tell them apart; the gyro does.
+the motion capture and the IMU (Geneva & Huang, "vicon2gt", 2020). Their names are alike; the rates of rotation of the
+second agree with the gyro, those of the first do not.
 """
 
 from dataclasses import dataclass
@@ -9,18 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.asl_table import columns_of, read_table
 from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.opencv_yaml import read_fields
-from toolkit.datasets.io.truth_choice import rate_scatter_radps
+from toolkit.datasets.io.tables import columns_of, read_table
 from toolkit.datasets.io.truth_file import load_truth
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
-from toolkit.geometry import se3_inverse
+from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuSamples, Truth
 
+# Long enough that the noise of single truth poses hardly counts, short enough that the gyro's mean is the rotation.
+_STEP_NS = NS_PER_S // 10
 _AXES = "xyz"
-# Position, quaternion, velocity, gyro bias and accelerometer bias, in the data set's words and in vicon2gt's.
+# Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
 _HEADINGS = (
     (
         tuple(f"p_RS_R_{a}" for a in _AXES) + tuple(f"q_RS_{a}" for a in "xyzw"),
@@ -35,14 +38,14 @@ _HEADINGS = (
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The truth to use, and in words which it is and why."""
+    """The truth to use, and a sentence with its file and the reason."""
 
     truth: Truth
     reason: str
 
 
 def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
-    """Return the truth of a recording; of several, the one that turns most nearly as the gyro says.
+    """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
 
     Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged.
     """
@@ -57,9 +60,9 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
     best, least = ranked[0]
     if not np.isfinite(least):
         raise DataError(f"{best}: the truth and the IMU share no 0.2 s; check that both are of one recording and clock")
-    told = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
+    scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
     among = "" if len(ranked) == 1 else ", the better of what the folder holds"
-    return Choice(found[best], f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {told})")
+    return Choice(found[best], f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters})")
 
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
@@ -94,3 +97,39 @@ def _read_csv(path: Path) -> Truth:
     if not complete:
         return Truth(table.t_ns, T_world_imu)
     return Truth(table.t_ns, T_world_imu, table.values[:, 7:10], table.values[:, 10:16])
+
+
+def rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
+    """Return how far the truth's rates of rotation are from the gyro's, RMS (rad/s), the gyro's mean bias removed.
+
+    A truth whose axes are not the IMU's rotates about other axes than the gyro measures. Infinite where the two share
+    no 0.2 s.
+    """
+    sample_t_ns, gyro_radps = _usable(imu)
+    if not sample_t_ns.size:
+        return float("inf")
+    first, last = max(truth.t_ns[0], sample_t_ns[0]), min(truth.t_ns[-1], sample_t_ns[-1])
+    at_ns = np.arange(first, last + 1, _STEP_NS, dtype=np.int64)
+    if at_ns.size < 3:
+        return float("inf")
+    R_world_imu = interpolate_poses(truth.t_ns, truth.T_world_imu, at_ns)[:, :3, :3]
+    steps = so3_log(np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:])
+    off = steps * (NS_PER_S / _STEP_NS) - _mean_rates(sample_t_ns, gyro_radps, at_ns)
+    return float(np.sqrt(((off - np.median(off, axis=0)) ** 2).mean()))
+
+
+def _usable(imu: ImuSamples) -> tuple[IntArray, Array]:
+    """Return stamps (S,) and rates (S, 3) without what the audit will repair: rows not finite, out of order, twice."""
+    finite = np.flatnonzero(np.isfinite(imu.gyro_radps).all(axis=1))
+    t_ns, first = np.unique(imu.t_ns[finite], return_index=True)
+    return t_ns, imu.gyro_radps[finite[first]]
+
+
+def _mean_rates(t_ns: IntArray, gyro_radps: Array, at_ns: IntArray) -> Array:
+    """Return the means (N - 1, 3) rad/s of samples (S, 3), taken as straight lines, between stamps (N,)."""
+    t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
+    areas = 0.5 * (gyro_radps[1:] + gyro_radps[:-1]) * np.diff(t_s)[:, None]
+    turned = np.vstack([np.zeros(3), np.cumsum(areas, axis=0)])
+    reached = np.stack([np.interp(at_s, t_s, axis) for axis in turned.T], axis=1)
+    means: Array = np.diff(reached, axis=0) / np.diff(at_s)[:, None]
+    return means

@@ -1,4 +1,7 @@
-"""The named arrays of one recording, with the checks that turn a malformed one into one clear line."""
+"""The named arrays of one recording as measurements: checks of type and shape, stamps, and stereo corners.
+
+Every check turns a malformed array into one line that names file and key.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,10 +11,20 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Observations
 
 # How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.
 _RIGID_TOLERANCE = 1e-3
+# No recording lies beyond the year 5000, nor has a sample only every half minute.
+_LATEST_S = 1e11
+_LONGEST_STEP_S = 30.0
+_UNITS = (
+    (1e-9, "nanoseconds: divide by 1e9"),
+    (1e-6, "microseconds: divide by 1e6"),
+    (1e-3, "milliseconds: divide by 1e3"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +118,38 @@ def check_frame_count(path: Path, frame_count: int) -> None:
     """Raise DataError where a recording is too short to estimate any motion."""
     if frame_count < 2:
         raise DataError(f"{path}: the recording has {frame_count} frame(s); at least two are needed")
+
+
+def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
+    """Return stamps (N,) given in seconds as int64 nanoseconds.
+
+    Raises DataError naming the first stamp that is not finite, or the unit the stamps are probably in. The
+    order is not checked: a recording may be repaired.
+    """
+    bad = np.flatnonzero(~np.isfinite(stamps_s))
+    if bad.size:
+        raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]} ({bad.size} such stamps); remove these samples")
+    unit = probable_unit(stamps_s)
+    if unit is not None:
+        raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit}")
+    return np.rint(stamps_s * NS_PER_S).astype(np.int64)
+
+
+def probable_unit(stamps_s: Array) -> str | None:
+    """Return the unit, with its remedy, that stamps (N,) are probably in, or None where seconds are plausible."""
+    largest = float(np.abs(stamps_s).max(initial=0.0))
+    step = float(np.median(np.abs(np.diff(stamps_s)))) if stamps_s.size > 1 else 0.0
+    if largest < _LATEST_S and step < _LONGEST_STEP_S:
+        return None
+    # The size of absolute stamps shows their unit (the epoch began 1.3e9 to 1.8e9 s ago), the step of relative ones.
+    for scale, name in _UNITS:
+        if largest * scale > 1e8 or step * scale > 1e-3:
+            return name
+    return _UNITS[-1][1]
+
+
+def observations(frame: IntArray, track_id: IntArray, corners_px: Array) -> Observations:
+    """Build sightings from rows in any order; corners (N, 4) are uL, vL, uR, vR and v is the mean of the two rows."""
+    u_left_px, v_left_px, u_right_px, v_right_px = corners_px.T
+    uv_px = np.stack([u_left_px, u_right_px, 0.5 * (v_left_px + v_right_px)], axis=1)
+    return Observations.sorted(frame, track_id, uv_px)

@@ -1,7 +1,7 @@
-"""The YAML of calibration files, as far as they use it: nested mappings of numbers, words and lists of numbers.
+"""The YAML of calibration files, as far as they use it: nested mappings of numbers, text and lists of numbers.
 
 Files in OpenCV's dialect begin with ``%YAML:1.0``, which is not YAML and which general readers refuse; a strict
-reader of the few forms there are needs no further dependency and takes nothing for granted.
+reader of these few forms needs no further dependency.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from toolkit.errors import DataError
 
 
 def read_fields(path: Path) -> Fields:
-    """Return what a file holds as arrays with dotted keys: numbers, lists of numbers (n,), and words as they are.
+    """Return what a file holds as arrays with dotted keys: numbers, lists of numbers (n,), and text as it is.
 
     Raises DataError, naming the line, where the file cannot be read or holds any other form.
     """
@@ -63,7 +63,7 @@ def _statements(path: Path, text: str) -> list[tuple[int, int, str]]:
 
 
 def _value(path: Path, number: int, value: str) -> np.ndarray:
-    """Return a list of numbers (n,), a number (), or a word ()."""
+    """Return a list of numbers (n,), a number (), or text ()."""
     if value.startswith("["):
         try:
             return np.array([float(word) for word in value.strip("[] ").split(",") if word.strip()])

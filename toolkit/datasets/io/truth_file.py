@@ -1,6 +1,6 @@
 """Ground truth from TUM files, and the checks that it belongs to a recording.
 
-Columns are never reordered silently: where the order looks wrong the error says so.
+Columns are never reordered silently: where the order looks wrong an error is raised.
 """
 
 from dataclasses import replace

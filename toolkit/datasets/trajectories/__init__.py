@@ -38,7 +38,7 @@ def read_poses(path: Path) -> PosesFile:
     """Read a file of any of the formats.
 
     Raises DataError, naming the line and the likely cause, where it is missing, empty, of none of the formats or
-    not what its format asks for: a wrong unit of time is named, never repaired. The order of quaternions shows
+    not as its format requires: a wrong unit of time is named, never repaired. The order of quaternions shows
     only beside the recording (:mod:`~toolkit.datasets.trajectories.belonging`).
     """
     rows = read_rows(path, _KIND)

@@ -1,4 +1,4 @@
-"""The checks that a trajectory belongs to a recording: one clock, one unit of time, and turns as the gyro says."""
+"""The checks that a trajectory belongs to a recording: one clock, one unit of time, rotation as the gyro has it."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -60,15 +60,15 @@ def check_clock(what: str, sequence: Sequence, t_ns: IntArray) -> None:
     if overlap and scale is None:
         return
     if scale is None:
-        told, cause = "they do not overlap", _clock_difference(frames_t_ns, t_ns)
+        mismatch, cause = "they do not overlap", _clock_difference(frames_t_ns, t_ns)
     else:
-        told, cause = "they fit only in another unit of time", f"multiply the stamps by {scale:g}"
+        mismatch, cause = "they fit only in another unit of time", f"multiply the stamps by {scale:g}"
     ranges = f"{what} covers {range_s(t_ns)}, the frames {range_s(frames_t_ns)}"
-    raise DataError(f"{sequence.name}: {ranges}: {told}; {cause}")
+    raise DataError(f"{sequence.name}: {ranges}: {mismatch}; {cause}")
 
 
 def check_turns(what: str, sequence: Sequence, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]) -> bool:
-    """Say whether rotations (N, 3, 3) turn as the gyro says; a recording may be too short or too straight to tell.
+    """Return whether rotations (N, 3, 3) agree with the gyro; False also where the recording is too short or straight.
 
     Raises DataError where they do so under one of the readings, and not as given: read wrongly, a trajectory turns
     the other way and about other axes.
@@ -88,7 +88,7 @@ def check_turns(what: str, sequence: Sequence, t_ns: IntArray, R_world_imu: Arra
 
 
 def range_s(t_ns: IntArray) -> str:
-    """Return the first and the last of stamps in words."""
+    """Return the first and the last of stamps as text."""
     return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
 
 

@@ -52,7 +52,7 @@ def parse(rows: Rows) -> PosesFile:
 
 def text(trajectory: Trajectory) -> str:
     """Return a trajectory as the text of a file; poses that are not finite are left out."""
-    told = finite(trajectory)
-    quaternions = np.roll(quaternion_from_rotation(told.T_world_imu[:, :3, :3]), 1, axis=1)
-    values = np.hstack([told.positions, quaternions]).tolist()
-    return rows_text(HEADER, zip(map(str, told.t_ns.tolist()), values, strict=True), ",")
+    kept = finite(trajectory)
+    quaternions = np.roll(quaternion_from_rotation(kept.T_world_imu[:, :3, :3]), 1, axis=1)
+    values = np.hstack([kept.positions, quaternions]).tolist()
+    return rows_text(HEADER, zip(map(str, kept.t_ns.tolist()), values, strict=True), ",")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.stamps import stamps_ns
+from toolkit.datasets.io.fields import stamps_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.estimate import Trajectory
@@ -48,7 +48,7 @@ def parse(rows: Rows) -> PosesFile:
 
 
 def read(path: Path, kind: str) -> Trajectory:
-    """Read a file; ``kind`` says what it is where it cannot be. Raises DataError as :func:`parse` does."""
+    """Read a file; ``kind`` describes it in the error where that fails. Raises DataError as :func:`parse` does."""
     poses = parse(read_rows(path, kind))
     assert poses.t_ns is not None
     return Trajectory(poses.t_ns, poses.T_world_imu)
@@ -59,10 +59,10 @@ def text(trajectory: Trajectory) -> str:
 
     Velocity and biases that the trajectory does not have are nan.
     """
-    told = finite(trajectory)
-    unknown = np.full((len(told), 3), np.nan)
-    v_world = unknown if told.v_world is None else told.v_world
-    accel, gyro = (unknown, unknown) if told.bias is None else (told.bias[:, :3], told.bias[:, 3:])
-    quaternions = quaternion_from_rotation(told.T_world_imu[:, :3, :3])
-    values = np.hstack([quaternions, told.positions, v_world, gyro, accel]).tolist()
-    return rows_text(HEADER, zip(map(stamp_text, told.t_ns.tolist()), values, strict=True), " ")
+    kept = finite(trajectory)
+    unknown = np.full((len(kept), 3), np.nan)
+    v_world = unknown if kept.v_world is None else kept.v_world
+    accel, gyro = (unknown, unknown) if kept.bias is None else (kept.bias[:, :3], kept.bias[:, 3:])
+    quaternions = quaternion_from_rotation(kept.T_world_imu[:, :3, :3])
+    values = np.hstack([quaternions, kept.positions, v_world, gyro, accel]).tolist()
+    return rows_text(HEADER, zip(map(stamp_text, kept.t_ns.tolist()), values, strict=True), " ")

@@ -23,7 +23,7 @@ class OtherOrder:
     """The order that the quaternions of a format have by mistake.
 
     Rolling what was read as x y z w by ``roll`` gives what the file then means; ``name`` calls the mistake, and
-    ``remedy`` says what to do.
+    ``remedy`` is the instruction to correct it.
     """
 
     roll: int
@@ -96,7 +96,7 @@ def finite(trajectory: Trajectory) -> Trajectory:
 
 
 def rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: str) -> str:
-    """Return a file's text: the header, then each row's first word and its values with 15 digits."""
+    """Return a file's text: the header, then each row's first entry and its values with 15 digits."""
     lines = (
         separator.join(([first] if first else []) + [f"{value:.15g}" for value in values]) for first, values in rows
     )

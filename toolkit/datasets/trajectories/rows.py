@@ -1,4 +1,4 @@
-"""The lines of a text file as words with their line numbers, and stamps in words as exact nanoseconds."""
+"""The lines of a text file as cells with their line numbers, and printed stamps as exact nanoseconds."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,62 +16,62 @@ _LARGEST_NS = 2**63 - 1
 
 @dataclass(frozen=True)
 class Rows:
-    """What a table in a text file holds: the number and the words of each line that is not empty or a comment.
+    """What a table in a text file holds: the number and the cells of each line that is not empty or a comment.
 
-    There is at least one line; ``commas`` tells that commas separate the words, and not blanks.
+    There is at least one line; ``commas`` is True where commas separate the cells, and not blanks.
     """
 
     path: Path
     line_numbers: list[int]
-    words: list[list[str]]
+    cells: list[list[str]]
     commas: bool
 
     @property
     def width(self) -> int:
-        """How many words the first line has."""
-        return len(self.words[0])
+        """The number of cells of the first line."""
+        return len(self.cells[0])
 
     def numbers(self, width: int, columns: str) -> Array:
-        """Return all words as numbers (N, width); ``columns`` names the first of them.
+        """Return all cells as numbers (N, width); ``columns`` names the first of them.
 
-        Raises DataError naming the line that has another number of words or one that is no number.
+        Raises DataError naming the line that has another number of cells or one that is no number.
         """
-        return np.array([self._numbers(n, words, width, columns) for n, words in self], dtype=float)
+        return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
 
     def stamps(self, per_unit_ns: int) -> IntArray:
-        """Return the first words, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
+        """Return the first cells, in units of so many nanoseconds, as int64 nanoseconds (N,), rounded only there.
 
         A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
         or beyond what 64 bits hold.
         """
-        return np.array([self._stamp(n, words[0], per_unit_ns) for n, words in self], dtype=np.int64)
+        return np.array([self._stamp(n, cells[0], per_unit_ns) for n, cells in self], dtype=np.int64)
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
-        return zip(self.line_numbers, self.words, strict=True)
+        return zip(self.line_numbers, self.cells, strict=True)
 
-    def _numbers(self, line_number: int, words: list[str], width: int, columns: str) -> list[float]:
-        if len(words) != width:
-            found = f"{self.path}: line {line_number} has {len(words)} columns"
+    def _numbers(self, line_number: int, cells: list[str], width: int, columns: str) -> list[float]:
+        if len(cells) != width:
+            found = f"{self.path}: line {line_number} has {len(cells)} columns"
             raise DataError(f"{found}, expected {width} ({columns})")
         try:
-            return [float(word) for word in words]
+            return [float(cell) for cell in cells]
         except ValueError as error:
             raise DataError(f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}") from error
 
-    def _stamp(self, line_number: int, word: str, per_unit_ns: int) -> int:
+    def _stamp(self, line_number: int, cell: str, per_unit_ns: int) -> int:
         try:
-            t_ns = int((Decimal(word) * per_unit_ns).to_integral_value())
+            t_ns = int((Decimal(cell) * per_unit_ns).to_integral_value())
         except (InvalidOperation, OverflowError, ValueError):
-            raise DataError(f"{self.path}: line {line_number} has no finite time ({word}); remove the line") from None
+            raise DataError(f"{self.path}: line {line_number} has no finite time ({cell}); remove the line") from None
         if abs(t_ns) > _LARGEST_NS:
-            raise DataError(f"{self.path}: line {line_number} has the time {word}, beyond any clock; check its unit")
+            raise DataError(f"{self.path}: line {line_number} has the time {cell}, beyond any clock; check its unit")
         return t_ns
 
 
 def read_rows(path: Path, kind: str) -> Rows:
     """Return the rows of a file; comments start with ``#``, and a heading without it may precede commas.
 
-    ``kind`` says what such a file is. Raises DataError where it is missing, empty or not text.
+    ``kind`` describes such a file in an error. Raises DataError where it is missing, empty or not text.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -82,12 +82,12 @@ def read_rows(path: Path, kind: str) -> Rows:
     lines = [(n, line.partition("#")[0].strip()) for n, line in enumerate(text.splitlines(), start=1)]
     lines = [(n, line) for n, line in lines if line]
     commas = bool(lines) and "," in lines[-1][1]
-    rows = [(n, _words(line, commas=commas)) for n, line in lines]
+    rows = [(n, _cells(line, commas=commas)) for n, line in lines]
     if commas and not _is_number(rows[0][1][0]):
         rows = rows[1:]
     if not rows:
         raise DataError(f"{path}: the file holds no poses; {kind}")
-    return Rows(path, [n for n, _ in rows], [words for _, words in rows], commas)
+    return Rows(path, [n for n, _ in rows], [cells for _, cells in rows], commas)
 
 
 def stamp_text(t_ns: int) -> str:
@@ -96,14 +96,14 @@ def stamp_text(t_ns: int) -> str:
     return f"{sign}{seconds}.{rest_ns:09d}"
 
 
-def _words(line: str, *, commas: bool) -> list[str]:
+def _cells(line: str, *, commas: bool) -> list[str]:
     """Split a line; some programs end theirs with a comma."""
-    return [word.strip() for word in line.removesuffix(",").split(",")] if commas else line.split()
+    return [cell.strip() for cell in line.removesuffix(",").split(",")] if commas else line.split()
 
 
-def _is_number(word: str) -> bool:
+def _is_number(cell: str) -> bool:
     try:
-        float(word)
+        float(cell)
     except ValueError:
         return False
     return True

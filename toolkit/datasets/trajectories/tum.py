@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.stamps import stamps_ns
+from toolkit.datasets.io.fields import stamps_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.errors import DataError
@@ -45,7 +45,7 @@ def parse(rows: Rows) -> PosesFile:
 
 
 def read(path: Path, kind: str = KIND) -> Trajectory:
-    """Read a file; ``kind`` says what it is where it cannot be. Raises DataError as :func:`parse` does."""
+    """Read a file; ``kind`` describes it in the error where that fails. Raises DataError as :func:`parse` does."""
     poses = parse(read_rows(path, kind))
     assert poses.t_ns is not None
     return Trajectory(poses.t_ns, poses.T_world_imu)
@@ -53,7 +53,7 @@ def read(path: Path, kind: str = KIND) -> Trajectory:
 
 def text(trajectory: Trajectory) -> str:
     """Return a trajectory as the text of a file; poses that are not finite are left out."""
-    told = finite(trajectory)
-    values = np.hstack([told.positions, quaternion_from_rotation(told.T_world_imu[:, :3, :3])])
-    stamps = (stamp_text(t_ns) for t_ns in told.t_ns.tolist())
+    kept = finite(trajectory)
+    values = np.hstack([kept.positions, quaternion_from_rotation(kept.T_world_imu[:, :3, :3])])
+    stamps = (stamp_text(t_ns) for t_ns in kept.t_ns.tolist())
     return rows_text(HEADER, zip(stamps, values.tolist(), strict=True), " ")

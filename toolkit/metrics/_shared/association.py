@@ -3,7 +3,7 @@
 The rule, the same for every estimator on a sequence: a truth stamp is scored where an estimate lies within the
 stamp tolerance (1 ms, or a quarter of the truth's period if that is less; stamps that coincide up to rounding are
 never interpolated), or where it lies between two estimates at most 1.5 frame periods apart (the estimate is then
-interpolated on the geodesic of SE(3)). Everything else is not scored, and the coverage says so.
+interpolated on the geodesic of SE(3)). Everything else is not scored; the coverage counts it as missing.
 """
 
 from dataclasses import dataclass

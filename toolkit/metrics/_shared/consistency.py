@@ -1,4 +1,4 @@
-"""Estimation errors in the units of the covariance that was stated for them, and the band a consistent one keeps.
+"""Estimation errors normalised by their stated covariance (NEES), and the chi-square band of a consistent estimator.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
 the normalised estimation error squared (NEES) e^T P^-1 e of a consistent estimator is chi-square distributed.
@@ -18,7 +18,7 @@ from toolkit.sequence import Sequence
 
 POSE_DOF = 6
 BAND_PROBABILITY = 0.95
-# A prior farther from the truth than one in a million draws is not about the truth's world.
+# A prior this improbable under its own covariance is expressed in another world frame than the truth.
 _OTHER_WORLD = 1e-6
 
 
@@ -26,7 +26,7 @@ _OTHER_WORLD = 1e-6
 class BodyErrors:
     """T_estimate^-1 T_truth (n, 4, 4) at the estimate's stamps (n,), which are its ``rows`` (n,).
 
-    ``placed`` tells that the estimate is in a world of its own and was brought into the truth's by its first pose.
+    ``placed`` is True where the estimate has its own world frame and was aligned with the truth's by its first pose.
     """
 
     t_ns: IntArray
@@ -69,9 +69,9 @@ def chi2_quantile(probability: float, dof: int) -> float:
 def body_errors(evaluation: Evaluation) -> BodyErrors:
     """Return the errors of the evaluated estimate in the body frame, wherever the truth has a pose.
 
-    In the truth's world as it is, if the sequence brings a prior about that world, as a simulated one does.
-    Otherwise every estimator starts in a world of its own and is placed by its first pose, as for ``ate_none_m``:
-    what is given away then is what the start pins without measuring it. Raises Unavailable without truth, or
+    In the truth's world frame without any alignment, if the sequence has a prior in that frame, as a simulated one
+    has. Otherwise every estimator starts in a frame of its own and is placed by its first pose, as for
+    ``ate_none_m``: only what the start fixes without measuring it is aligned. Raises Unavailable without truth, or
     where the truth begins after the estimate, for then there is no first pose to place.
     """
     truth, estimate = evaluation.sequence.truth, evaluation.estimate
@@ -86,7 +86,7 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
     poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
     if placed:
         if rows[0] != 0:
-            raise Unavailable("the estimate's world is its own, and the truth has no pose for its first one")
+            raise Unavailable("the estimate has its own world frame, and the truth has no pose for its first one")
         place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
         poses = place(true_poses[0], poses[0]).apply(poses)
     return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, placed)

@@ -1,4 +1,4 @@
-"""What the metric files look at: one output of one run beside its sequence, with nothing computed twice."""
+"""One output of one run beside its sequence: association, alignments and poses of frames, each computed once."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,8 +50,8 @@ class Evaluation:
     def placed(self) -> Array:
         """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
 
-        Every estimator starts in a world of its own. With an IMU the vertical is measured, so only heading
-        and position are given away; without one, the whole first pose.
+        Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
+        and position of the first pose are aligned; without one, the whole first pose is.
         """
         place = place_yaw if self.sequence.motion_kind == "imu" else place_pose
         pairs = self.compared

@@ -6,8 +6,8 @@ linear in q, points at infinity (no disparity) are as good as any other, and a G
 
 One robust solution a track comes first: Levenberg-Marquardt on all of its views, Huber's weights. Leaving view i
 out then subtracts its share from the normal equations and takes one Gauss-Newton step,
-(H - H_i) d = -(g - g_i). That is linear in the number of sightings, but keeps weights that view i had a say in, so
-tracks of at most 40 views are solved again from there without view i; in a longer one its say is too small to matter.
+(H - H_i) d = -(g - g_i). That is linear in the number of sightings, but view i still influences the weights, so
+tracks of at most 40 views are solved again from there without view i; in a longer one its influence is negligible.
 """
 
 from dataclasses import dataclass, replace

@@ -1,8 +1,41 @@
-"""The answer of a metric: a number, or the reason why there is none."""
+"""What a metric file declares, a record for each metric, and what it returns: a number, or why there is none."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
+
+Best = Literal["least", "most", "one", ""]
+InTable = Literal["always", "where rows differ", "on request"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One metric: what it means and how every table, file and page shows it.
+
+    ``meaning`` is one line with the unit; ``unit`` is as it stands in a table, "1" for a ratio and "" for a count.
+    ``heading`` are the two lines above its column, ``name`` the same in one line where it is not given. ``best`` is
+    which value is best: the least, the most, the one nearest 1, or none that is. ``table`` is when the table of a
+    comparison has a column for it by default, ``over_seeds`` whether the table over seeds has one.
+    ``in_contract`` marks the keys that every ``vislam.metrics/1`` document has; it counts for the toolkit's own
+    metrics only. ``gate_name`` is what the accuracy gate calls it, "" where the gate does not test it.
+    """
+
+    key: str
+    meaning: str
+    unit: str
+    heading: tuple[str, str]
+    name: str = ""
+    decimals: int = 2
+    best: Best = "least"
+    table: InTable = "on request"
+    over_seeds: bool = False
+    count: bool = False
+    in_contract: bool = False
+    gate_name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or " ".join(filter(None, self.heading)))
 
 
 class Unavailable(Exception):  # noqa: N818 - not an error: the run or the sequence simply lacks what the metric needs

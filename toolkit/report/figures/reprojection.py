@@ -9,7 +9,7 @@ from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, held_out, in_sample
-from toolkit.metrics._shared.reprojection import CAP_PX
+from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
 from toolkit.report.figures.top_view import last_word

@@ -1,11 +1,11 @@
-"""Keeping some frames of a sequence and renumbering what refers to them."""
+"""A sequence with only some of its frames or motion samples."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from toolkit.geometry import IntArray
-from toolkit.sequence import Observations, Sequence
+from toolkit.geometry import BoolArray, IntArray
+from toolkit.sequence import MotionSamples, Observations, Sequence, TwistSamples
 
 
 def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
@@ -25,3 +25,15 @@ def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
         observations=Observations.sorted(frame[rows], observations.track_id[rows], observations.uv_px[rows]),
         prior=sequence.prior if first_frame_stays else None,
     )
+
+
+def keep_samples(sequence: Sequence, kept: BoolArray | IntArray) -> Sequence:
+    """Return the sequence with the motion samples of a mask (S,) or an index (M,), in that order."""
+    motion = sequence.motion
+    t_ns = motion.t_ns[kept]
+    samples: MotionSamples
+    if isinstance(motion, TwistSamples):
+        samples = replace(motion, t_ns=t_ns, v_mps=motion.v_mps[kept], w_radps=motion.w_radps[kept])
+    else:
+        samples = replace(motion, t_ns=t_ns, accel_mps2=motion.accel_mps2[kept], gyro_radps=motion.gyro_radps[kept])
+    return replace(sequence, motion=samples)

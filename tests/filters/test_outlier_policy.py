@@ -1,0 +1,128 @@
+"""How far a wrong sighting pulls an estimate: each estimator's policy towards outliers, by its name alone.
+
+On an exact recording one sighting is moved by so many standard deviations, and the error it makes is read off: the
+influence function of robust statistics (Hampel et al. 1986). It grows in proportion where a sighting counts in full,
+stays where Huber's loss holds it, and is zero beyond a gate. A changed threshold moves one of the three.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from toolkit.estimate import Run
+from toolkit.geometry import se3_inverse, se3_log
+from toolkit.sequence import Sequence, is_held_out
+from toolkit.simulation import DRIVE, simulate
+from toolkit.simulation.scenarios import noise_free
+
+# The frame whose sighting is wrong, and how long before and after it the track must have been seen.
+FRAME, AROUND = 8, 4
+
+
+class Scene(NamedTuple):
+    """An exact recording, the rows of FRAME's sightings of long tracks, the nearest track first."""
+
+    sequence: Sequence
+    rows: list[int]
+
+    def with_error(self, sigmas: float) -> Sequence:
+        """Return the recording with one sighting off by so many standard deviations, to the side in both images."""
+        observations, whitener = self.sequence.observations, np.linalg.cholesky(self.sequence.rig.cov_uv_px2)
+        uv_px = observations.uv_px.copy()
+        # Neither the nearest, whose landmark would follow it, nor a far one, which says little.
+        uv_px[self.rows[len(self.rows) // 3]] += sigmas * (whitener @ np.array([1.0, 1.0, 0.0])) / np.sqrt(2.0)
+        return replace(self.sequence, observations=replace(observations, uv_px=uv_px))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    sequence = simulate(noise_free(replace(DRIVE, duration_s=1.3)), 0)
+    seen = sequence.observations
+    disparity_px = seen.uv_px[:, 0] - seen.uv_px[:, 1]
+    rows = np.flatnonzero((seen.frame == FRAME) & ~is_held_out(seen.track_id))
+
+    def is_long(row: int) -> bool:
+        frames = seen.frame[seen.track_id == seen.track_id[row]]
+        return bool(frames.min() <= FRAME - AROUND and frames.max() >= FRAME + AROUND)
+
+    return Scene(sequence, sorted(filter(is_long, rows.tolist()), key=lambda row: -disparity_px[row]))
+
+
+@pytest.fixture
+def pull(scene, run_estimator) -> Callable[[str, float], float]:
+    """Return a function: the error (m) of the final position at FRAME that a sighting off by some sigmas makes."""
+    truth = scene.sequence.truth.T_world_imu[FRAME]
+
+    def pulled(name: str, sigmas: float) -> float:
+        estimated = run_estimator(name, scene.with_error(sigmas)).final.T_world_imu[FRAME]
+        return float(np.linalg.norm(se3_log(se3_inverse(estimated) @ truth)[3:]))
+
+    return pulled
+
+
+# Of what is exact a run leaves rounding, or where its iteration stops.
+NOTHING_M = 1e-6
+
+
+def test_ekf_holds_a_sighting_from_one_and_a_half_sigma_on_and_drops_it_beyond_its_gate(pull):
+    """Its whitener holds the landmark's variance as well, here as large as the sighting's: 1.5 becomes 2.1 sigma."""
+    at_one = pull("ekf", 1.0)
+    assert at_one > 100.0 * NOTHING_M
+    assert pull("ekf", 1.5) / at_one == pytest.approx(1.5, rel=0.02)
+    assert pull("ekf", 3.5) / at_one == pytest.approx(2.1, rel=0.1)  # 3.5 would be full weight
+    assert pull("ekf", 6.0) < NOTHING_M
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
+def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_has_slipped(pull, name):
+    """The gate's bound is 2.8 sigma, of a residual of which the fit takes a tenth; slipped is what is beyond 7.9."""
+    at_one = pull(name, 1.0)
+    assert at_one > 100.0 * NOTHING_M
+    assert pull(name, 2.5) / at_one == pytest.approx(2.5, rel=0.02)
+    assert pull(name, 6.5) / at_one == pytest.approx(3.0, rel=0.1)  # 6.5 would be full weight
+    assert pull(name, 12.0) < NOTHING_M
+
+
+def test_batch_counts_in_full_what_chance_explains_and_nothing_else(pull):
+    """A sound sighting is beyond 4.03 sigma once in a thousand; the filters' gate at 95 % would end at 2.8."""
+    at_one = pull("batch", 1.0)
+    assert at_one > 100.0 * NOTHING_M
+    assert pull("batch", 3.7) / at_one == pytest.approx(3.7, rel=0.02)  # one relinearisation is in it
+    assert pull("batch", 4.7) < NOTHING_M
+
+
+@pytest.mark.parametrize("name", ["msckf", "msckf-fej"])
+def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_slipped_is_asked_again(scene, run_estimator, name):
+    """To give up the worst sighting of a track with bad luck would choose measurements by their agreement.
+
+    The one track of five views fails from 6.7 sigma on, and is twice beyond its gate from 9.5 on.
+    """
+
+    def counted(sigmas: float) -> tuple[int, int]:
+        info = run_estimator(name, scene.with_error(sigmas)).info
+        return int(info["gate_tested"].sum()), int(info["gate_accepted"].sum())
+
+    tested, accepted = counted(0.0)
+    assert tested == accepted
+    assert counted(5.5) == (tested, accepted)
+    assert counted(8.0) == (tested, accepted - 1)
+    assert counted(12.0) == (tested + 1, accepted)
+
+
+def test_a_doubtful_pose_does_not_harden_the_decoupled_map(scene, run_estimator):
+    """Four landmarks leave the pose as doubtful as they are: mapped along known poses each would be a quarter surer."""
+    rows = scene.rows[:4]
+    seen = scene.sequence.observations
+    few = seen.select(np.isin(seen.track_id, seen.track_id[rows]))
+    sequence = replace(scene.sequence, observations=few)
+
+    def variances(run: Run) -> np.ndarray:
+        assert run.landmarks.cov is not None
+        return np.trace(run.landmarks.cov, axis1=1, axis2=2)
+
+    doubtful, known = (variances(run_estimator(name, sequence)) for name in ("ekf", "mapping"))
+    assert len(doubtful) == len(rows)
+    assert (doubtful > 1.15 * known).all()

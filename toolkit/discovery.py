@@ -1,0 +1,83 @@
+"""Find the modules of announced packages: the estimators, metrics and datasets of this and other distributions.
+
+An installed distribution announces, under an entry-point group such as ``toolkit.metrics``, a package; every public
+module directly in that package is one estimator, metric file or dataset. No list of names has to be edited.
+"""
+
+import importlib
+import importlib.machinery
+import importlib.util
+import pkgutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+
+from toolkit.errors import VislamError
+
+
+class MissingDependency(Exception):  # noqa: N818 - what a module needs and this installation lacks
+    """Raised where a module cannot be imported because a package of another distribution is not installed."""
+
+    def __init__(self, package: str) -> None:
+        super().__init__(f"it needs the package {package}")
+
+
+@dataclass(frozen=True)
+class FoundModule:
+    """A module of an announced package: its dotted name and its file."""
+
+    module: str
+    path: Path
+
+    @property
+    def name(self) -> str:
+        """Return the name a user reads: ``my_filter.py`` is ``my-filter``."""
+        return self.module.rpartition(".")[2].replace("_", "-")
+
+    def load(self) -> ModuleType:
+        """Import the module.
+
+        Raises MissingDependency where it needs a package that is not installed. Any other error is a defect and
+        passes through, a misspelt module of the module's own package or of the toolkit included.
+        """
+        try:
+            return importlib.import_module(self.module)
+        except ModuleNotFoundError as error:
+            if error.name is None or error.name.split(".")[0] in (self.module.split(".")[0], "toolkit"):
+                raise
+            raise MissingDependency(error.name) from error
+
+
+def modules_in(package: str, folders: Iterable[str]) -> list[FoundModule]:
+    """Return the modules directly in a package's folders; sub-packages and private modules are parts, not members."""
+    return [
+        FoundModule(f"{package}.{module.name}", Path(folder) / f"{module.name}.py")
+        for folder in folders
+        for module in pkgutil.iter_modules([folder])
+        if not module.ispkg and not module.name.startswith("_")
+    ]
+
+
+def announced(group: str, error: type[VislamError] = VislamError) -> list[FoundModule]:
+    """Return the modules of every package announced under an entry-point group, importing none of them.
+
+    Raises ``error`` where an entry point does not name a package.
+    """
+    found: list[FoundModule] = []
+    for package in sorted({point.value for point in entry_points(group=group)}):
+        spec = _spec(package)
+        if spec is None or spec.submodule_search_locations is None:
+            raise error(f"the entry point {group} names {package}, which is not a package here")
+        found += modules_in(package, spec.submodule_search_locations)
+    return found
+
+
+def _spec(package: str) -> importlib.machinery.ModuleSpec | None:
+    try:
+        return importlib.util.find_spec(package)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{package}.".startswith(f"{error.name}."):
+            raise
+        return None  # a parent of the package does not exist

@@ -1,0 +1,70 @@
+"""From pairs of poses, or of image points, to one error each, and to the figures over all of them."""
+
+import numpy as np
+
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
+from toolkit.metrics._shared.association import Matched
+from toolkit.metrics._shared.scores import Unavailable
+
+# An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or
+# one that is not finite, counts as this much, so that no run wins by losing its points.
+CAP_PX = 100.0
+
+
+def relative_errors(matched: Matched, first: IntArray, last: IntArray) -> Array:
+    """Return E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) (p, 4, 4) for true poses Q, estimates P and index pairs (p,), (p,).
+
+    Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eq. 2. Free of any gauge.
+    """
+    true_motion = se3_inverse(matched.truth[first]) @ matched.truth[last]
+    estimated_motion = se3_inverse(matched.estimate[first]) @ matched.estimate[last]
+    return se3_inverse(true_motion) @ estimated_motion
+
+
+def lengths(vectors: Array) -> Array:
+    """Return the Euclidean length (...,) of vectors (..., 3)."""
+    return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
+def angles_deg(rotations: Array) -> Array:
+    """Return the rotation angle (...,) in degrees, 0 to 180, of rotations (..., 3, 3)."""
+    return np.degrees(lengths(so3_log(rotations)))
+
+
+def rmse(errors: Array) -> float:
+    """Return the root mean square of errors (N,)."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_front: BoolArray) -> Array:
+    """Return the root mean square of the uL, uR and v residuals (N,), no more than CAP_PX.
+
+    Predictions and measurements are (N, 3); an observation that is not ``in_front`` (N,) counts as CAP_PX.
+    """
+    errors_px = np.sqrt(np.mean((uv_measured_px - uv_predicted_px) ** 2, axis=1))
+    return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
+
+
+def median_px(errors_px: Array) -> float:
+    """Return the median of errors (N,) px; raises Unavailable where there are none."""
+    if not errors_px.size:
+        raise Unavailable("no observation could be reprojected")
+    return float(np.median(errors_px))
+
+
+def rmse_px(errors_px: Array) -> float:
+    """Return the root mean square of errors (N,) px; raises Unavailable where there are none."""
+    if not errors_px.size:
+        raise Unavailable("no observation could be reprojected")
+    return rmse(errors_px)
+
+
+def scored_remark(errors_px: Array, observation_count: int, why_left_out: str) -> str:
+    """Return how many of the observations were scored and how many of those stand at the cap; "" if all is well."""
+    parts = []
+    if errors_px.size < observation_count:
+        parts.append(f"{errors_px.size} of {observation_count} observations scored, the others {why_left_out}")
+    at_cap = int(np.count_nonzero(errors_px >= CAP_PX))
+    if at_cap:
+        parts.append(f"{at_cap} behind the camera or off by more than {CAP_PX:g} px, counted as {CAP_PX:g} px")
+    return "; ".join(parts)
