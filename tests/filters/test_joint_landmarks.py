@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from filters.kalman.belief import initial_belief
 
 from filters.kalman import iterated, joint_landmarks
 from filters.kalman.diagnostics import Innovation
