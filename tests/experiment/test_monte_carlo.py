@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from toolkit.report.metrics_json import to_text
 
 from toolkit.datasets import is_drawn_from_a_seed
-from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.statistics import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
-from toolkit.report.metrics_json import to_text
 from toolkit.report.report_md import report_text
 from toolkit.report.terminal import comparison_text
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from toolkit.gate.baseline import BaselineError
-from toolkit.gate.baseline_file import to_text
-from toolkit.gate.baseline_file import check_releases, load_baseline
+from toolkit.gate.baseline_file import check_releases, load_baseline, to_text
 from toolkit.gate.releases import differences, installed
 from toolkit.metrics import describe
 

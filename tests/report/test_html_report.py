@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toolkit.report.comparison import Comparison
 
 from toolkit.errors import DataError, OutputError
-from toolkit.report.comparison import Comparison
 from toolkit.report.html import write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.page import SCRIPTS, json_in_html, page_text

@@ -19,7 +19,6 @@ from toolkit.metrics import cost, score_run
 from toolkit.progress import SILENT
 from toolkit.report.figures import errors_over_time, frame_times
 from toolkit.report.records import read_metrics
-from toolkit.report.references import reference_runs
 from toolkit.report.run_directory import Request, compare_all
 from toolkit.report.terminal import comparison_text
 from toolkit.runner import Progress

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import to_builtins
+from toolkit.report.comparison import Comparison, Row
 
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.metrics import score_run
-from toolkit.report.comparison import Comparison, Row
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document
 

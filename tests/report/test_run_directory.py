@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from toolkit.report.comparison import Comparison
 
 from toolkit.errors import OutputError
 from toolkit.report import run_directory
-from toolkit.report.comparison import Comparison
 from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import check_run_directory, write_run
 from toolkit.report.scores_json import metrics_document

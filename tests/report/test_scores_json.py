@@ -5,10 +5,10 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from toolkit.report.comparison import Comparison
 
 from toolkit.documents import parse, to_text
 from toolkit.metrics import Scores, describe
-from toolkit.report.comparison import Comparison
 from toolkit.report.records.metrics import PROMISED_KEYS, Metrics
 from toolkit.report.scores_json import metrics_document
 
