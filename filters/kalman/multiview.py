@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
 
@@ -41,32 +41,20 @@ def linearise(sightings: Sightings, points: Array, poses: Array, poses_at: Array
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
     What was not seen is zero throughout.
     """
-    whitener = np.linalg.inv(np.linalg.cholesky(rig.cov_uv_px2))
-    seen = sightings.seen[..., None]
-    points_cam, _ = _in_camera(points, poses, rig)
-    points_cam_at, points_imu_at = _in_camera(points, poses_at, rig)
-    safe, safe_at = _in_front(points_cam), _in_front(points_cam_at)
-    residuals = np.where(seen, (sightings.uvs_px - stereo.project(safe, rig)) @ whitener.T, 0.0)
-    d_uv_d_imu = whitener @ stereo.projection_jacobian(safe_at, rig) @ rig.T_imu_cam[:3, :3].T
-    d_uv_d_imu = np.where(seen[..., None], d_uv_d_imu, 0.0)
-    H_pose = np.concatenate([d_uv_d_imu @ skew(points_imu_at), -d_uv_d_imu], axis=-1)
-    H_point = d_uv_d_imu @ np.swapaxes(poses_at[:, :3, :3], -1, -2)
-    depth_m = np.where(sightings.seen, points_cam[..., 2], np.inf)
-    return Linearised(residuals, H_pose, H_point, depth_m)
+    whitener, seen = stereo.whitener(rig), sightings.seen[..., None]
+    now = _seen_from(poses, points, rig)
+    there = now if poses_at is poses else _seen_from(poses_at, points, rig)
+    residuals = np.where(seen, (sightings.uvs_px - now.uv_px) @ whitener.T, 0.0)
+    H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
+    H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
+    return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, now.depth_m, np.inf))
 
 
-def _in_camera(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return points (F, 3) in the camera and in the IMU frame of each pose (W, 4, 4), both (F, W, 3)."""
-    T_imu_world, T_cam_imu = se3_inverse(poses), se3_inverse(rig.T_imu_cam)
+def _seen_from(poses: Array, points: Array, rig: StereoRig) -> stereo.StereoPrediction:
+    """Predict points (F, 3) from each pose (W, 4, 4), all with leading axes (F, W)."""
+    T_imu_world = se3_inverse(poses)
     points_imu = np.einsum("wij,fj->fwi", T_imu_world[:, :3, :3], points) + T_imu_world[:, :3, 3]
-    return points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3], points_imu
-
-
-def _in_front(points_cam: Array) -> Array:
-    """Return the points with a depth that can be divided by; callers gate those that were not in front."""
-    result = points_cam.copy()
-    result[..., 2] = np.where(np.abs(result[..., 2]) < 1e-3, 1e-3, result[..., 2])
-    return result
+    return stereo.linearise(points_imu, poses[:, :3, :3], rig)
 
 
 class Constraints(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from filters.smoothing.graph_builder import HUBER_THRESHOLD
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
 
@@ -39,16 +39,16 @@ class Sightings:
 
 
 class Seen(NamedTuple):
-    """Where N sightings' points are: rotations (N, 3, 3) to the body, the points (N, 3) there and in the camera."""
+    """Where N sightings' points are: attitudes (N, 3, 3) of the IMU, the points (N, 3) there, depths (N,) m."""
 
-    R_imu_world: Array
+    R_world_imu: Array
     points_imu: Array
-    points_cam: Array
+    depth_m: Array
 
     @property
     def in_front(self) -> BoolArray:
         """Say which points (N,) are in front of the camera."""
-        front: BoolArray = self.points_cam[:, 2] > 0.0
+        front: BoolArray = self.depth_m > 0.0
         return front
 
 
@@ -70,10 +70,9 @@ class Reduced(NamedTuple):
 def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> Seen:
     """Return where the points (M, 3) of sightings are, seen from their poses (K, 4, 4) of the IMU in the world."""
     T_imu_world = se3_inverse(poses)[sightings.pose]
-    R_imu_world, T_cam_imu = T_imu_world[:, :3, :3], se3_inverse(rig.T_imu_cam)
     with np.errstate(invalid="ignore"):
-        points_imu = (R_imu_world @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
-        return Seen(R_imu_world, points_imu, points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3])
+        points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
+        return Seen(poses[sightings.pose, :3, :3], points_imu, stereo.in_camera(points_imu, rig)[:, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,30 +99,25 @@ class Vision:
     def reduced(self) -> Reduced:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
         weights = np.where(self.seen.in_front, np.sqrt(HUBER_THRESHOLD / np.maximum(self._norm, HUBER_THRESHOLD)), 0.0)
-        to_cam = self._root @ stereo.projection_jacobian(self._points_cam, self.rig)
-        J_body = weights[:, None, None] * (to_cam @ self.rig.T_imu_cam[:3, :3].T)
-        # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the body.
-        J_pose = np.concatenate([J_body @ skew(self.seen.points_imu), -J_body], axis=-1)
-        J_point = J_body @ self.seen.R_imu_world
+        weighted = weights[:, None, None] * stereo.whitener(self.rig)
+        J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
         return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
+
+    @cached_property
+    def _predicted(self) -> stereo.StereoPrediction:
+        """The points as predicted; those behind the camera from a place that has an image."""
+        in_front, somewhere = self.seen.in_front, transform(self.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
+        points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
+        return stereo.linearise(points_imu, self.seen.R_world_imu, self.rig)
 
     @cached_property
     def _residual(self) -> Array:
         """Measured less predicted, whitened (N, 3)."""
-        return (self.sightings.uv_px - stereo.project(self._points_cam, self.rig)) @ self._root.T
+        return (self.sightings.uv_px - self._predicted.uv_px) @ stereo.whitener(self.rig).T
 
     @cached_property
     def _norm(self) -> Array:
         return np.asarray(np.linalg.norm(self._residual, axis=1))
-
-    @property
-    def _points_cam(self) -> Array:
-        """The points in the camera; those behind it stand at a place that has an image."""
-        return np.where(self.seen.in_front[:, None], self.seen.points_cam, np.array([0.0, 0.0, 1.0]))
-
-    @property
-    def _root(self) -> Array:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.rig.cov_uv_px2)))
 
 
 def _eliminated(residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]) -> Reduced:

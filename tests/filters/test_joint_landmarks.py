@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from filters.kalman.belief import initial_belief
 
 from filters.kalman import iterated, joint_landmarks
 from filters.kalman.diagnostics import Innovation
@@ -10,6 +9,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
 from toolkit.geometry import Array, transform
 from toolkit.models import stereo
+from toolkit.models.motion import motion_model
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import FLIGHT, simulate
 
@@ -19,7 +19,8 @@ SEQUENCE = simulate(FLIGHT, 0)
 def belief_with_a_landmark(depth_m: float) -> JointBelief:
     """Return a belief whose only landmark has that depth in the camera and is uncertain by 0.1 m."""
     assert SEQUENCE.prior is not None
-    joint = JointBelief(initial_belief(SEQUENCE.prior, "imu"))
+    model = motion_model(SEQUENCE.noise, SEQUENCE.gravity_world)
+    joint = JointBelief(model.initial_belief(SEQUENCE.prior))
     joint.clone(0)
     point = transform(joint.clones[0] @ SEQUENCE.rig.T_imu_cam, np.array([[0.3, 0.2, depth_m]]))
     joint.add_landmarks(np.array([7]), point, np.zeros((3, joint.cov.shape[0])), 0.01 * np.eye(3))

@@ -95,6 +95,20 @@ def test_depth_is_negative_behind_the_camera(pose):
     assert stereo.predict(behind, pose, DRIVE.rig).depth_m == pytest.approx([-4.0])
 
 
+def test_a_point_in_the_plane_of_the_camera_has_an_image_and_keeps_its_depth(pose):
+    """What nothing can see must not spoil the rows beside it with numbers that are none."""
+    beside = in_world(np.array([[0.5, 0.2, 0.0], [0.5, 0.2, 4.0]]), pose, DRIVE.rig)
+    predicted = stereo.predict(beside, pose, DRIVE.rig)
+    assert all(np.isfinite(part).all() for part in predicted)
+    np.testing.assert_allclose(predicted.depth_m, [0.0, 4.0], atol=1e-12)
+
+
+@every_rig
+def test_whitened_noise_has_unit_covariance(rig):
+    whitener = stereo.whitener(rig)
+    np.testing.assert_allclose(whitener @ rig.cov_uv_px2 @ whitener.T, np.eye(3), atol=1e-12)
+
+
 class Sighted(NamedTuple):
     """A frame with the pose and the points (N, 3) its factors are evaluated at."""
 

@@ -7,12 +7,15 @@ import numpy as np
 from toolkit.geometry import Array, se3_inverse, skew, transform
 from toolkit.sequence import StereoRig
 
+# What a depth is divided by at least.
+_LEAST_DIVISIBLE_M = 1e-3
+
 
 class StereoPrediction(NamedTuple):
-    """Predicted measurements of N points from one pose, with Jacobians.
+    """Predicted measurements of points, with Jacobians; the leading axes (...) are those of the points.
 
-    ``uv_px`` (N, 3); ``d_uv_d_pose`` (N, 3, 6) for a right perturbation [rotation, position] of T_world_imu;
-    ``d_uv_d_point`` (N, 3, 3) for the point in the world; ``depth_m`` (N,): where it is not positive the
+    ``uv_px`` (..., 3); ``d_uv_d_pose`` (..., 3, 6) for a right perturbation [rotation, position] of T_world_imu;
+    ``d_uv_d_point`` (..., 3, 3) for the point in the world; ``depth_m`` (...): where it is not positive the
     point is not in front of the camera and the rest of its row means nothing.
     """
 
@@ -45,14 +48,33 @@ def projection_jacobian(points_cam: Array, rig: StereoRig) -> Array:
 
 def predict(points_world: Array, T_world_imu: Array, rig: StereoRig) -> StereoPrediction:
     """Predict the measurements of points (N, 3) from one pose (4, 4) or from a pose each (N, 4, 4)."""
-    T_cam_imu = se3_inverse(rig.T_imu_cam)
-    points_imu = transform(se3_inverse(T_world_imu), points_world)
-    points_cam = transform(T_cam_imu, points_imu)
-    d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ T_cam_imu[:3, :3]
+    return linearise(transform(se3_inverse(T_world_imu), points_world), T_world_imu[..., :3, :3], rig)
+
+
+def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPrediction:
+    """Predict the measurements of points (..., 3) given in the IMU frame, whose attitudes are (..., 3, 3).
+
+    A point within a millimetre of the camera's plane is predicted as if it were a millimetre in front of it.
+    """
+    points_cam = in_camera(points_imu, rig)
+    depth_m = points_cam[..., 2].copy()
+    points_cam[..., 2] = np.where(np.abs(depth_m) < _LEAST_DIVISIBLE_M, _LEAST_DIVISIBLE_M, depth_m)
+    d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ rig.T_imu_cam[:3, :3].T
     # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the IMU frame.
     d_uv_d_pose = np.concatenate([d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu], axis=-1)
-    d_uv_d_point = d_uv_d_point_imu @ np.swapaxes(T_world_imu[..., :3, :3], -1, -2)
-    return StereoPrediction(project(points_cam, rig), d_uv_d_pose, d_uv_d_point, points_cam[..., 2])
+    d_uv_d_point = d_uv_d_point_imu @ np.swapaxes(R_world_imu, -1, -2)
+    return StereoPrediction(project(points_cam, rig), d_uv_d_pose, d_uv_d_point, depth_m)
+
+
+def in_camera(points_imu: Array, rig: StereoRig) -> Array:
+    """Return points (..., 3) of the IMU frame in the left camera."""
+    T_cam_imu = se3_inverse(rig.T_imu_cam)
+    return np.asarray(points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3])
+
+
+def whitener(rig: StereoRig) -> Array:
+    """Return W (3, 3) with W cov W^T = 1: a residual (..., 3) px becomes one of unit variance by ``residual @ W.T``."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(rig.cov_uv_px2)))
 
 
 def triangulate(uvs_px: Array, rig: StereoRig) -> Array:
