@@ -1,9 +1,10 @@
 """Incremental full smoother: every state and landmark kept, re-solved only where news reaches (iSAM2, GTSAM).
 
-What it approximates: a variable is relinearised once it has moved by a threshold, not at every iteration, and each
-frame makes one Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree").
-Its causal answer is the newest state, its final answer the latest value of every state. A landmark that falls behind
-the camera, or makes the system indeterminate, is dropped and the log says so.
+What it approximates, frame by frame: a variable is relinearised once it has moved by a threshold, not at every
+iteration; what none of the last 30 frames concerns is not relinearised at all; and each frame makes one Gauss-Newton
+step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal answer is the
+newest state. For its final answer everything is linearised anew until the error stalls: that is the optimum of all it
+took in. A landmark that falls behind the camera, or makes the system indeterminate, is dropped and the log says so.
 """
 
 from dataclasses import replace
@@ -14,10 +15,12 @@ import numpy as np
 from filters.smoothing.covariance_recovery import with_covariances
 from filters.smoothing.graph_builder import Grown, Growth
 from filters.smoothing.incremental import IncrementalTree
+from filters.smoothing.indeterminate import Recovery, behind_camera
+from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.marginals import state_cov
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import Array, se3_inverse, transform
+from toolkit.geometry import Array
 from toolkit.models.factors import L
 from toolkit.sequence import Packet
 
@@ -52,15 +55,14 @@ class Isam2:
         return estimate
 
     def finish(self) -> Finished:
-        """Return every state and landmark as last known."""
-        self._log += [f"in the end: {line}" for line in self._tree.settle()]
-        values, motion = self._tree.isam.calculateBestEstimate(), self._growth.motion
+        """Solve for every state and landmark, all of them linearised anew until the error stalls."""
+        graph, motion = self._tree.graph(), self._growth.motion
+        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping())
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
-        linear = self._tree.isam.getFactorsUnsafe().linearize(values)
         keys = [motion.keys(k) for k in range(len(states))]
-        trajectory, log = with_covariances(Trajectory.of(states), linear, self._tree.landmarks(), keys)
-        return Finished(trajectory, Landmarks.of(points), log=(*self._log, *log))
+        trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), self._tree.landmarks(), keys)
+        return Finished(trajectory, Landmarks.of(points), converged, (*self._log, *log))
 
     def _newest(self, grown: Grown, packet: Packet) -> Estimate:
         values = self._tree.read(grown.state_keys)
@@ -70,13 +72,13 @@ class Isam2:
 
     def _drop_landmarks_behind(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
         """Drop what is no longer in front of the camera that sees it: its sightings would say nothing at all."""
-        T_cam_world = se3_inverse(estimate.T_world_imu @ self._rig.T_imu_cam)
-        depths_m = transform(T_cam_world, points)[:, 2]
-        behind = [seen[row] for row in np.flatnonzero(depths_m <= 0.0)]
+        behind = {seen[row] for row in np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))}
         if behind:
-            self._growth.forget(set(behind))
-            log = [f"landmark {i} fell behind the camera and was dropped" for i in behind]
-            self._note(packet, log + self._tree.drop(map(L, behind)))
+            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
+            recovery = self._tree.drop(map(L, behind))
+            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
 
-    def _note(self, packet: Packet, lines: list[str]) -> None:
-        self._log += [f"frame {packet.index}: {line}" for line in lines]
+    def _note(self, packet: Packet, recovery: Recovery) -> None:
+        """Keep the log of a recovery; a landmark that was dropped begins anew with its next sighting."""
+        self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
+        self._growth.forget(recovery.dropped)

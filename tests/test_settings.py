@@ -79,3 +79,9 @@ def test_settings_cannot_be_changed() -> None:
     with pytest.raises(AttributeError):
         DEFAULTS.window.lag_s = 5.0  # type: ignore[misc]
     assert isinstance(msgspec.structs.replace(DEFAULTS, seeds=3), Settings)
+
+
+def test_what_differs_from_the_defaults_is_kept_alone_and_reads_back() -> None:
+    assert settings.changes_of(DEFAULTS) == {}
+    changes = {"window": {"lag_s": 3.0}, "seeds": 4, "estimators": {"mine": {"gain": 0.5}}}
+    assert settings.changes_of(settings_of(changes, "here")) == changes

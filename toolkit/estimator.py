@@ -9,6 +9,7 @@ where no estimator is named; ``OPTIONS`` names the settings that it alone reads.
 
 import ast
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, cast
 
@@ -82,7 +83,8 @@ class EstimatorEntry:
 
     def options(self) -> frozenset[str]:
         """Return the names of the settings that this estimator alone reads: its module's constant ``OPTIONS``."""
-        return frozenset(self._strings("OPTIONS"))
+        options = self._constants().get("OPTIONS", ())
+        return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""
@@ -105,17 +107,10 @@ class EstimatorEntry:
                 pairs = _paired(statement.target, statement.value)
             else:
                 continue
-            found |= {t.id: v.value for t, v in pairs if isinstance(t, ast.Name) and isinstance(v, ast.Constant)}
+            for target, value in pairs:
+                with suppress(ValueError):  # not a literal, so nothing that is read here
+                    found |= {target.id: ast.literal_eval(value)} if isinstance(target, ast.Name) else {}
         return found
-
-    def _strings(self, constant: str) -> list[str]:
-        """Return the words of a top-level tuple of literals; none where there is no such constant."""
-        for statement in self._tree().body:
-            if isinstance(statement, ast.Assign) and any(
-                isinstance(target, ast.Name) and target.id == constant for target in statement.targets
-            ):
-                return [str(word) for word in ast.literal_eval(statement.value)]
-        return []
 
     def load(self) -> Build:
         """Import the estimator and return its ``build``.

@@ -5,15 +5,15 @@ Observations are sparse, one row a sighting. Motion samples are cut at the frame
 from all of them and serves the held-out reprojection error.
 """
 
-import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
 
 from toolkit.errors import DataError
+from toolkit.files import content_digest
 from toolkit.geometry import (
     Array,
     BoolArray,
@@ -341,24 +341,13 @@ class Sequence:
         kept = self.observations.select(self.observations.frame < max_frames)
         return replace(self, frames_t_ns=self.frames_t_ns[:max_frames], observations=kept)
 
-    def content_hash(self) -> str:
-        """Return a SHA-256 over everything an estimator can see and the truth it is scored on."""
-        digest = hashlib.sha256()
-        parts = (self.rig, self.noise, self.observations, self.motion, self.truth, self.prior)
-        for part in (self.frames_t_ns, self.gravity_world, *parts):
-            _feed(digest, part)
-        return digest.hexdigest()
+    def content_hash(self, digits: int | None = None) -> str:
+        """Return a SHA-256 over everything an estimator can see and the truth it is scored on.
 
-
-def _feed(digest: "hashlib._Hash", value: object) -> None:
-    if isinstance(value, np.ndarray):
-        digest.update(str(value.shape).encode())
-        digest.update(np.ascontiguousarray(value).data)
-    elif hasattr(value, "__dataclass_fields__"):
-        for f in fields(value):  # type: ignore[arg-type]
-            _feed(digest, getattr(value, f.name))
-    else:
-        digest.update(repr(value).encode())
+        With ``digits``, of the same rounded (:func:`toolkit.files.content_digest`).
+        """
+        seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
+        return content_digest((*seen, self.truth, self.prior), digits)
 
 
 def is_held_out(track_ids: IntArray) -> BoolArray:

@@ -161,6 +161,18 @@ def as_values(settings: Settings) -> dict[str, Any]:
     return values
 
 
+def changes_of(settings: Settings) -> dict[str, Any]:
+    """Return the nested values in which settings differ from the defaults: what follows when the defaults change."""
+    changed: dict[str, Any] = {}
+    defaults = as_values(DEFAULTS)
+    for key, value in as_values(settings).items():
+        section = isinstance(value, dict) and key != "estimators"
+        differs = {name: one for name, one in value.items() if one != defaults[key][name]} if section else value
+        if differs != ({} if section else defaults[key]):
+            changed[key] = differs
+    return changed
+
+
 def describe() -> tuple[Described, ...]:
     """Return every setting, in the order of the record."""
     return tuple(_described(Settings, ""))

@@ -9,6 +9,7 @@ a threshold it is replaced by a new one at the states' values: what iSAM2 does t
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -26,6 +27,11 @@ class Held:
     factor: gtsam.CustomFactor
     linearised_at: gtsam.Values
 
+    @cached_property
+    def keys(self) -> tuple[int, ...]:
+        """Return the keys of the factor, which GTSAM hands out as a new list each time."""
+        return tuple(self.factor.keys())
+
     def container(self) -> gtsam.LinearContainerFactor:
         """Return the linearisation as a factor of its own."""
         return gtsam.LinearContainerFactor(self.factor.linearize(self.linearised_at), self.linearised_at)
@@ -33,8 +39,7 @@ class Held:
     def moved(self, values: gtsam.Values) -> bool:
         """Say whether a state is no longer where the factor was linearised."""
         delta = self.linearised_at.localCoordinates(values)
-        keys: list[int] = self.factor.keys()
-        return any(np.abs(delta.at(key)).max() > MOVED for key in keys)
+        return any(np.abs(delta.at(key)).max() > MOVED for key in self.keys)
 
 
 def held_of(factors: gtsam.NonlinearFactorGraph, read: Read) -> dict[int, Held]:

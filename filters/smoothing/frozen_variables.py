@@ -17,7 +17,12 @@ class Resting:
         self._recent: deque[set[int]] = deque()
         self._last_frame: dict[int, int] = {}
         self._count = 0
+        self._at_rest: set[int] = set()
         self.keys = gtsam.KeyList()
+
+    def all_of(self, keys: Iterable[int]) -> bool:
+        """Say whether all of some variables rest."""
+        return self._at_rest.issuperset(keys)
 
     def concerns(self, keys: Iterable[int]) -> None:
         """Take note of the variables a new frame concerns."""
@@ -29,4 +34,5 @@ class Resting:
             for key in sorted(self._recent.popleft()):
                 if self._last_frame[key] == oldest:
                     self.keys.push_back(key)
+                    self._at_rest.add(key)
         self._count += 1

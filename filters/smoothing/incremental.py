@@ -13,7 +13,7 @@ import numpy as np
 
 from filters.smoothing.cached_linearisation import Held, contained, held_of, renewed
 from filters.smoothing.frozen_variables import Resting
-from filters.smoothing.indeterminate import variable_named, weak_hold
+from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
@@ -21,8 +21,8 @@ from toolkit.models.factors import kind_of
 # The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
 # states left out of the order make the tree ever denser.
 RECENT_FRAMES = 100
-# What none of so many frames concerns is linearised anew in the end only: a heading that turns by a hair moves the
-# whole past, and a frame would cost as much as the run is long.
+# What none of so many frames concerns stays linearised where it is, Python factors included: a heading that turns by
+# a hair moves the whole past, and a frame would cost as much as the run is long.
 FLUID_FRAMES = 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
@@ -31,8 +31,6 @@ QR_FRAMES = 20
 # linearisation points: with five times these a flight of two minutes was five times less accurate.
 ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD_MPS, BIAS_THRESHOLD = 0.01, 0.01, 0.01
 POSITION_THRESHOLD_BASELINES, LANDMARK_THRESHOLD_BASELINES = 0.1, 0.5
-# Older states hardly move: their Python factors are looked at again in the end.
-WATCHED_STEPS = 40
 MOST_RECOVERIES = 20
 
 
@@ -49,8 +47,8 @@ class IncrementalTree:
         self._held: dict[int, Held] = {}
         self._sightings: dict[int, list[int]] = {}
 
-    def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> list[str]:
-        """Take in a frame whose new state has the given keys; return what had to be recovered, a line each.
+    def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> Recovery:
+        """Take in a frame whose new state has the given keys; return what had to be recovered.
 
         Raises EstimatorError where the system stays indeterminate whatever is dropped.
         """
@@ -59,21 +57,18 @@ class IncrementalTree:
         self._recent.append(state_keys)
         self._resting.concerns(factors.keyVector())
         held = held_of(factors, lambda keys: self._first_values(keys, values))
-        moved = renewed(list(self._held.items())[-WATCHED_STEPS:], self.read)
+        watched = [(slot, factor) for slot, factor in self._held.items() if not self._resting.all_of(factor.keys)]
+        moved = renewed(watched, self.read)
         return self._update(contained(factors, held), values, held, moved)
 
-    def settle(self, most_rounds: int = 5) -> list[str]:
-        """Renew the Python factors whose states have moved since, until none has; return what was recovered."""
-        log = []
-        self._resting = Resting(FLUID_FRAMES)
-        for _ in range(most_rounds):
-            moved = renewed(self._held.items(), self.read)
-            log += self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, moved)
-            if not moved:
-                break
-        return log
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Return all factors, of the Python ones themselves and not their linearisations."""
+        factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
+        for slot, held in self._held.items():
+            factors.replace(slot, held.factor)
+        return without_gaps(factors)
 
-    def drop(self, landmarks: Iterable[int]) -> list[str]:
+    def drop(self, landmarks: Iterable[int]) -> Recovery:
         """Take landmarks out, with all their sightings; return what had to be recovered."""
         slots = [slot for key in landmarks for slot in self._sightings.pop(key)]
         return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
@@ -117,7 +112,7 @@ class IncrementalTree:
         held: dict[int, Held],
         moved: dict[int, Held],
         dropped_slots: Iterable[int] = (),
-    ) -> list[str]:
+    ) -> Recovery:
         """Add factors, of which ``held`` stand at their places; replace those moved, by slot; take some out.
 
         The slots of new factors follow those of the old, in every case: after a refusal they are known too.
@@ -135,9 +130,14 @@ class IncrementalTree:
         self._slot_count += factors.size()
         try:
             self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._resting.keys)
+            self._solve_back()
         except RuntimeError as refusal:
             return self._recovered(refusal)
-        return []
+        return Recovery([], set())
+
+    def _solve_back(self) -> None:
+        """Read a variable, for which GTSAM solves for all: only here does QR refuse what it has eliminated."""
+        self._state_variable(self._recent[-1][0])
 
     def _order(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
         """Return the place of each recent state in the elimination; all else comes first.
@@ -150,14 +150,15 @@ class IncrementalTree:
                 groups.insert2(key, place)
         return groups
 
-    def _recovered(self, refusal: RuntimeError) -> list[str]:
+    def _recovered(self, refusal: RuntimeError) -> Recovery:
         """Build the tree anew without the landmarks GTSAM names, or with a weak hold on the states it names."""
-        log = []
+        log, dropped = [], set()
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
             factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
             values = self.isam.getLinearizationPoint()
             if kind_of(key) == "l":
+                dropped.add(gtsam.Symbol(key).index())
                 log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
                 for slot in self._sightings.pop(key):
                     factors.remove(slot)
@@ -173,7 +174,7 @@ class IncrementalTree:
             except RuntimeError as again:
                 refusal = again
             else:
-                return log
+                return Recovery(log, dropped)
         raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
     def _return_to_cholesky(self, new: gtsam.Values) -> None:
@@ -203,6 +204,7 @@ class IncrementalTree:
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(compact))
+        self._solve_back()
 
     def _empty_tree(self) -> gtsam.ISAM2:
         pose = [ROTATION_THRESHOLD_RAD] * 3 + [POSITION_THRESHOLD_BASELINES * self._baseline_m] * 3

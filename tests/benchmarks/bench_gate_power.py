@@ -32,8 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import gate_pool
 
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE
-from toolkit.gate.paired import Pairs, Where, worse_p
-from toolkit.gate.statistics import rejected
+from toolkit.gate.paired import Pairs, Where, rejected, worse_p
 
 CASES = {"flight": 2.5, "drive": 5.0}
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "batch")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from toolkit import estimator
-from toolkit.report.seeds_json import violations
+from toolkit.report.records import read_seeds
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
@@ -19,13 +19,12 @@ def test_a_run_directory_over_seeds(vislam: Vislam, capsys: pytest.CaptureFixtur
     told = capsys.readouterr()
     assert told.err == ""
     assert "results: run\n" in told.out
-    document = json.loads(Path("run/seeds.json").read_text())
-    assert violations(document) == []
-    assert document["seeds"] == [5, 6, 7]
-    assert len(set(document["hashes"])) == 3
+    document = read_seeds(Path("run/seeds.json"))
+    assert document.seeds == (5, 6, 7)
+    assert len(set(document.hashes)) == 3
     manifest = json.loads(Path("run/manifest.json").read_text())
     assert manifest["seeds"] == {"sequence": 5, "count": 3}
-    assert manifest["sequence"]["hash"] == document["hashes"][0]
+    assert manifest["sequence"]["hash"] == document.hashes[0]
     figures = sorted(path.name for path in Path("run/figures").iterdir())
     assert figures == ["errors_over_seeds.png", "nees_over_seeds.png"]
     assert all(name in Path("run/report.md").read_text() for name in figures)

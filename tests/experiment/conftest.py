@@ -1,35 +1,41 @@
-"""Trials that are quick, and outcomes made up for the tests of what is done with them."""
+"""Units of work that are quick, and outcomes made up for the tests of what is done with them."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from toolkit.experiment.monte_carlo import OverSeeds, in_order
-from toolkit.experiment.trial import Outcome, Scored, Trial
-from toolkit.initialization import start_from_measurements
+from toolkit.datasets import load_sequence
+from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.recording import Recording
+from toolkit.experiment.units import Outcome, Scored, Unit
+from toolkit.geometry import Array
 from toolkit.metrics import Scores, describe
 
 FRAMES = 50
 SEEDS = (3, 4, 5, 6)
+Units = Callable[..., list[Unit]]
 
 
 @pytest.fixture
-def trials():
-    """Return a function that makes short trials of the drive over seeds."""
+def units() -> Units:
+    """Return a function that makes short runs of the drive, seed by seed."""
 
-    def make(seeds=(0, 1, 2), estimators=("dead-reckoning", "ekf")):
-        return [Trial("drive", seed, tuple(estimators), start_from_measurements, max_frames=30) for seed in seeds]
+    def make(seeds: tuple[int, ...] = (0, 1, 2), estimators: tuple[str, ...] = ("dead-reckoning", "ekf")) -> list[Unit]:
+        recordings = [Recording("drive", seed, max_frames=30) for seed in seeds]
+        return [Unit(one, one.seed, name, keep_run=True) for one in recordings for name in estimators]
 
     return make
 
 
-def scored(seed, nees):
+def scored(seed: int, nees: Array) -> Scored:
     values = dict.fromkeys(describe()) | {"ate_none_m": float(seed), "nees_pose_mean": float(nees.mean())}
     notes = {key: "not now" for key, value in values.items() if value is None}
     return Scored(Scores(values, notes), nees, np.full(FRAMES, 0.1 * seed))
 
 
 @pytest.fixture
-def over():
+def over() -> Comparison:
     """Four seeds of three estimators: one that is consistent, one that diverges under a seed, one that always fails."""
     rng = np.random.default_rng(2)
     outcomes = []
@@ -42,7 +48,7 @@ def over():
             ),
             Outcome(seed, "honest", "ok", {"causal": honest, "final": honest}, sequence_hash=f"hash{seed}"),
         ]
-    names = ("honest", "astray", "broken")
-    frames_s = 0.1 * np.arange(FRAMES)
-    ordered = in_order(outcomes, names, SEEDS)
-    return OverSeeds("drive", "drive", "twist", SEEDS, "the start", frames_s, names, ordered, 2, {})
+    sequence = load_sequence("drive").truncated(FRAMES)
+    assert sequence.prior is not None
+    ordered = in_order(outcomes, ("honest", "astray", "broken"), SEEDS)
+    return Comparison("drive", sequence, (), sequence.prior, SEEDS, ordered, workers=2)

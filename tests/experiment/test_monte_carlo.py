@@ -6,15 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toolkit.experiment.monte_carlo import mean_nees, spread_of
-from toolkit.report.seeds_md import seeds_report, seeds_text
+from toolkit.report.metrics_json import to_text
 
 from toolkit.datasets import is_drawn_from_a_seed
+from toolkit.experiment.statistics import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
-from toolkit.report.metrics_json import to_text
+from toolkit.report.report_md import report_text
+from toolkit.report.terminal import comparison_text
 
 
 def test_spread_is_numpys():
@@ -56,7 +57,7 @@ def test_the_band_is_for_the_runs_that_are_there():
 
 
 def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
-    astray = over.groups[2]
+    astray = over.rows[2]
     assert (astray.estimator, astray.counts) == ("astray", {"ok": 3, "diverged": 1, "failed": 0})
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
     assert astray.values("ate_none_m") == [3.0, 4.0, 5.0, 6.0]
@@ -64,14 +65,14 @@ def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
 
 
 def test_an_estimator_without_any_answer_keeps_a_line(over):
-    assert [(g.estimator, g.output) for g in over.groups] == [
+    assert [(g.estimator, g.output) for g in over.rows] == [
         ("honest", "causal"),
         ("honest", "final"),
         ("astray", "causal"),
         ("broken", "final"),
     ]
-    assert over.groups[3].spread("ate_none_m") is None
-    assert over.groups[3].reason("ate_none_m") == "no run is ok"
+    assert over.rows[3].spread("ate_none_m") is None
+    assert over.rows[3].reason("ate_none_m") == "no run is ok"
 
 
 @pytest.fixture
@@ -112,11 +113,11 @@ def test_the_validator_survives_anything(document):
 
 
 def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
-    for text in (seeds_text(over), seeds_report(over, {})):
+    for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
         assert "too sure of itself" in " ".join(text.split())
-    assert max(map(len, seeds_text(over).splitlines())) <= 100
+    assert max(map(len, comparison_text(over).splitlines())) <= 100
 
 
 def test_both_figures_are_drawn(over, tmp_path):

@@ -6,51 +6,73 @@ import subprocess
 import sys
 import textwrap
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from toolkit.errors import DataError
-from toolkit.experiment.monte_carlo import in_order
-from toolkit.experiment.trial import run_trial
-from toolkit.experiment.workers import outcomes_of
+from toolkit.estimate import Trajectory
+from toolkit.experiment.units import Outcome, Scored, Unit, run_unit
+from toolkit.experiment.workers import Lost, results_of
+from toolkit.metrics import cost
+from toolkit.progress import SILENT
+
+Units = Callable[..., list[Unit]]
 
 _WORK = """
 import os, signal, time
+from pathlib import Path
 from toolkit.errors import DataError
-from toolkit.experiment.trial import Outcome
 
-def dies(trial):
-    for name in trial.estimators:
-        if name == "ekf" and trial.seed == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        yield Outcome(trial.seed, name, "ok")
+MARK = Path(__file__).with_name("mark")
 
-def leaves(trial):
+def dies(unit, progress):
+    if (unit.estimator, unit.seed) == ("ekf", 1):
+        with MARK.open("a") as mark:
+            mark.write("tried ")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return unit.estimator, unit.seed
+
+def dies_once(unit, progress):
+    if (unit.estimator, unit.seed) == ("ekf", 1) and not MARK.exists():
+        MARK.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return unit.estimator, unit.seed
+
+def leaves(unit, progress):
     os._exit(3)
-    yield
 
-def refuses(trial):
-    if trial.seed == 1:
+def is_short_of_memory(unit, progress):
+    if unit.seed == 1:
+        raise MemoryError
+    return unit.seed
+
+def refuses(unit, progress):
+    if unit.seed == 1:
         raise DataError("nothing to see")
     time.sleep(60)
-    yield
 
-def is_broken(trial):
+def is_broken(unit, progress):
     raise ZeroDivisionError("a defect")
-    yield
 
-def tells_threads(trial):
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    for name in trial.estimators:
-        yield Outcome(trial.seed, name, "ok", log=tuple(os.environ[n] for n in names))
+def tells_threads(unit, progress):
+    return tuple(os.environ[name] for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
+
+def goes_on(unit, progress):
+    for done in range(4):
+        progress.advance(done, 4)
+        time.sleep(0.15)
+    return unit.seed
 """
-_MEASURED = ("frame_ms_mean", "frame_ms_p95", "frame_ms_max", "total_s", "cpu_s", "peak_rss_mb")
+_COST = {metric.key for metric in cost.METRICS}
 
 
 @pytest.fixture
-def work(tmp_path, monkeypatch):
+def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """Return work for the processes, in a module that they can import as well."""
     (tmp_path / "work_for_tests.py").write_text(_WORK)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -60,77 +82,128 @@ def work(tmp_path, monkeypatch):
     del sys.modules["work_for_tests"]
 
 
-def test_three_seeds_in_processes_equal_three_single_runs_exactly(trials):
-    estimators, seeds = ("dead-reckoning", "ekf"), (0, 1, 2)
-    swept = in_order(outcomes_of(trials(seeds, estimators), workers=2), estimators, seeds)
-    single = in_order((o for trial in trials(seeds, estimators) for o in run_trial(trial)), estimators, seeds)
-    assert len(swept) == 6
-    for one, other in zip(swept, single, strict=True):
-        for name in ("seed", "estimator", "status", "log", "sequence_hash"):
-            assert getattr(one, name) == getattr(other, name)
-        assert one.outputs.keys() == other.outputs.keys() == {"causal", "final"}
-        for output, scored in one.outputs.items():
-            assert _but_cost(scored) == _but_cost(other.outputs[output])
-            np.testing.assert_array_equal(scored.nees_pose, other.outputs[output].nees_pose)
-            np.testing.assert_array_equal(scored.position_m, other.outputs[output].position_m)
-    assert len({o.sequence_hash for o in swept}) == 3
+def by_place(units: list[Unit], workers: int, work: Any) -> list[Any]:
+    """Return the results in the order of the units, each of which must come exactly once."""
+    found = list(results_of(units, workers, work, SILENT))
+    assert sorted(place for place, _ in found) == list(range(len(units)))
+    return [result for _, result in sorted(found, key=lambda pair: pair[0])]
 
 
-def _but_cost(scored):
-    return {key: value for key, value in scored.scores.values.items() if key not in _MEASURED}
+def test_processes_equal_one_process_bit_for_bit(units: Units) -> None:
+    """Several seeds and several estimators, a smoother with them: scores, trajectories and landmarks."""
+    asked = units((0, 1, 2), ("dead-reckoning", "ekf", "batch"))
+    for one, other in zip(by_place(asked, 2, run_unit), by_place(asked, 1, run_unit), strict=True):
+        _assert_equal(one, other)
 
 
-def test_a_process_that_dies_fails_its_run_and_no_other(trials, work):
-    estimators = ("dead-reckoning", "ekf", "batch")
-    outcomes = in_order(outcomes_of(trials((0, 1), estimators), 2, work.dies), estimators, (0, 1))
-    assert [o.status for o in outcomes] == ["ok", "ok", "ok", "failed", "ok", "ok"]
-    assert outcomes[3].log == ("its process was ended by signal 9 before it answered",)
+def _assert_equal(one: Outcome, other: Outcome) -> None:
+    for name in ("seed", "estimator", "status", "log", "sequence_hash", "final_is_causal"):
+        assert getattr(one, name) == getattr(other, name)
+    assert one.outputs.keys() == other.outputs.keys() != set()
+    for output, scored in one.outputs.items():
+        assert _but_cost(scored) == _but_cost(other.outputs[output])
+        np.testing.assert_array_equal(scored.nees_pose, other.outputs[output].nees_pose)
+        np.testing.assert_array_equal(scored.position_m, other.outputs[output].position_m)
+    assert one.run is not None
+    assert other.run is not None
+    for mine, theirs in ((one.run.causal, other.run.causal), (one.run.final, other.run.final)):
+        _assert_same_trajectory(mine, theirs)
+    np.testing.assert_array_equal(one.run.landmarks.track_ids, other.run.landmarks.track_ids)
+    np.testing.assert_array_equal(one.run.landmarks.points_world, other.run.landmarks.points_world)
 
 
-def test_a_process_that_leaves_without_a_word_fails_every_run_once(trials, work):
-    outcomes = list(outcomes_of(trials((0,)), 1, work.leaves))
-    assert [(o.estimator, o.status) for o in outcomes] == [("dead-reckoning", "failed"), ("ekf", "failed")]
-    assert outcomes[0].log == ("its process ended with status 3 before it answered",)
+def _assert_same_trajectory(one: Trajectory | None, other: Trajectory | None) -> None:
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        np.testing.assert_array_equal(one.t_ns, other.t_ns)
+        np.testing.assert_array_equal(one.T_world_imu, other.T_world_imu)
 
 
-def test_an_error_of_the_recording_ends_everything_at_once(trials, work):
+def _but_cost(scored: Scored) -> dict[str, float | None]:
+    return {key: value for key, value in scored.scores.values.items() if key not in _COST}
+
+
+def test_a_process_that_dies_twice_loses_its_unit_and_no_other(units: Units, work: ModuleType, tmp_path: Path) -> None:
+    results = by_place(units((0, 1), ("dead-reckoning", "ekf", "batch")), 2, work.dies)
+    assert results[4] == Lost("its process was ended by signal 9 before it answered")
+    del results[4]
+    assert results == [(name, 0) for name in ("dead-reckoning", "ekf", "batch")] + [("dead-reckoning", 1), ("batch", 1)]
+    assert (tmp_path / "mark").read_text() == "tried tried "
+
+
+def test_a_process_that_dies_once_loses_nothing(units: Units, work: ModuleType) -> None:
+    results = by_place(units((0, 1)), 2, work.dies_once)
+    assert results == [(name, seed) for seed in (0, 1) for name in ("dead-reckoning", "ekf")]
+
+
+def test_a_process_that_leaves_without_a_word_says_its_status(units: Units, work: ModuleType) -> None:
+    assert by_place(units((0,)), 2, work.leaves) == [Lost("its process ended with status 3 before it answered")] * 2
+
+
+def test_a_unit_without_memory_is_lost_alone(units: Units, work: ModuleType) -> None:
+    kept, lost = by_place(units((0, 1), ("ekf",)), 2, work.is_short_of_memory)
+    assert (kept, type(lost)) == (0, Lost)
+
+
+def test_an_error_of_the_recording_ends_everything_at_once(units: Units, work: ModuleType) -> None:
     began = time.monotonic()
     with pytest.raises(DataError, match="nothing to see"):
-        list(outcomes_of(trials((0, 1)), 2, work.refuses))
+        list(results_of(units((0, 1), ("ekf",)), 2, work.refuses, SILENT))
     assert time.monotonic() - began < 30.0  # the other process, asleep for a minute, was not waited for
 
 
-def test_a_defect_is_told_with_its_traceback(trials, work):
-    with pytest.raises(RuntimeError, match="ZeroDivisionError: a defect"):
-        list(outcomes_of(trials((0,)), 1, work.is_broken))
+def test_a_defect_is_told_with_the_traceback_of_its_process(units: Units, work: ModuleType) -> None:
+    with pytest.raises(ZeroDivisionError, match="a defect") as raised:
+        list(results_of(units((0,)), 2, work.is_broken, SILENT))
+    assert "in is_broken" in str(raised.value.__cause__)
 
 
-def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(trials, work, monkeypatch):
+def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
+    units: Units, work: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    outcomes = list(outcomes_of(trials((0,)), 1, work.tells_threads))
-    assert outcomes[0].log == ("1", "1", "1")
+    assert by_place(units((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
 
 
-# While the fork server imports, and while the trials run.
+@pytest.mark.parametrize("workers", [1, 2])
+def test_progress_is_that_of_all_units_and_never_goes_back(units: Units, work: ModuleType, workers: int) -> None:
+    heard: list[tuple[int, int]] = []
+
+    class Listening:
+        def advance(self, done: int, total: int, stage: str = "") -> None:
+            heard.append((done, total))
+
+    asked = units((0, 1), ("ekf",))
+    assert sorted(result for _, result in results_of(asked, workers, work.goes_on, Listening())) == [0, 1]
+    shares = [done / total for done, total in heard]
+    assert shares == sorted(shares)
+    assert len({total for _, total in heard}) == 1
+    assert any(0.0 < share < 0.5 for share in shares)
+    assert shares[-1] == 1.0 or workers == 1
+
+
+# While the processes start, and while the units run.
 @pytest.mark.parametrize("delay_s", [0.2, 3.0])
-def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp_path, delay_s):
+def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp_path: Path, delay_s: float) -> None:
     program = textwrap.dedent("""
-        import sys, threading
+        import sys
         from toolkit.cli import main
-        from toolkit.experiment import workers
-        start = workers._start
+        from toolkit.experiment import pipeline
+        results_of = pipeline.results_of
         def told(*given):
             print("starting", flush=True)
-            return start(*given)
-        workers._start = told
-        sys.exit(main(["compare", "drive", "--seeds", "50", "--estimators", "ekf,batch", "--out", "run"]))
+            yield from results_of(*given)
+        pipeline.results_of = told
+        words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--out", "run"]
+        sys.exit(main(["compare", "drive", *words]))
     """)
     vislam = subprocess.Popen(
         [sys.executable, "-c", program],
         cwd=tmp_path,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -143,11 +216,11 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp
     _, told = vislam.communicate(timeout=60)
     assert vislam.returncode == 130
     assert told == "vislam: error: interrupted; what was not finished is not written\n"
-    assert list(Path(tmp_path).iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
     _assert_gone(vislam.pid)
 
 
-def _assert_gone(group):
+def _assert_gone(group: int) -> None:
     for _ in range(100):
         try:
             os.killpg(group, 0)

@@ -4,6 +4,7 @@ The graph is made of the smoothers' own factors and linearised at the truth. A r
 a tiny share of the stated ones is linear in effect: what a filter linearises at is the truth to that share.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
@@ -18,8 +19,8 @@ from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import B, L, StereoFactors, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
-from toolkit.models.stereo import triangulate_world
-from toolkit.sequence import Sequence
+from toolkit.models.stereo import project, triangulate_world
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import Scenario, simulate
 
 SEED = 11
@@ -130,3 +131,21 @@ def oracle() -> SimpleNamespace:
         first_belief=first_belief,
         assert_covariances_agree=assert_covariances_agree,
     )
+
+
+@pytest.fixture
+def recording_with_a_fleck() -> Callable[[Scenario, int, int, float], Sequence]:
+    """Return a maker of recordings of few tracks, with a point that moves with the car tracked throughout."""
+
+    def record(scenario: Scenario, tracks: int, seed: int, depth_m: float) -> Sequence:
+        sequence = simulate(replace(scenario, camera=replace(scenario.camera, max_tracks=tracks)), seed)
+        count, seen, rig = sequence.frame_count, sequence.observations, sequence.rig
+        noise = np.random.default_rng(seed).standard_normal((count, 3)) * np.sqrt(np.diag(rig.cov_uv_px2))
+        observations = Observations.sorted(
+            np.r_[seen.frame, np.arange(count)],
+            np.r_[seen.track_id, np.full(count, 10**6)],
+            np.r_[seen.uv_px, project(depth_m * np.array([0.1, 0.05, 1.0]), rig) + noise],
+        )
+        return replace(sequence, observations=observations)
+
+    return record

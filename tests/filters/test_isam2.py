@@ -20,7 +20,7 @@ from toolkit.models import twist
 from toolkit.models.factors import B, L, V, X
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence, TwistMotion
-from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
 
@@ -103,8 +103,9 @@ def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFact
 
 def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named():
     tree = IncrementalTree(bias_size=6, baseline_m=0.1)
-    log = tree.add(*pose_and_landmarks(landmarks=4, unseen=2), [X(0), V(0), B(0)])
+    log, dropped = tree.add(*pose_and_landmarks(landmarks=4, unseen=2), [X(0), V(0), B(0)])
     assert len(log) == 2
+    assert dropped == {2, 3}
     assert all("indeterminate and was dropped" in line for line in log)
     assert sorted(tree.landmarks()) == [L(0), L(1)]
     assert np.isfinite(tree.points([L(0), L(1)])).all()
@@ -113,7 +114,7 @@ def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named():
 def test_after_a_recovery_the_tree_grows_and_drops_as_before():
     tree = IncrementalTree(bias_size=6, baseline_m=0.1)
     tree.add(*pose_and_landmarks(landmarks=4, unseen=1), [X(0), V(0), B(0)])
-    assert tree.drop([L(1)]) == []
+    assert tree.drop([L(1)]) == ([], set())
     assert not tree.has(L(1))
     assert sorted(tree.landmarks()) == [L(0), L(2)]
 
@@ -124,7 +125,7 @@ def test_a_state_that_nothing_holds_is_held_weakly_and_named():
         values.insert(X(k), gtsam.Pose3())
     graph.add(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
     tree = IncrementalTree(bias_size=6, baseline_m=0.1)
-    log = tree.add(graph, values, [X(1)])
+    log, _ = tree.add(graph, values, [X(1)])
     assert "solved by QR" in log[0]
     assert "held weakly" in log[-1]
     assert tree.read([X(0), X(1)]).size() == 2
@@ -173,29 +174,35 @@ def test_a_state_at_rest_is_linearised_where_it_was_until_the_end(monkeypatch):
         # The step to the next frame concerns it, too, and its last turn comes in the frame it goes to rest.
         assert any(moved[: FLUID_FRAMES + 1])
         assert not any(moved[FLUID_FRAMES + 1 :])
-    estimator.finish()
-    now = estimator._tree.isam.getLinearizationPoint()
-    assert not now.atPose3(X(1)).equals(points[-1].atPose3(X(1)), 1e-9)
+    final = estimator.finish().trajectory
+    assert not np.allclose(final.T_world_imu[1], points[-1].atPose3(X(1)).matrix(), atol=1e-9)
 
 
 def isam2_of(sequence: Sequence) -> Isam2:
     return Isam2(Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
 
 
-@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
-def test_its_latest_states_are_the_optimum_of_the_whole_problem(scenario):
-    """Up to its thresholds: a state is off the optimum by a fraction of its standard deviation at most."""
-    sequence = simulate(replace(scenario, duration_s=4.0), 1)
+@pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
+def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
+    """Of every factor it took in, the Python ones themselves: many more steps lead nowhere else.
+
+    The solve stops at a relative decrease of 1e-5, of an error that is half of some 10^4 squared sigmas: what a state
+    may still move by is a hundredth of a sigma.
+    """
+    sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0), 1)
     estimator, said = isam2_of(sequence), []
     for packet in sequence.packets():
         said.append(estimator.step(packet))
-    final = estimator.finish().trajectory
-    tree = estimator._tree.isam
-    best = solve(tree.getFactorsUnsafe(), tree.calculateBestEstimate(), Stopping(1e-9)).values
-    off = [se3_log(se3_inverse(best.atPose3(X(k)).matrix()) @ final.T_world_imu[k]) for k in range(len(final))]
-    sigma = np.sqrt(np.diagonal(said[-1].cov)[:6])
-    assert (np.abs(off) < 0.3 * sigma).all()
-    assert not np.allclose(final.positions[:-1], [e.T_world_imu[:3, 3] for e in said[:-1]], atol=1e-6)
+    graph, before = estimator._tree.graph(), estimator._tree.isam.calculateBestEstimate()
+    finished = estimator.finish()
+    assert finished.converged
+    final, sigma = finished.trajectory, np.sqrt(np.diagonal(said[-1].cov)[:6])
+    best = solve(graph, before, Stopping(1e-12)).values
+    optimum = np.array([best.atPose3(X(k)).matrix() for k in range(len(final))])
+    off = se3_log(se3_inverse(optimum) @ final.T_world_imu)
+    assert (np.abs(off) < 0.01 * sigma).all()
+    was = [se3_log(se3_inverse(optimum[k]) @ before.atPose3(X(k)).matrix()) for k in range(len(final))]
+    assert (np.abs(was) > 0.02 * sigma).any(), "there was something to solve for"
 
 
 def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
@@ -204,3 +211,10 @@ def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
     run = run_estimator("isam2", replace(sequence, observations=sequence.observations.select(~hidden)))
     assert run.status == "ok", run.log
     assert np.isfinite(run.causal.cov).all()
+
+
+def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recording_with_a_fleck, run_estimator):
+    """It ended as failed, with sightings of a landmark that the tree no longer had."""
+    run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 1, 30.0))
+    assert run.status == "ok", run.log
+    assert any("indeterminate and was dropped" in line for line in run.log)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from toolkit.gate.baseline import BaselineError
-from toolkit.gate.baseline_json import to_text
-from toolkit.gate.baseline_reader import check_releases, load_baseline
+from toolkit.gate.baseline_file import check_releases, load_baseline, to_text
 from toolkit.gate.releases import differences, installed
 from toolkit.metrics import describe
 
@@ -47,24 +46,27 @@ def _run(document):
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (lambda d: d.pop("schema"), "is no baseline"),
-        (lambda d: d.update(schema="vislam.baseline/9"), "is no baseline"),
+        (lambda d: d.pop("schema"), "has not the schema vislam.baseline/1"),
+        (lambda d: d.update(schema="vislam.baseline/9"), "its schema is 'vislam.baseline/9'"),
         (lambda d: d.pop("releases"), "releases"),
         (lambda d: d.update(false_alarm_rate=0.0), "false_alarm_rate"),
         (lambda d: d.update(false_alarm_rate=1.5), "false_alarm_rate"),
-        (lambda d: d.update(sequences=[]), "no sequences"),
-        (lambda d: d.update(sequences=[3]), "no sequences"),
+        (lambda d: d.update(sequences=[]), "sequences: expected list of length >= 1"),
+        (lambda d: d.update(sequences=[3]), r"sequences\[0\]: expected object"),
         (lambda d: d["bounds"].pop("speed_ratio"), "speed_ratio"),
         (lambda d: d["bounds"].update(speed_ratio=0.9), "speed_ratio"),
         (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"), "smaller"),
         (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(margin_percent="1"), "margin_percent"),
         (lambda d: d["sequences"][0].update(seeds=[0, 0]), "seeds"),
-        (lambda d: d["sequences"][0].update(runs={}), "no runs"),
+        (lambda d: d["sequences"][0].update(runs={}), r"sequences\[0\].runs: expected object of length >= 1"),
         (lambda d: d["sequences"][0]["hashes"].pop(), "hashes"),
         (lambda d: _run(d)["status"].__setitem__(0, "fine"), "status"),
         (lambda d: _run(d)["causal"]["ate_se3_m"].pop(), "ate_se3_m"),
-        (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, float("nan")), "ate_se3_m"),
-        (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, "0.1"), "ate_se3_m"),
+        (lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, float("nan")), r"ate_se3_m\[3\].*NaN"),
+        (
+            lambda d: _run(d)["causal"]["ate_se3_m"].__setitem__(3, "0.1"),
+            r"\[0\]\.runs\.one\.causal\.ate_se3_m\[3\]",
+        ),
         (lambda d: _run(d)["causal"].update(ate_se3_m=None), "ate_se3_m"),
     ],
 )
@@ -94,7 +96,7 @@ def test_a_file_cut_anywhere_is_told(path):
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path):
-    with pytest.raises(BaselineError, match="cannot be read"):
+    with pytest.raises(BaselineError, match="is missing; make the baseline with vislam baseline"):
         load_baseline(tmp_path / "missing.json")
 
 

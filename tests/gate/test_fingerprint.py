@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import load_sequence
-from toolkit.gate.fingerprint import fingerprint
+from toolkit.gate.measuring import fingerprint
 from toolkit.sequence import ImuSamples, Observations
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 SHORT = replace(FLIGHT, duration_s=1.0)
 _PROGRAM = """
 from dataclasses import replace
-from toolkit.gate.fingerprint import fingerprint
+from toolkit.gate.measuring import fingerprint
 from toolkit.simulation import FLIGHT, simulate
 print(*(fingerprint(simulate(replace(FLIGHT, duration_s=1.0), seed)) for seed in range(4)))
 """

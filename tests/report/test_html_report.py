@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toolkit.report.comparison import Comparison
 
 from toolkit.errors import DataError, OutputError
-from toolkit.report.comparison import Comparison
 from toolkit.report.html import write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.page import SCRIPTS, json_in_html, page_text
@@ -220,7 +220,7 @@ def test_a_directory_in_the_way_is_refused(run_directory: Path, tmp_path: Path) 
         ("report.json", None, "earlier version"),
         ("manifest.json", None, "missing"),
         ("metrics.json", "{", "cannot be read"),
-        ("metrics.json", "{}", "not what this version writes"),
+        ("metrics.json", "{}", "has not the schema vislam.metrics/1"),
         ("trajectories/late_final.tum", None, "late_final.tum"),
         ("trajectories/late_final.tum", "1 2 3\n", "columns"),
         ("landmarks/late.csv", "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
@@ -234,6 +234,25 @@ def test_a_damaged_run_directory_is_told_in_one_line(
     if text is not None:
         (tmp_path / "run" / name).write_text(text)
     with pytest.raises(DataError, match=re.escape(told)):
+        read_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda d: d["runs"].pop(), "does not have the runs of metrics.json"),
+        (lambda d: d["maps"][0].update(estimator="nobody"), "has the map of a run it does not have"),
+    ],
+)
+def test_a_report_of_other_runs_is_told(
+    run_directory: Path, tmp_path: Path, spoil: Callable[[Json], object], told: str
+) -> None:
+    shutil.copytree(run_directory, tmp_path / "run")
+    report = tmp_path / "run" / "report.json"
+    document = json.loads(report.read_text())
+    spoil(document)
+    report.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=told):
         read_run(tmp_path / "run")
 
 

@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
+from toolkit.report.comparison import Comparison
 
 from toolkit.errors import OutputError
 from toolkit.report import run_directory
-from toolkit.report.comparison import Comparison
-from toolkit.report.metrics_json import violations
+from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import check_run_directory, write_run
+from toolkit.report.scores_json import metrics_document
 
 # Where it does not matter what is in a figure's file.
 unrendered = pytest.mark.usefixtures("unrendered")
@@ -29,7 +30,8 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert {f"landmarks/{run.estimator}.csv" for run in comparison.runs} <= files
     figures = ("top_steady", "top_astray", "top_late", "top_all", "errors_over_time", "reprojection", "frame_times")
     assert {f"figures/{name}.png" for name in figures} <= files
-    assert violations(json.loads((target / "metrics.json").read_text())) == []
+    assert read_metrics(target / "metrics.json") == metrics_document(comparison)
+    assert read_manifest(target / "manifest.json").command == "vislam compare"
     report = (target / "report.md").read_text()
     assert all(f"(figures/{name}.png)" in report for name in figures)
 

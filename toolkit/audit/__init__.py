@@ -1,6 +1,6 @@
 """The audit: faults of a recording, found from its data alone, reported and (by default) repaired.
 
-A file in this folder that holds a ``FAULT`` is a fault, found by being here; ``parts`` holds what several of them share.
+A file in this folder that holds a ``FAULT`` is a fault, found by being here; ``parts`` is what several of them share.
 Read ``fault``, then ``no_disparity`` for the smallest fault, ``stale_frames`` and ``mixed_axes`` for the others' kinds.
 """
 

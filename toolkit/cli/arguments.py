@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
+    from toolkit.settings import Settings
+
 _EXIT_STATUSES = """\
 exit status:
   0    everything ran and ended well
@@ -128,6 +130,16 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="one setting, as in window.lag_s=3 (see 'vislam list'); may be repeated",
     )
+
+
+def settings_asked(options: argparse.Namespace) -> "Settings":
+    """Return the settings of --config and --set; raises SettingsError for one that does not exist."""
+    from toolkit.experiment.configuration import read_configuration
+    from toolkit.settings import settings_of, with_assignments
+
+    values = {} if options.config is None else read_configuration(options.config)[1]
+    place = "the command line" if options.config is None else str(options.config)
+    return settings_of(with_assignments(values, options.set), place)
 
 
 def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:

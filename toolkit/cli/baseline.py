@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import (
     UsageError,
     add_estimators_argument,
+    add_settings_arguments,
     add_workers_argument,
     at_least,
     epilog,
     positive_seconds,
+    settings_asked,
 )
 
 if TYPE_CHECKING:
@@ -68,6 +70,7 @@ def add_to(subcommands: Subcommands) -> None:
         default=[],
         help="ground truth of a recorded sequence, from the same places; may be given several times",
     )
+    add_settings_arguments(parser)
     add_workers_argument(parser)
     parser.set_defaults(command=command)
 
@@ -75,7 +78,7 @@ def add_to(subcommands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     """Measure, write and return 1 where an estimator diverged or failed; the baseline is written then, too."""
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.gate.baseline_json import to_text
+    from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
     from toolkit.gate.releases import label
     from toolkit.progress import of_this_process
@@ -86,7 +89,7 @@ def command(options: argparse.Namespace) -> int:
     check_writable(out)
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_baseline(cases, workers, made_by, of_this_process())
+    made = new_baseline(cases, workers, made_by, of_this_process(), settings_asked(options))
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join([*ends, f"baseline: {out}"]))

@@ -48,11 +48,11 @@ def add_to(subcommands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     """Check, print and return 1 where anything got worse or is missing."""
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.gate.baseline_reader import check_releases, load_baseline
+    from toolkit.gate.baseline_file import check_releases, load_baseline
     from toolkit.gate.checking import How, check
     from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, write_check
-    from toolkit.report.gate_words import gate_text
+    from toolkit.report.gate_text import gate_text
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
     for path in files.values():

@@ -80,8 +80,7 @@ def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
     from toolkit.experiment import comparisons, prepared_cases
     from toolkit.progress import of_this_process, print_above
-    from toolkit.report.run_directory import MadeBy, write_run
-    from toolkit.report.session import directories_for
+    from toolkit.report.run_directory import MadeBy, directories_for, write_run
     from toolkit.report.table import columns_asked
     from toolkit.report.terminal import comparison_text
 

@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 from toolkit.errors import VislamError
 from toolkit.estimate import Output, Status
+from toolkit.settings import DEFAULTS, Settings
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]
@@ -111,7 +112,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Baseline:
-    """Cases with what was measured on them, the releases it was measured with, and what counts as worse.
+    """Cases with what was measured on them, the releases and settings it was measured with, and what counts as worse.
 
     ``false_alarm_rate`` is that of all statistical tests of one check together.
     """
@@ -121,3 +122,4 @@ class Baseline:
     bounds: Bounds = DEFAULT_BOUNDS
     false_alarm_rate: float = FALSE_ALARM_RATE
     made_by: Mapping[str, str] = field(default_factory=dict)
+    settings: Settings = DEFAULTS

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from toolkit.estimator import find_all
 from toolkit.experiment.recording import prepare
@@ -12,44 +12,46 @@ from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.paired import judge_pairs
 from toolkit.gate.releases import installed
 from toolkit.gate.verdict import Check
-from toolkit.progress import ProgressFor
+from toolkit.progress import ProgressFor, silent
+from toolkit.settings import DEFAULTS, Settings
 
 
 @dataclass(frozen=True)
 class How:
-    """How to run: so many processes, and whether time counts."""
+    """How to run: so many processes, whether time counts, with which settings."""
 
     workers: int
     speed: bool = True
+    settings: Settings = DEFAULTS
 
 
 def new_baseline(
-    cases: Sequence[Case], workers: int, made_by: Mapping[str, str], progress_for: ProgressFor
+    cases: Sequence[Case],
+    workers: int,
+    made_by: Mapping[str, str],
+    progress_for: ProgressFor = silent,
+    settings: Settings = DEFAULTS,
 ) -> Baseline:
-    """Measure a baseline.
+    """Measure a baseline; a check of it will run with the same settings.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a sequence that cannot be
     had; both before the first run.
     """
     for case in cases:
-        find_each(case.estimators)
-        prepare(recordings_of(case)[0])
-    measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), workers, progress_for)) for case in cases)
-    return Baseline(installed(), measured, made_by=made_by)
-
-
-def find_each(estimators: Sequence[str]) -> None:
-    """Raise EstimatorError unless every estimator is there and can be used."""
-    for entry in find_all(estimators).values():
-        entry.load()
+        for entry in find_all(case.estimators).values():
+            entry.check_usable(settings)
+        prepare(recordings_of(case, settings)[0])
+    how = How(workers, settings=settings)
+    measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), how, progress_for)) for case in cases)
+    return Baseline(installed(), measured, made_by=made_by, settings=settings)
 
 
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
     """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error."""
-    began = time.monotonic()
+    began, how = time.monotonic(), replace(how, settings=baseline.settings)
     judged = Judged()
     for case, before in baseline.cases:
-        now = _measured(case, metrics_of(case, baseline.bounds), how.workers, progress_for)
+        now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
         one = judge_case(case, before, now, baseline.bounds, speed=how.speed)
         judged.verdicts += one.verdicts
         judged.tests += one.tests
@@ -71,7 +73,7 @@ def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float) -> 
     )
 
 
-def _measured(case: Case, metrics: Sequence[str], workers: int, progress_for: ProgressFor) -> Measured:
+def _measured(case: Case, metrics: Sequence[str], how: How, progress_for: ProgressFor) -> Measured:
     runs = len(case.seeds) * len(case.estimators)
     with progress_for(f"{case.source}: {runs} runs") as progress:
-        return measure(case, metrics, workers, progress)
+        return measure(case, metrics, how.settings, how.workers, progress)

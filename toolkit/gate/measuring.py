@@ -1,7 +1,8 @@
 """Run what a baseline lists, in processes side by side, and gather what came of it by estimator, metric and seed."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from collections.abc import Sequence as Several
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +15,14 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, prepared_of, run_estimator
 from toolkit.experiment.workers import Lost, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
-from toolkit.gate.fingerprint import fingerprint
 from toolkit.gate.reference import reference_s
 from toolkit.progress import Progress
+from toolkit.sequence import Sequence
+from toolkit.settings import Settings
 
 DATA_ROOT = "VISLAM_DATA"
+# Of a fingerprint: significant digits that are hashed, and hexadecimal digits of the hash that are kept.
+_DIGITS, _LENGTH = 6, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +34,16 @@ class Timed:
     fingerprint: str = ""
 
 
-def recordings_of(case: Case) -> list[Recording]:
+def recordings_of(case: Case, settings: Settings) -> list[Recording]:
     """Return the recording of a case under each of its seeds.
 
     Files are found here, by whole paths: a process that reads them may stand elsewhere, in another environment.
     """
     source, truth = located(case.source), None if case.truth is None else Path(located(case.truth))
-    return [Recording(source, seed, truth, duration_s=case.duration_s) for seed in case.seeds]
+    return [
+        Recording(source, seed, truth, start=settings.start, duration_s=case.duration_s, noise=settings.noise)
+        for seed in case.seeds
+    ]
 
 
 def located(source: str) -> str:
@@ -48,7 +55,7 @@ def located(source: str) -> str:
     return next((str(place.absolute()) for place in places if place.exists()), source)
 
 
-def measure(case: Case, metrics: Iterable[str], workers: int, progress: Progress) -> Measured:
+def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int, progress: Progress) -> Measured:
     """Run every estimator of a case under every seed.
 
     An estimator that is not there is ``absent``, a sequence that cannot be had ``unreadable``; nothing of that is
@@ -56,8 +63,8 @@ def measure(case: Case, metrics: Iterable[str], workers: int, progress: Progress
     """
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}
     present = replace(case, estimators=tuple(name for name in case.estimators if name not in absent))
-    recordings = recordings_of(present)
-    units = [Unit(recording, recording.seed, name) for recording in recordings for name in present.estimators]
+    recordings = recordings_of(present, settings)
+    units = [Unit(recording, recording.seed, name, settings) for recording in recordings for name in present.estimators]
     try:
         if units:
             prepare(recordings[0])
@@ -81,12 +88,23 @@ def timed(unit: Unit, progress: Progress) -> Timed:
     return Timed(outcome, _over(run, reference), fingerprint(prepared.sequence))
 
 
+def fingerprint(sequence: Sequence) -> str:
+    """Return a hash of what an estimator can see and of the truth that survives another processor's rounding.
+
+    The same simulation differs in its last bits from one processor to the next, since numeric libraries choose other
+    instructions there; its content hash then differs in everything. The same content rounded to six digits of each
+    array's largest value has another hash with a chance below 1e-4 a sequence, and any other change of a measurement by
+    more than one part in a million shows.
+    """
+    return sequence.content_hash(_DIGITS)[:_LENGTH]
+
+
 def metrics_of(case: Case, bounds: Bounds) -> tuple[str, ...]:
     """Return the metrics a case is judged by."""
     return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
 
 
-def gathered(case: Case, found: Iterable[Timed], metrics: Sequence[str], absent: dict[str, str]) -> Measured:
+def gathered(case: Case, found: Iterable[Timed], metrics: Several[str], absent: dict[str, str]) -> Measured:
     """Arrange outcomes, which come in any order, by estimator and seed; keep the metrics of interest."""
     by_run = {(one.outcome.estimator, one.outcome.seed): one for one in found}
     read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
@@ -117,7 +135,7 @@ def _over(run: Run, reference: float) -> float | None:
     return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
 
 
-def _series(found: Sequence[Timed], metrics: Sequence[str]) -> Series:
+def _series(found: Several[Timed], metrics: Several[str]) -> Series:
     """Return the series of one estimator; a final output that only repeats the causal one is left out."""
     outcomes = [one.outcome for one in found]
     outputs = [{o: s.scores.values for o, s in one.outputs.items() if o not in _repeated(one)} for one in outcomes]
@@ -134,7 +152,7 @@ def _repeated(outcome: Outcome) -> tuple[Output, ...]:
     return ("final",) if outcome.final_is_causal else ()
 
 
-def _why(outcomes: Sequence[Outcome]) -> str:
+def _why(outcomes: Several[Outcome]) -> str:
     """Return what the first run that did not end well says of it, in one line."""
     for one in outcomes:
         if one.status != "ok" and one.log:

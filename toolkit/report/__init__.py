@@ -1,4 +1,5 @@
-"""What a comparison leaves behind: the table, the JSON contract, trajectories, figures and the manifest.
+"""What a comparison leaves behind: tables, words, JSON documents, trajectories, figures, one HTML page; nothing runs.
 
-Reading order: session -> comparison -> table -> metrics_json -> run_directory -> figures.
+Reading order: table -> messages -> terminal, report_md -> scores_json, report_json, records -> run_directory; figures/
+draws, html/ makes the page from run directories alone; gate_text and gate_files show a check of the gate.
 """

@@ -6,7 +6,8 @@ from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError
 from toolkit.estimate import Output, Trajectory
 from toolkit.files import replaced_file
-from toolkit.report.html.run_files import Document, read_run
+from toolkit.report.html.run_files import SeedsFiles, read_run
+from toolkit.report.records import Report
 
 TRUTH = "truth"
 
@@ -19,29 +20,29 @@ def export(directory: Path, estimator: str | None, output: Output | None, format
     OutputError where the file cannot be written.
     """
     run = read_run(directory)
-    if run.over_seeds:
+    if isinstance(run, SeedsFiles):
         raise DataError(
             f"{directory} is a comparison over seeds and holds no trajectories; run one seed without --seeds"
         )
     what, name = _chosen(directory, run.report, estimator, output)
     trajectory = tum.read(directory / name, "a run that diverged may leave no finite pose")
     if format_name == "kitti":
-        _check_every_frame(what, trajectory, run.scores["sequence"]["frames"])
+        _check_every_frame(what, trajectory, run.scores.sequence.frames)
     text = FORMATS[format_name].text(trajectory)
     with replaced_file(target) as partial:
         partial.write_text(text, encoding="utf-8")
     return f"{what}, {len(trajectory)} poses"
 
 
-def _chosen(directory: Path, report: Document, estimator: str | None, output: Output | None) -> tuple[str, str]:
+def _chosen(directory: Path, report: Report, estimator: str | None, output: Output | None) -> tuple[str, str]:
     """Return in words which trajectory is meant, and its file in the run directory."""
     if estimator == TRUTH:
-        if report["truth"] is None:
+        if report.truth is None:
             raise DataError(f"{directory} has no ground truth")
-        return TRUTH, report["truth"]
-    files = {(run["estimator"], run["output"]): run["trajectory"] for run in report["runs"] if run["trajectory"]}
+        return TRUTH, report.truth
+    files = {(run.estimator, run.output): run.trajectory for run in report.runs if run.trajectory}
     names = list(dict.fromkeys(name for name, _ in files))
-    there = ", ".join([*names, *([TRUTH] if report["truth"] is not None else [])])
+    there = ", ".join([*names, *([TRUTH] if report.truth is not None else [])])
     if estimator is None and len(names) != 1:
         raise DataError(f"{directory} holds several trajectories; choose one with --estimator: {there}")
     name = names[0] if estimator is None else estimator

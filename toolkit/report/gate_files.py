@@ -1,23 +1,105 @@
 """The files a check of the gate leaves behind: JUnit XML, Markdown and JSON, each only where it is asked for."""
 
+import math
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from itertools import groupby
 from pathlib import Path
+from xml.etree import ElementTree
 
-import toolkit
+from toolkit.documents import to_text
 from toolkit.errors import OutputError
 from toolkit.files import check_parent, replaced_file
-from toolkit.gate.verdict import Check
-from toolkit.report.gate_json import gate_json
-from toolkit.report.gate_junit import gate_junit
-from toolkit.report.gate_words import gate_markdown
+from toolkit.gate.verdict import Check, Verdict
+from toolkit.report.gate_text import about, gate_markdown
 from toolkit.report.manifest import cpu_model, git_revision
-from toolkit.report.metrics_json import to_text
+from toolkit.report.records.check import CheckDocument, VerdictRecord
+
+
+def check_document(check: Check) -> CheckDocument:
+    """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
+    return CheckDocument(
+        schema="vislam.check/1",
+        baseline=check.baseline,
+        passed=check.passed,
+        failures=len(check.failures),
+        false_alarm_rate=check.false_alarm_rate,
+        tests=check.tests,
+        releases=dict(check.releases),
+        seconds=check.seconds,
+        notes=check.notes,
+        verdicts=tuple(_verdict(verdict) for verdict in check.verdicts),
+    )
+
+
+def _verdict(verdict: Verdict) -> VerdictRecord:
+    return VerdictRecord(
+        sequence=verdict.sequence,
+        estimator=verdict.estimator,
+        output=verdict.output,
+        metric=verdict.metric,
+        finding=verdict.finding,
+        words=verdict.words,
+        before=_finite(verdict.before),
+        after=_finite(verdict.after),
+        change_percent=_finite(verdict.change_percent),
+        allowed_percent=_finite(verdict.allowed_percent),
+        p=_finite(verdict.p),
+        seen_percent=_finite(verdict.seen_percent),
+        fails=verdict.fails,
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def gate_junit(check: Check) -> str:
+    """Return a check as JUnit XML, which every CI shows: a suite a sequence, a test case a comparison.
+
+    The format is what the common readers agree on: https://github.com/testmoapp/junitxml describes it.
+    """
+    root = ElementTree.Element("testsuites", _counts(check.verdicts), name="accuracy gate")
+    root.set("time", f"{check.seconds:.3f}")
+    for sequence, verdicts in groupby(check.verdicts, key=lambda verdict: verdict.sequence):
+        _add_suite(root, sequence, tuple(verdicts))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _add_suite(root: ElementTree.Element, sequence: str, verdicts: tuple[Verdict, ...]) -> None:
+    suite = ElementTree.SubElement(root, "testsuite", _counts(verdicts), name=sequence)
+    for verdict in verdicts:
+        who = ".".join(filter(None, (sequence, verdict.estimator, verdict.output)))
+        case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
+        told = f"{about(verdict)}: {verdict.words}" if verdict.words else ""
+        if verdict.fails:
+            ElementTree.SubElement(case, "failure", type=verdict.finding, message=told).text = _numbers(verdict)
+        elif told:
+            ElementTree.SubElement(case, "system-out").text = f"{told}\n{_numbers(verdict)}"
+
+
+def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
+    failures = sum(verdict.fails for verdict in verdicts)
+    return {"tests": str(len(verdicts)), "failures": str(failures), "errors": "0", "skipped": "0"}
+
+
+def _numbers(verdict: Verdict) -> str:
+    told = {
+        "before": verdict.before,
+        "now": verdict.after,
+        "change in percent": verdict.change_percent,
+        "allowed in percent": verdict.allowed_percent,
+        "p, adjusted": verdict.p,
+        "sees, in percent": verdict.seen_percent,
+    }
+    return "\n".join(f"{name}: {value:.7g}" for name, value in told.items() if value is not None)
+
 
 WRITERS: Mapping[str, Callable[[Check], str]] = {
     "junit": gate_junit,
     "markdown": gate_markdown,
-    "json": lambda check: to_text(gate_json(check)),
+    "json": lambda check: to_text(check_document(check)),
 }
 
 
@@ -45,6 +127,6 @@ def made_here(command: str) -> dict[str, str]:
     return {
         "command": command,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git_revision": git_revision(Path(toolkit.__file__).parent) or "not from a checkout",
+        "git_revision": git_revision() or "not from a checkout",
         "cpu": cpu_model(),
     }

@@ -7,13 +7,15 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import toolkit
+import msgspec
+from msgspec import UNSET
+
 from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.workers import usable_cpus
-from toolkit.report.metrics_json import Json
+from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
 
-SCHEMA = "vislam.manifest/1"
 _PACKAGES = {
     "toolkit": "vislam-toolkit",
     "numpy": "numpy",
@@ -25,67 +27,61 @@ _PACKAGES = {
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
 
 
-def build(comparison: Comparison, command: str) -> Json:
-    """Return the manifest of a comparison made by ``command``."""
-    here, seeds = _estimators(comparison), {"sequence": comparison.seeds[0]}
-    if comparison.over_seeds:
-        seeds["count"] = len(comparison.seeds)
-    return {
-        **_made_by(command),
-        "sequence": _sequence(comparison.sequence),
-        "start": comparison.prior.source,
-        "estimators": here,
-        "references": [name for name in comparison.estimators if name not in here],
-        "seeds": seeds,
-        "threads": {
-            "cpus": usable_cpus(),
-            "workers": comparison.workers,
-            "per_worker": 1,
-            **{name: os.environ.get(name) for name in _THREAD_VARIABLES},
-        },
-        **_machine(),
-    }
+def manifest_document(comparison: Comparison, command: str, asked: Configuration) -> Manifest:
+    """Return the manifest of a comparison: made by a command, that came to be asked for this."""
+    here = _run_here(comparison)
+    versions = {name: _version(package) for name, package in _PACKAGES.items()}
+    request = msgspec.structs.replace(asked.request, sequences=(comparison.source,), estimators=here)
+    return Manifest(
+        schema="vislam.manifest/1",
+        command=command,
+        compare=request,
+        settings=asked.settings,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions={"python": platform.python_version(), **versions},
+        git_revision=git_revision(),
+        sequence=_recording(comparison.sequence),
+        start=comparison.prior.source,
+        estimators=here,
+        references=tuple(name for name in comparison.estimators if name not in here),
+        seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),
+        threads=_threads(comparison),
+        cpu=cpu_model(),
+        os=platform.platform(),
+    )
 
 
-def _estimators(comparison: Comparison) -> list[str]:
-    """Return the estimators that were run here."""
+def _run_here(comparison: Comparison) -> tuple[str, ...]:
+    """Return the estimators that were run here, and not read from files."""
     others = {run.estimator for run in comparison.runs if run.timings is None}
-    return [name for name in comparison.estimators if name not in others]
+    return tuple(name for name in comparison.estimators if name not in others)
 
 
-def _made_by(command: str) -> Json:
-    return {
-        "schema": SCHEMA,
-        "command": command,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"python": platform.python_version(), **{name: _version(p) for name, p in _PACKAGES.items()}},
-        "git_revision": git_revision(Path(toolkit.__file__).parent),
-    }
+def _threads(comparison: Comparison) -> dict[str, int | str | None]:
+    variables = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    return {"cpus": usable_cpus(), "workers": comparison.workers, "per_worker": 1, **variables}
 
 
-def _sequence(sequence: Sequence) -> Json:
-    return {
-        "name": sequence.name,
-        "hash": sequence.content_hash(),
-        "format": sequence.provenance.format,
-        "source": sequence.provenance.source,
-    }
+def _recording(sequence: Sequence) -> Recording:
+    return Recording(
+        name=sequence.name,
+        hash=sequence.content_hash(),
+        format=sequence.provenance.format,
+        source=sequence.provenance.source,
+    )
 
 
-def _machine() -> Json:
-    return {"cpu": cpu_model(), "os": platform.platform()}
-
-
-def git_revision(package: Path) -> str | None:
-    """Return the commit a package's folder is checked out at, ``-dirty`` where it was edited, or None.
+def git_revision() -> str | None:
+    """Return the commit the toolkit is checked out at, ``-dirty`` where it was edited, or None.
 
     A package installed somewhere inside another project's checkout is not at that project's revision.
     """
-    if not (package.parent / ".git").exists():
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists():
         return None
     try:
         described = subprocess.run(
-            ["git", "-C", str(package.parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
+            ["git", "-C", str(checkout), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
             capture_output=True,
             text=True,
             timeout=10,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import unavailable
-from toolkit.report.metrics_json import path_length_m
+from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, explained_metrics, shared_values
 from toolkit.sequence import Sequence
 

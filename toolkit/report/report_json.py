@@ -1,7 +1,8 @@
-"""The JSON contract ``vislam.report/1``: what a report draws and says beyond metrics.json (see docs/report.md)."""
+"""What a report draws and says beyond the scores, as a record: ``report.json``, of one seed or over many."""
 
 import math
 from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,40 +12,43 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.report.contract import object_violations, schema_violations
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
 from toolkit.report.figures.top_view import last_word
-from toolkit.report.messages import note_lines, outcome, remark_lines, sequence_line
-from toolkit.report.metrics_json import Json
+from toolkit.report.messages import (
+    consistency_lines,
+    header_lines,
+    note_lines,
+    outcome,
+    remark_lines,
+    sequence_line,
+)
+from toolkit.report.records.report import (
+    AuditWords,
+    DrawnMap,
+    DrawnOverSeeds,
+    DrawnRun,
+    ErrorKind,
+    ErrorSeries,
+    MeanNeesSeries,
+    NeesSeries,
+    NisSeries,
+    Numbers,
+    Report,
+    SeedsReport,
+    SeedsWords,
+    StepTimes,
+    Vector,
+    Words,
+)
 from toolkit.resampling import NS_PER_S
 
-SCHEMA = "vislam.report/1"
 TRUTH_FILE = "trajectories/truth.tum"
 
 _SIGNIFICANT_DIGITS = 6
 _MICROSECONDS = 6
-_FIELDS: dict[str, tuple[type, ...]] = {
-    "start_ns": (int,),
-    "truth": (str, type(None)),
-    "alignment": (str,),
-    "error": (dict, type(None)),
-    "runs": (list,),
-    "steps": (list,),
-    "maps": (list,),
-    "words": (dict,),
-}
-_RUN_FIELDS: dict[str, tuple[type, ...]] = {
-    "estimator": (str,),
-    "output": (str,),
-    "repeats_causal": (bool,),
-    "trajectory": (str, type(None)),
-    "rotation": (list,),
-    "translation_m": (list,),
-    "errors": (dict, type(None)),
-    "nees": (dict, str),
-    "nis": (dict, str),
-}
+
+Series = TypeVar("Series", NeesSeries, NisSeries)
 
 
 def trajectory_file(estimator: str, output: Output) -> str:
@@ -57,21 +61,35 @@ def landmarks_file(estimator: str) -> str:
     return f"landmarks/{plain_name(estimator)}.csv"
 
 
-def build(comparison: Comparison) -> Json:
-    """Return the document of a comparison; times count from the first frame, what is not finite becomes null."""
+def report_document(comparison: Comparison) -> Report:
+    """Return what the report of a comparison draws and says; what is not finite becomes null."""
     curves = error_curves(comparison)
-    start_ns = int(comparison.sequence.frames_t_ns[0])
-    return {
-        "schema": SCHEMA,
-        "start_ns": start_ns,
-        "truth": None if truth_during(comparison.sequence) is None else TRUTH_FILE,
-        "alignment": alignment_words(comparison.sequence),
-        "error": None if curves is None else {"what": curves.what, "caption": _error_caption(comparison, curves)},
-        "runs": [_row(row, comparison, _curve_of(row, curves)) for row in comparison.rows],
-        "steps": list(_steps(comparison)),
-        "maps": [_map(run, comparison) for run in comparison.runs if len(run.landmarks)],
-        "words": _words(comparison),
-    }
+    return Report(
+        schema="vislam.report/1",
+        start_ns=int(comparison.sequence.frames_t_ns[0]),
+        truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
+        alignment=alignment_words(comparison.sequence),
+        error=None if curves is None else ErrorKind(what=curves.what, caption=_error_caption(comparison, curves)),
+        runs=tuple(_row(row, comparison, _curve_of(row, curves)) for row in comparison.rows),
+        steps=tuple(_steps(comparison)),
+        maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
+        words=_words(comparison),
+    )
+
+
+def seeds_report_document(over: Comparison) -> SeedsReport:
+    """Return what the report over seeds draws and says; its runs are those of seeds.json, in its order."""
+    return SeedsReport(
+        schema="vislam.report/1",
+        t_s=tuple(_short(t) for t in over.frames_s.tolist()),
+        runs=tuple(_over_seeds(group) for group in over.rows),
+        words=SeedsWords(
+            sequence="; ".join(header_lines(over)),
+            notes=tuple(note_lines(over)),
+            verdicts=tuple(consistency_lines(over)),
+            start=over.prior.source,
+        ),
+    )
 
 
 def _error_caption(comparison: Comparison, curves: ErrorCurves) -> str:
@@ -93,47 +111,54 @@ def _same_line(row: Row, other: Row) -> bool:
     return row.run is other.run and (row.run.final_is_causal or row.output == other.output)
 
 
-def _words(comparison: Comparison) -> Json:
-    return {
-        "sequence": sequence_line(comparison.sequence),
-        "notes": list(note_lines(comparison)),
-        "remarks": list(remark_lines(comparison)),
-        "start": comparison.prior.source,
-        "audit": [
-            {"fault": f.fault, "count": f.count, "outcome": outcome(f), "detail": f.detail} for f in comparison.findings
-        ],
-        "facts": list(comparison.sequence.provenance.facts),
-        "changes": dict(comparison.changes),
-    }
+def _words(comparison: Comparison) -> Words:
+    return Words(
+        sequence=sequence_line(comparison.sequence),
+        notes=tuple(note_lines(comparison)),
+        remarks=tuple(remark_lines(comparison)),
+        start=comparison.prior.source,
+        audit=tuple(
+            AuditWords(fault=f.fault, count=f.count, outcome=outcome(f), detail=f.detail) for f in comparison.findings
+        ),
+        facts=comparison.sequence.provenance.facts,
+        changes=dict(comparison.changes),
+    )
 
 
-def _row(row: Row, comparison: Comparison, errors: Errors | None) -> Json:
+def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
     answered = row.run.trajectory(row.output) is not None
     alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else None
+    rotation = np.eye(3) if alignment is None else alignment.rotation
+    translation_m = np.zeros(3) if alignment is None else alignment.translation
     start_ns = int(comparison.sequence.frames_t_ns[0])
-    return {
-        "estimator": row.estimator,
-        "output": row.output,
-        "repeats_causal": row.output == "final" and row.run.final_is_causal,
-        "trajectory": trajectory_file(row.estimator, row.output) if answered else None,
-        "rotation": (np.eye(3) if alignment is None else alignment.rotation).tolist(),
-        "translation_m": (np.zeros(3) if alignment is None else alignment.translation).tolist(),
-        "errors": None if errors is None else _errors(errors, start_ns),
-        "nees": _told_or_why(_nees, row, comparison),
-        "nis": _told_or_why(_nis, row, comparison),
-    }
+    return DrawnRun(
+        estimator=row.estimator,
+        output=row.output,
+        repeats_causal=row.output == "final" and row.run.final_is_causal,
+        trajectory=trajectory_file(row.estimator, row.output) if answered else None,
+        rotation=(_vector(rotation[0]), _vector(rotation[1]), _vector(rotation[2])),
+        translation_m=_vector(translation_m),
+        errors=None if errors is None else _errors(errors, start_ns),
+        nees=_told_or_why(_nees, row, comparison),
+        nis=_told_or_why(_nis, row, comparison),
+    )
 
 
-def _errors(errors: Errors, start_ns: int) -> Json:
-    return {
-        "t_s": _seconds(errors.t_ns, start_ns),
-        "path_m": numbers(errors.path_m),
-        "position_m": numbers(errors.position_m),
-        "heading_deg": numbers(errors.heading_deg),
-    }
+def _vector(values: Array) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
-def _told_or_why(series: Callable[[Row, Comparison], Json], row: Row, comparison: Comparison) -> Json | str:
+def _errors(errors: Errors, start_ns: int) -> ErrorSeries:
+    return ErrorSeries(
+        t_s=_seconds(errors.t_ns, start_ns),
+        path_m=numbers(errors.path_m),
+        position_m=numbers(errors.position_m),
+        heading_deg=numbers(errors.heading_deg),
+    )
+
+
+def _told_or_why(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
     """Return a series, or in words why there is none."""
     if row.run.trajectory(row.output) is None:
         return "the run gave no trajectory"
@@ -144,18 +169,18 @@ def _told_or_why(series: Callable[[Row, Comparison], Json], row: Row, comparison
         return str(reason)
 
 
-def _nees(row: Row, comparison: Comparison) -> Json:
+def _nees(row: Row, comparison: Comparison) -> NeesSeries:
     nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
-    return {
-        "t_s": _seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
-        "pose": numbers(nees.pose),
-        "orientation": numbers(nees.orientation),
-        "position": numbers(nees.position),
-        "band": list(nees_band(POSE_DOF)),
-    }
+    return NeesSeries(
+        t_s=_seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
+        pose=numbers(nees.pose),
+        orientation=numbers(nees.orientation),
+        position=numbers(nees.position),
+        band=nees_band(POSE_DOF),
+    )
 
 
-def _nis(row: Row, comparison: Comparison) -> Json:
+def _nis(row: Row, comparison: Comparison) -> NisSeries:
     """Return each step's NIS over its degrees of freedom with the two-sided 95 % band for as many."""
     causal, info = row.run.causal, row.run.info
     if row.output != "causal" or causal is None:
@@ -168,53 +193,65 @@ def _nis(row: Row, comparison: Comparison) -> Json:
         raise Unavailable("no step reports an innovation")
     bands = {int(d): nees_band(int(d)) for d in np.unique(dof[given])}
     low, high = np.array([bands[int(d)] for d in dof[given]]).T
-    return {
-        "t_s": _seconds(causal.t_ns[given], int(comparison.sequence.frames_t_ns[0])),
-        "per_dof": numbers(nis[given] / dof[given]),
-        "low": numbers(low),
-        "high": numbers(high),
-    }
+    return NisSeries(
+        t_s=_seconds(causal.t_ns[given], int(comparison.sequence.frames_t_ns[0])),
+        per_dof=numbers(nis[given] / dof[given]),
+        low=numbers(low),
+        high=numbers(high),
+    )
 
 
-def _steps(comparison: Comparison) -> Iterator[Json]:
+def _steps(comparison: Comparison) -> Iterator[StepTimes]:
     frames_t_ns = comparison.sequence.frames_t_ns
     for run in comparison.runs:
         if run.timings is not None and run.timings.step_s.size:
             t_ns = frames_t_ns[: run.timings.step_s.size]
-            yield {
-                "estimator": run.estimator,
-                "t_s": _seconds(t_ns, int(frames_t_ns[0])),
-                "step_ms": numbers(1e3 * run.timings.step_s),
-                "finish_s": number(run.timings.finish_s),
-            }
+            yield StepTimes(
+                estimator=run.estimator,
+                t_s=_seconds(t_ns, int(frames_t_ns[0])),
+                step_ms=numbers(1e3 * run.timings.step_s),
+                finish_s=number(run.timings.finish_s),
+            )
 
 
-def _map(run: Run, comparison: Comparison) -> Json:
+def _map(run: Run) -> DrawnMap:
     """Return where a run's landmarks are; they move with the run's last word onto the truth."""
-    return {"estimator": run.estimator, "landmarks": landmarks_file(run.estimator), "output": last_word(run)}
+    return DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=last_word(run))
 
 
-def _seconds(t_ns: IntArray, start_ns: int) -> list[float]:
-    return [round(t / NS_PER_S, _MICROSECONDS) for t in (t_ns - start_ns).tolist()]
+def _over_seeds(group: Row) -> DrawnOverSeeds:
+    """Return the NEES averaged over the seeds with its band, and the position error over the seeds, or None each."""
+    nees, errors_m = group.mean_nees, group.position_m
+    return DrawnOverSeeds(
+        estimator=group.estimator,
+        output=group.output,
+        nees=None
+        if nees is None
+        else MeanNeesSeries(pose=numbers(nees.mean), low=numbers(nees.low), high=numbers(nees.high)),
+        position_rms_m=None if errors_m is None else numbers(_rms_over_runs(errors_m)),
+    )
 
 
-def numbers(values: Array) -> list[float | None]:
+def _rms_over_runs(errors: Array) -> Array:
+    """Return the root mean square (K,) over runs of errors (runs, K), NaN where no run has one."""
+    known = np.isfinite(errors)
+    total, count = np.where(known, errors, 0.0) ** 2, known.sum(axis=0)
+    return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def _seconds(t_ns: IntArray, start_ns: int) -> tuple[float, ...]:
+    return tuple(round(t / NS_PER_S, _MICROSECONDS) for t in (t_ns - start_ns).tolist())
+
+
+def numbers(values: Array) -> Numbers:
     """Return values (N,) with six digits, None for what is not finite."""
-    return [number(value) for value in values.tolist()]
+    return tuple(number(value) for value in values.tolist())
 
 
 def number(value: float) -> float | None:
     """Return a value with six digits, or None where it is not finite."""
-    return float(f"{value:.{_SIGNIFICANT_DIGITS}g}") if math.isfinite(value) else None
+    return _short(value) if math.isfinite(value) else None
 
 
-def violations(document: object) -> list[str]:
-    """Return everything in which a parsed document breaks the contract; empty for a valid one."""
-    if not isinstance(document, dict):
-        return ["the document is not an object"]
-    found = list(schema_violations(document, SCHEMA))
-    found += object_violations(document, "the document", _FIELDS)
-    runs = document.get("runs")
-    for i, run in enumerate(runs if isinstance(runs, list) else []):
-        found += object_violations(run, f"runs[{i}]", _RUN_FIELDS)
-    return found
+def _short(value: float) -> float:
+    return float(f"{value:.{_SIGNIFICANT_DIGITS}g}")

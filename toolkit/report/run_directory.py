@@ -1,24 +1,26 @@
 """The run directory: everything one comparison leaves behind, written at once or not at all."""
 
-import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-
-from toolkit.estimate import Trajectory
-from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.configuration import Configuration, as_manifest
-from toolkit.experiment.units import Outcome
-from toolkit.files import check_replaceable, replaced_directory
-from toolkit.report import manifest, metrics_json, report_json, seeds_json, seeds_report_json
-from toolkit.report.figures import drawn, over_seeds, save
+from toolkit.datasets.trajectories import tum
+from toolkit.documents import schema_name, to_line, to_text, told_schema
+from toolkit.estimate import Landmarks, Trajectory
+from toolkit.experiment.comparison import Comparison, plain_name
+from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.pipeline import Case
+from toolkit.files import check_parent, check_replaceable, replaced_directory
+from toolkit.report import report_json
+from toolkit.report.figures import drawn, save
 from toolkit.report.figures.alignment import truth_during
+from toolkit.report.manifest import manifest_document
+from toolkit.report.records import Manifest
 from toolkit.report.report_md import report_text
-from toolkit.report.trajectory_files import write_landmarks, write_tum
+from toolkit.report.scores_json import metrics_document, seeds_document
 
-MANIFEST = "manifest.json"
-REPORT = "report.json"
+METRICS, SEEDS = "metrics.json", "seeds.json"
+REPORT, MANIFEST = "report.json", "manifest.json"
 
 
 def check_run_directory(target: Path) -> None:
@@ -28,11 +30,33 @@ def check_run_directory(target: Path) -> None:
 
 def is_run_directory(directory: Path) -> bool:
     """Say whether a directory holds a manifest of ours; many programs write a file of that name."""
-    try:
-        told = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(told, dict) and told.get("schema") == manifest.SCHEMA
+    return told_schema(directory / MANIFEST) == schema_name(Manifest)
+
+
+def directories_for(cases: Sequence[Case], out: Path) -> tuple[Path, ...]:
+    """Return the run directory of each case: ``out`` for a single one, else folders in it by the sequences' names.
+
+    Raises OutputError where one cannot be written or holds something else.
+    """
+    names = unique_names(case.name for case in cases)
+    directories = (out,) if len(names) == 1 else tuple(out / name for name in names)
+    if len(names) > 1:
+        check_parent(out)
+    for directory in directories:
+        check_run_directory(directory)
+    return directories
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Turn sequence names into directory names, all different; a second ``drive`` becomes ``drive-2``."""
+    taken: list[str] = []
+    for name in names:
+        plain = plain_name(name) or "sequence"
+        candidate, n = plain, 2
+        while candidate in taken:
+            candidate, n = f"{plain}-{n}", n + 1
+        taken.append(candidate)
+    return taken
 
 
 @dataclass(frozen=True)
@@ -50,41 +74,16 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
     """
     with replaced_directory(target, is_run_directory) as directory:
         if comparison.over_seeds:
-            _write_over_seeds(comparison, directory)
+            _write_text(directory / SEEDS, to_text(seeds_document(comparison)))
+            _write_text(directory / REPORT, to_line(report_json.seeds_report_document(comparison)))
         else:
-            _write_single(comparison, directory)
-        told = manifest.build(comparison, made_by.command) | as_manifest(_of_one(made_by.asked, comparison))
-        _write_text(directory / MANIFEST, json.dumps(told, indent=2) + "\n")
-
-
-def _of_one(asked: Configuration, comparison: Comparison) -> Configuration:
-    """Return what was asked for, of the one sequence and its estimators by name."""
-    made_here = [outcome.estimator for outcome in comparison.outcomes if not _is_reference(outcome)]
-    request = msgspec.structs.replace(
-        asked.request, sequences=(comparison.source,), estimators=tuple(dict.fromkeys(made_here))
-    )
-    return Configuration(request, asked.settings)
-
-
-def _is_reference(outcome: Outcome) -> bool:
-    return outcome.run is not None and outcome.run.timings is None
-
-
-def _write_single(comparison: Comparison, directory: Path) -> None:
-    _write_text(directory / "metrics.json", metrics_json.to_text(metrics_json.build(comparison)))
-    _write_text(directory / REPORT, json.dumps(report_json.build(comparison), allow_nan=False) + "\n")
-    _write_trajectories(comparison, directory)
-    (directory / "figures").mkdir()
-    captions = save(drawn(comparison), directory / "figures")
-    _write_text(directory / "report.md", report_text(comparison, captions))
-
-
-def _write_over_seeds(comparison: Comparison, directory: Path) -> None:
-    _write_text(directory / "seeds.json", metrics_json.to_text(seeds_json.build(comparison)))
-    _write_text(directory / REPORT, json.dumps(seeds_report_json.build(comparison), allow_nan=False) + "\n")
-    (directory / "figures").mkdir()
-    captions = save(over_seeds.draw(comparison), directory / "figures")
-    _write_text(directory / "report.md", report_text(comparison, captions))
+            _write_text(directory / METRICS, to_text(metrics_document(comparison)))
+            _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
+            _write_trajectories(comparison, directory)
+        (directory / "figures").mkdir()
+        captions = save(drawn(comparison), directory / "figures")
+        _write_text(directory / "report.md", report_text(comparison, captions))
+        _write_text(directory / MANIFEST, to_text(manifest_document(comparison, made_by.command, made_by.asked)))
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:
@@ -92,13 +91,25 @@ def _write_trajectories(comparison: Comparison, directory: Path) -> None:
         (directory / folder).mkdir()
     truth = truth_during(comparison.sequence)
     if truth is not None:
-        write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
+        _write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
-            write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
+            _write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
     for run in comparison.runs:
-        write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+        _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+
+
+def _write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write a trajectory as a TUM file."""
+    path.write_text(tum.text(trajectory), encoding="utf-8")
+
+
+def _write_landmarks(landmarks: Landmarks, path: Path) -> None:
+    """Write landmarks as CSV, one a row: track id and position in the world in metres."""
+    rows = zip(landmarks.track_ids.tolist(), landmarks.points_world.tolist(), strict=True)
+    lines = [f"{track_id},{x:.15g},{y:.15g},{z:.15g}" for track_id, (x, y, z) in rows]
+    path.write_text("\n".join(["track_id,x_m,y_m,z_m", *lines]) + "\n", encoding="utf-8")
 
 
 def _write_text(path: Path, text: str) -> None:

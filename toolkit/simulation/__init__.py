@@ -1,7 +1,7 @@
 """Simulated recordings with exact truth: a smooth trajectory, landmarks to look at, and sensors with known noise.
 
-Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each), ``trajectory``
-(B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise).
+Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
+``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise).
 """
 
 from toolkit.simulation.scenarios import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate

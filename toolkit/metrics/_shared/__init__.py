@@ -1,5 +1,5 @@
 """Parts of the metric files; no file here is a metric.
 
-Read ``scores`` (what a metric file declares and returns), ``evaluation`` (one output of a run beside its sequence), then
+Read ``scores`` (what a metric file declares and returns), ``evaluation`` (one output of a run and its sequence), then
 ``association``, ``alignment`` and ``residuals``; ``consistency`` is NEES, ``leave_one_out`` the held-out prediction.
 """

@@ -4,20 +4,17 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
+from toolkit.report.figures import errors_over_time, frame_times, over_seeds, reprojection, top_view
 from toolkit.report.figures.style import NamedFigure
 
-_DRAWINGS: tuple[Callable[[Comparison], Iterator[NamedFigure]], ...] = (
-    top_view.draw,
-    errors_over_time.draw,
-    reprojection.draw,
-    frame_times.draw,
-)
+_Drawing = Callable[[Comparison], Iterator[NamedFigure]]
+_OF_ONE: tuple[_Drawing, ...] = (top_view.draw, errors_over_time.draw, reprojection.draw, frame_times.draw)
+_OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
 
 def drawn(comparison: Comparison) -> Iterator[NamedFigure]:
     """Draw every figure the comparison has data for."""
-    return (figure for drawing in _DRAWINGS for figure in drawing(comparison))
+    return (figure for drawing in (_OVER_SEEDS if comparison.over_seeds else _OF_ONE) for figure in drawing(comparison))
 
 
 def save(figures: Iterable[NamedFigure], directory: Path) -> dict[str, str]:

@@ -5,35 +5,41 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
+from msgspec.structs import asdict
 
 from toolkit.geometry import Array
-from toolkit.report.html.columns import columns_of
+from toolkit.metrics import known_metrics
 from toolkit.report.html.highlights import highlights
-from toolkit.report.html.run_files import RunFiles, Track
+from toolkit.report.html.run_files import RunFiles, SeedsFiles, Track
 from toolkit.report.html.seeds_payload import seeds_case
 from toolkit.report.html.thinning import MOST_LANDMARKS, MOST_POSES, coordinates, evenly, running_median, thinned
+from toolkit.report.records.report import DrawnMap, DrawnRun, NeesSeries
 
 Json = dict[str, Any]
+Files = RunFiles | SeedsFiles
 
 
-def payload_of(runs: Sequence[RunFiles]) -> Json:
+def payload_of(runs: Sequence[Files]) -> Json:
     """Return what the page shows of run directories, side by side in this order."""
     titles = _titles(runs)
     colours = _colours(runs)
-    keys = {key for files in runs for run in files.scores["runs"] for key in run["metrics"]}
+    keys = {key for files in runs for run in files.scores.runs for key in run.metrics}
     return {
         "title": " / ".join(titles),
         "columns": columns_of(keys),
         "cases": [
-            seeds_case(files, f"c{i}", title, colours) if files.over_seeds else _case(files, f"c{i}", title, colours)
+            _case(files, f"c{i}", title, colours)
+            if isinstance(files, RunFiles)
+            else seeds_case(files, f"c{i}", title, colours)
             for i, (files, title) in enumerate(zip(runs, titles, strict=True))
         ],
     }
 
 
-def _titles(runs: Sequence[RunFiles]) -> list[str]:
+def _titles(runs: Sequence[Files]) -> list[str]:
     """Return the sequences' names, with the directory's where several share one, as given where that is shared too."""
-    names = [files.scores["sequence"]["name"] for files in runs]
+    names = [files.scores.sequence.name for files in runs]
     with_directory = [f"{name} ({files.directory.resolve().name})" for name, files in zip(names, runs, strict=True)]
     as_given = [f"{name} ({files.directory})" for name, files in zip(names, runs, strict=True)]
     choices = list(zip(names, with_directory, as_given, strict=True))
@@ -41,59 +47,60 @@ def _titles(runs: Sequence[RunFiles]) -> list[str]:
     return [next((title for title in choice if counts[title] == 1), choice[-1]) for choice in choices]
 
 
-def _colours(runs: Sequence[RunFiles]) -> dict[str, int]:
+def _colours(runs: Sequence[Files]) -> dict[str, int]:
     """Number the estimators in order of appearance; one of the same name has the same colour in every run."""
-    names = dict.fromkeys(run["estimator"] for files in runs for run in files.scores["runs"])
+    names = dict.fromkeys(run.estimator for files in runs for run in files.scores.runs)
     return {name: i for i, name in enumerate(names)}
 
 
 def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) -> Json:
-    report, sequence = files.report, files.scores["sequence"]
+    report, sequence = files.report, files.scores.sequence
     rows = _rows(files, case_id, colours)
     return {
         "kind": "run",
         "id": case_id,
         "title": title,
-        "sequence": sequence,
-        "words": report["words"],
-        "alignment": report["alignment"],
-        "error": report["error"],
-        "highlights": highlights(rows, sequence["motion"]),
+        "sequence": asdict(sequence),
+        "words": to_builtins(report.words),
+        "alignment": report.alignment,
+        "error": None if report.error is None else asdict(report.error),
+        "highlights": highlights(rows, sequence.motion),
         "rows": rows,
-        "truth": None if report["truth"] is None else _drawn(files.tracks[report["truth"]]),
-        "maps": [_map(one, files, rows) for one in report["maps"]],
+        "truth": None if report.truth is None else _drawn(files.tracks[report.truth]),
+        "maps": [_map(one, files, rows) for one in report.maps],
         "steps": [
-            {"estimator": one["estimator"], "finish_s": one["finish_s"], "rows": _rows_of(one["estimator"], rows)}
-            | _with_median({"t_s": one["t_s"], "step_ms": one["step_ms"]}, "step_ms")
-            for one in report["steps"]
+            {"estimator": one.estimator, "finish_s": one.finish_s, "rows": _rows_of(one.estimator, rows)}
+            | _with_median({"t_s": one.t_s, "step_ms": one.step_ms}, "step_ms")
+            for one in report.steps
         ],
-        "manifest": files.manifest,
+        "manifest": to_builtins(files.manifest),
     }
 
 
 def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     """Return a row for each kind of output that says something of its own, as in the other tables."""
-    repeated = {run["estimator"] for run in files.report["runs"] if run["repeats_causal"]}
-    changes, rows = files.report["words"].get("changes", {}), []
-    for i, (run, drawn) in enumerate(zip(files.scores["runs"], files.report["runs"], strict=True)):
-        name = run["estimator"]
-        if drawn["repeats_causal"]:
+    repeated = {run.estimator for run in files.report.runs if run.repeats_causal}
+    changes = files.report.words.changes
+    rows: list[Json] = []
+    for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
+        name = run.estimator
+        if drawn.repeats_causal:
             continue
         rows.append(
             {
                 "id": f"{case_id}r{i}",
                 "estimator": name,
-                "output": "both" if name in repeated else run["output"],
-                "status": run["status"],
+                "output": "both" if name in repeated else run.output,
+                "status": run.status,
                 "colour": colours[name],
                 "change": changes.get(name, ""),
-                "metrics": run["metrics"],
-                "notes": run["notes"],
-                "log": run["log"],
-                "track": None if drawn["trajectory"] is None else _drawn(_aligned(drawn, files)),
-                "errors": None if drawn["errors"] is None else thinned(drawn["errors"], "position_m"),
-                "nees": _series(drawn["nees"], "pose"),
-                "nis": drawn["nis"] if isinstance(drawn["nis"], str) else _with_median(drawn["nis"], "per_dof"),
+                "metrics": run.metrics,
+                "notes": run.notes,
+                "log": run.log,
+                "track": None if drawn.trajectory is None else _drawn(_aligned(files.tracks[drawn.trajectory], drawn)),
+                "errors": None if drawn.errors is None else thinned(asdict(drawn.errors), "position_m"),
+                "nees": _nees(drawn.nees),
+                "nis": drawn.nis if isinstance(drawn.nis, str) else _with_median(asdict(drawn.nis), "per_dof"),
             }
         )
     return rows
@@ -103,13 +110,12 @@ def _rows_of(estimator: str, rows: list[Json]) -> list[str]:
     return [row["id"] for row in rows if row["estimator"] == estimator]
 
 
-def _aligned(drawn: Json, files: RunFiles) -> Track:
-    track = files.tracks[drawn["trajectory"]]
+def _aligned(track: Track, drawn: DrawnRun) -> Track:
     return Track(track.t_s, _moved(track.positions, drawn))
 
 
-def _moved(points: Array, drawn: Json) -> Array:
-    moved: Array = points @ np.array(drawn["rotation"]).T + np.array(drawn["translation_m"])
+def _moved(points: Array, drawn: DrawnRun) -> Array:
+    moved: Array = points @ np.array(drawn.rotation).T + np.array(drawn.translation_m)
     return moved
 
 
@@ -118,10 +124,10 @@ def _drawn(track: Track) -> Json:
     return {"t_s": [round(t, 4) for t in track.t_s[kept].tolist()], **coordinates(track.positions[kept])}
 
 
-def _map(one: Json, files: RunFiles, rows: list[Json]) -> Json:
+def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
     """Return a run's landmarks, moved with its last word onto the truth."""
-    points, name = files.landmarks[one["landmarks"]], one["estimator"]
-    last = next(run for run in files.report["runs"] if run["estimator"] == name and run["output"] == one["output"])
+    points, name = files.landmarks[one.landmarks], one.estimator
+    last = next(run for run in files.report.runs if (run.estimator, run.output) == (name, one.output))
     shown = _moved(points[evenly(len(points), MOST_LANDMARKS)], last)
     return {"estimator": name, "rows": _rows_of(name, rows), "count": len(points), **coordinates(shown)}
 
@@ -131,9 +137,36 @@ def _with_median(series: Json, leading: str) -> Json:
     return thinned(series | {"median": running_median(series[leading])}, leading)
 
 
-def _series(series: Json | str, leading: str) -> Json | str:
+def _nees(series: NeesSeries | str) -> Json | str:
     """Return a thinned series with its constant band, or the words that say why there is none."""
     if isinstance(series, str):
         return series
-    band = {"band": series["band"]} if "band" in series else {}
-    return thinned({name: column for name, column in series.items() if name != "band"}, leading) | band
+    columns = asdict(series)
+    band = {"band": columns.pop("band")}
+    return thinned(columns, "pose") | band
+
+
+def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
+    """Return a column for each metric that the runs have, and for each key that no metric here declares."""
+    present = [metric for metric in known_metrics() if metric.key in keys_present]
+    usual = [metric for metric in present if metric.table != "on request"]
+    columns = [
+        {
+            "key": metric.key,
+            "name": metric.name,
+            "unit": metric.unit,
+            "decimals": metric.decimals,
+            "meaning": metric.meaning,
+            "best": metric.best,
+            "usual": metric in usual,
+            "usual_over_seeds": metric.over_seeds,
+        }
+        for metric in (*usual, *(metric for metric in present if metric not in usual))
+    ]
+    return [*columns, *(_undeclared(key) for key in sorted(keys_present - {metric.key for metric in present}))]
+
+
+def _undeclared(key: str) -> dict[str, Any]:
+    """Return the column of a metric that the runs have and this installation does not know."""
+    words = {"key": key, "name": key, "unit": "", "decimals": 3, "meaning": "", "best": ""}
+    return {**words, "usual": False, "usual_over_seeds": False}

@@ -1,23 +1,31 @@
 """What a run directory holds, read back with nothing but its own files, so that it works on any machine."""
 
-import json
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from toolkit.errors import DataError
+from toolkit.estimate import Output
 from toolkit.geometry import Array
-from toolkit.report import manifest, metrics_json, report_json, seeds_json, seeds_report_json
+from toolkit.report.records import (
+    Manifest,
+    Metrics,
+    Report,
+    Seeds,
+    SeedsReport,
+    read_manifest,
+    read_metrics,
+    read_report,
+    read_seeds,
+    read_seeds_report,
+)
+from toolkit.report.run_directory import MANIFEST, METRICS, REPORT, SEEDS
 from toolkit.resampling import NS_PER_S
 
-# A parsed JSON document of ours, after its validator had nothing to say.
-Document = dict[str, Any]
-_METRICS, _SEEDS, _REPORT, _MANIFEST = "metrics.json", "seeds.json", "report.json", "manifest.json"
 _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
+_Rows = list[tuple[str, Output]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,65 +38,65 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """One run directory: its documents, and trajectories and landmarks (M, 3) by the names the documents give them.
-
-    ``scores`` is metrics.json, or seeds.json where ``over_seeds``.
-    """
+    """The run directory of one seed; trajectories and landmarks (M, 3) by the names the report gives them."""
 
     directory: Path
-    scores: Document
-    report: Document
-    manifest: Document
-    over_seeds: bool = False
-    tracks: dict[str, Track] = field(default_factory=dict)
-    landmarks: dict[str, Array] = field(default_factory=dict)
+    scores: Metrics
+    report: Report
+    manifest: Manifest
+    tracks: dict[str, Track]
+    landmarks: dict[str, Array]
 
 
-def read_run(directory: Path) -> RunFiles:
+@dataclass(frozen=True, eq=False)
+class SeedsFiles:
+    """The run directory of a comparison over seeds, which holds no trajectories."""
+
+    directory: Path
+    scores: Seeds
+    report: SeedsReport
+    manifest: Manifest
+
+
+def read_run(directory: Path) -> RunFiles | SeedsFiles:
     """Read a run directory.
 
     Raises DataError, naming the file, where one is missing, damaged or of a version this toolkit does not know.
     """
     if not directory.is_dir():
         raise DataError(f"{directory} is not a directory; give a run directory, as vislam compare writes it")
-    if not any((directory / name).is_file() for name in (_METRICS, _SEEDS)):
-        raise DataError(f"{directory} is not a run directory: it holds neither {_METRICS} nor {_SEEDS}")
-    told = _document(directory, _MANIFEST, _manifest_violations)
-    if (directory / _SEEDS).is_file():
-        seeds = _document(directory, _SEEDS, seeds_json.violations)
-        return RunFiles(directory, seeds, _report(directory, told, seeds_report_json.violations), told, over_seeds=True)
-    scores = _document(directory, _METRICS, metrics_json.violations)
-    report = _report(directory, told, report_json.violations)
-    names = [report["truth"], *(run["trajectory"] for run in report["runs"])]
-    tracks = {name: _track(directory / name, report["start_ns"]) for name in names if name is not None}
-    landmarks = {one["landmarks"]: _landmarks(directory / one["landmarks"]) for one in report["maps"]}
-    return RunFiles(directory, scores, report, told, tracks=tracks, landmarks=landmarks)
+    if not any((directory / name).is_file() for name in (METRICS, SEEDS)):
+        raise DataError(f"{directory} is not a run directory: it holds neither {METRICS} nor {SEEDS}")
+    manifest = read_manifest(directory / MANIFEST)
+    if not (directory / REPORT).is_file():
+        again = f"repeat it: {manifest.command}" if manifest.command else "repeat the comparison"
+        raise DataError(f"{directory} was written by an earlier version and has no {REPORT}; {again}")
+    return _over_seeds(directory, manifest) if (directory / SEEDS).is_file() else _one_seed(directory, manifest)
 
 
-def _report(directory: Path, told: Document, violations: Callable[[object], list[str]]) -> Document:
-    if not (directory / _REPORT).is_file():
-        again = f"repeat it: {told['command']}" if told.get("command") else "repeat the comparison"
-        raise DataError(f"{directory} was written by an earlier version and has no {_REPORT}; {again}")
-    return _document(directory, _REPORT, violations)
+def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
+    scores, report = read_metrics(directory / METRICS), read_report(directory / REPORT)
+    drawn = [(run.estimator, run.output) for run in report.runs]
+    _check_same_runs(directory, METRICS, [(run.estimator, run.output) for run in scores.runs], drawn)
+    if not {(one.estimator, one.output) for one in report.maps} <= set(drawn):
+        raise DataError(f"{directory / REPORT} has the map of a run it does not have; repeat the comparison")
+    names = [report.truth, *(run.trajectory for run in report.runs)]
+    tracks = {name: _track(directory / name, report.start_ns) for name in names if name is not None}
+    landmarks = {one.landmarks: _landmarks(directory / one.landmarks) for one in report.maps}
+    return RunFiles(directory, scores, report, manifest, tracks, landmarks)
 
 
-def _document(directory: Path, name: str, violations: Callable[[object], list[str]]) -> Document:
-    path = directory / name
-    try:
-        document: Document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path} is missing; repeat the comparison") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}); repeat the comparison") from error
-    broken = violations(document)
-    if broken:
-        raise DataError(f"{path} is not what this version writes: {broken[0]}; repeat the comparison")
-    return document
+def _over_seeds(directory: Path, manifest: Manifest) -> SeedsFiles:
+    scores, report = read_seeds(directory / SEEDS), read_seeds_report(directory / REPORT)
+    drawn = [(run.estimator, run.output) for run in report.runs]
+    _check_same_runs(directory, SEEDS, [(run.estimator, run.output) for run in scores.runs], drawn)
+    return SeedsFiles(directory, scores, report, manifest)
 
 
-def _manifest_violations(document: object) -> list[str]:
-    schema = document.get("schema") if isinstance(document, dict) else None
-    return [] if schema == manifest.SCHEMA else [f"schema is {schema!r}, not {manifest.SCHEMA!r}"]
+def _check_same_runs(directory: Path, name: str, scored: _Rows, drawn: _Rows) -> None:
+    """Raise DataError unless the report draws the runs that have scores, in their order."""
+    if scored != drawn:
+        raise DataError(f"{directory}: {REPORT} does not have the runs of {name}; repeat the comparison")
 
 
 def _track(path: Path, start_ns: int) -> Track:

@@ -1,6 +1,6 @@
 """Fewer points than a recording has, none of them made up: what a screen can show, in a file that can be mailed."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -38,14 +38,14 @@ def with_peaks(values: Array, most: int) -> IntArray:
     return np.array(sorted(kept))
 
 
-def thinned(series: dict[str, Any], leading: str) -> dict[str, list[float | None]]:
+def thinned(series: Mapping[str, Sequence[float | None]], leading: str) -> dict[str, list[float | None]]:
     """Return the lists of a series, all thinned alike, so that the peaks of the ``leading`` one stay."""
     values = np.array([np.nan if value is None else value for value in series[leading]], dtype=float)
     kept = with_peaks(values, MOST_SAMPLES).tolist()
     return {name: [column[i] for i in kept] for name, column in series.items() if len(column) == values.size}
 
 
-def running_median(values: list[float | None]) -> list[float | None]:
+def running_median(values: Sequence[float | None]) -> list[float | None]:
     """Return the median of the known values around each; None where there are none."""
     padded = np.pad(
         np.array([np.nan if value is None else value for value in values], dtype=float),

@@ -1,14 +1,66 @@
-"""What a check of the gate says, in plain words: the verdict in one line, what failed and why, and what to know."""
+"""A check of the gate for people: the verdict in one line, a table of everything, what failed and why, what to know."""
 
 import textwrap
 from collections.abc import Iterable, Iterator
 
+from toolkit.gate.bounded import SHOWN
 from toolkit.gate.verdict import Check, Verdict
 from toolkit.metrics import known_metrics
-from toolkit.report.gate_table import failures_table, gate_table
-from toolkit.report.table import as_markdown, as_text
+from toolkit.report.table import Table, as_markdown, as_text, number
 
 _WIDTH = 100
+_MISSING = "-"
+_LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
+_NUMBERS = (
+    ("before", "", ""),
+    ("now", "", ""),
+    ("change", "", "%"),
+    ("allowed", "", "%"),
+    ("sees", "", "%"),
+    ("p", "", ""),
+)
+
+
+def gate_table(check: Check) -> Table:
+    """Return every verdict of a check."""
+    return Table((*_LABELS, *_NUMBERS), tuple(map(_row, check.verdicts)), labels=len(_LABELS))
+
+
+def failures_table(check: Check) -> Table:
+    """Return what the check fails for, with the reason in words."""
+    rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failures)
+    headings = (*_LABELS, *_NUMBERS, ("why", "", ""))
+    return Table(headings, rows, labels=len(_LABELS))
+
+
+def _row(verdict: Verdict) -> tuple[str, ...]:
+    labels = (verdict.sequence, verdict.estimator, verdict.output, verdict.metric, verdict.finding)
+    numbers = (
+        _value(verdict.before),
+        _value(verdict.after),
+        _percent(verdict.change_percent, sign="+"),
+        _percent(verdict.allowed_percent),
+        _percent(verdict.seen_percent),
+        _MISSING if verdict.p is None else f"{verdict.p:.2g}",
+    )
+    return (*(_escaped(label) or _MISSING for label in labels), *numbers)
+
+
+def _value(value: float | None) -> str:
+    return _MISSING if value is None else number(value, 4)
+
+
+def _percent(value: float | None, sign: str = "") -> str:
+    if value is None:
+        return _MISSING
+    # A change that is shown must not be printed as none.
+    small = 100.0 * SHOWN <= abs(value) < 0.05
+    return f"{value:{sign}.0e}" if small else f"{value + 0.0:{sign}.1f}"
+
+
+def _escaped(text: str) -> str:
+    """Return text that cannot end a Markdown cell."""
+    return " ".join(text.replace("|", "/").split())
 
 
 def headline(check: Check) -> str:

@@ -1,0 +1,187 @@
+"""Every document that revision 0d93a31 wrote is read, to the byte; what breaks a contract is refused with its place."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import msgspec
+import pytest
+
+from toolkit.documents import parse, read, schema, to_line, to_text
+from toolkit.errors import DataError
+from toolkit.gate import baseline_json, baseline_reader
+from toolkit.metrics import describe
+from toolkit.report.records.metrics import PROMISED_KEYS
+from toolkit.report.records.schemas import RECORDS, schema_files
+
+Document = dict[str, Any]
+
+# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records.
+OLD = Path(__file__).parent / "documents"
+SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
+CASES = {
+    "metrics.json": "metrics-1",
+    "seeds.json": "seeds-1",
+    "report.json": "report-1",
+    "report-over-seeds.json": "report-over-seeds-1",
+    "manifest.json": "manifest-1",
+    "manifest-over-seeds.json": "manifest-1",
+    "baseline.json": "baseline-1",
+    "check.json": "check-1",
+}
+
+
+def old(name: str) -> Document:
+    document: Document = json.loads((OLD / name).read_text())
+    return document
+
+
+def refused(name: str, document: object) -> str:
+    """Return what is said of a document that must not be read."""
+    with pytest.raises(DataError) as raised:
+        parse(json.dumps(document), RECORDS[CASES[name]])
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def test_there_is_an_old_document_of_each_kind() -> None:
+    assert {path.name for path in OLD.iterdir()} == CASES.keys()
+    assert set(CASES.values()) == RECORDS.keys()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_old_document_is_written_again_as_it_was(name: str) -> None:
+    written = (OLD / name).read_text()
+    record = read(OLD / name, RECORDS[CASES[name]])
+    assert written in (to_text(record), to_line(record)) or name == "baseline.json"
+
+
+def test_an_old_baseline_is_written_again_as_it_was() -> None:
+    path = OLD / "baseline.json"
+    assert baseline_json.to_text(baseline_reader.load_baseline(path)) == path.read_text()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_old_document_keeps_the_published_schema(name: str) -> None:
+    published = json.loads((SCHEMAS / f"{CASES[name]}.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(published)
+    jsonschema.validate(old(name), published)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_fields_of_a_later_version_are_passed_over(name: str) -> None:
+    record = RECORDS[CASES[name]]
+    later = {**old(name), "of a later version": {"a": [1]}}
+    assert parse(json.dumps(later), record) == read(OLD / name, record)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_document_without_any_one_of_its_fields_is_refused(name: str) -> None:
+    for field in old(name).keys() - {"references"}:
+        lacking = {key: value for key, value in old(name).items() if key != field}
+        assert field in refused(name, lacking)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("document", [None, 3, [], {}, {"runs": [3]}, {"schema": 3}, "text"])
+def test_what_is_no_document_is_told(name: str, document: object) -> None:
+    assert "has not the schema vislam." in refused(name, document)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_document_cut_anywhere_is_told(name: str, tmp_path: Path) -> None:
+    text = (OLD / name).read_text()
+    for end in range(0, len(text) - 2, max(1, len(text) // 40)):
+        (tmp_path / name).write_text(text[:end])
+        with pytest.raises(DataError, match=f"{name} cannot be read as JSON"):
+            read(tmp_path / name, RECORDS[CASES[name]])
+
+
+def test_the_published_schemas_are_those_of_the_records() -> None:
+    told = "docs/schemas differs from the records: python -m toolkit.report.records.schemas docs/schemas renews it"
+    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), told
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_every_object_of_a_schema_says_what_it_is(name: str) -> None:
+    for one in schema(RECORDS[name])["$defs"].values():
+        assert one["description"]
+
+
+def test_every_promised_metric_is_computed() -> None:
+    assert set(PROMISED_KEYS) <= describe().keys()
+
+
+def test_a_record_is_not_changed() -> None:
+    record = read(OLD / "check.json", RECORDS["check-1"])
+    with pytest.raises(AttributeError):
+        record.passed = False  # type: ignore[attr-defined]
+    assert all(issubclass(r, msgspec.Struct) and r.__struct_config__.frozen for r in RECORDS.values())
+
+
+def _second_run(document: Document) -> Document:
+    run: Document = document["runs"][1]
+    return run
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda d: _second_run(d)["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
+        (lambda d: _second_run(d)["notes"].clear(), "is null, and notes does not say why"),
+        (
+            lambda d: _second_run(d)["metrics"].update(ate_se3_m="0.2"),
+            "runs[1].metrics.ate_se3_m: expected number or null, got string",
+        ),
+        (
+            lambda d: _second_run(d)["metrics"].update(ate_se3_m=float("nan")),
+            "runs[1].metrics.ate_se3_m: expected number or null, got NaN or infinity",
+        ),
+        (lambda d: d["sequence"].update(frames=True), "sequence.frames: expected integer, got true or false"),
+        (lambda d: d["sequence"].update(frames=-1), "sequence.frames: expected integer >= 0"),
+        (lambda d: _second_run(d).update(status="fine"), "runs[1].status: cannot be 'fine'"),
+        (lambda d: d.update(schema="vislam.metrics/2"), "its schema is 'vislam.metrics/2'"),
+        (lambda d: d["audit"].append({"fault": "gap", "count": 1, "repaired": True}), "audit[0]: lacks detail"),
+        (lambda d: d.pop("runs"), "the document: lacks runs"),
+    ],
+)
+def test_broken_metrics_are_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+    document = old("metrics.json")
+    spoil(document)
+    assert told in refused("metrics.json", document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda d: d["runs"][0]["nees"]["pose"].pop(), "runs[0].nees: pose has 11 entries, t_s has 12"),
+        (lambda d: d["runs"][0]["rotation"].pop(), "runs[0].rotation: expected list of length 3, got 2"),
+        (lambda d: d["steps"][0]["t_s"].pop(), "steps[0]: step_ms has 12 entries, t_s has 11"),
+    ],
+)
+def test_a_broken_report_is_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+    document = old("report.json")
+    spoil(document)
+    assert told in refused("report.json", document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda d: d.update(passed=False), "the document: passed does not fit failures"),
+        (lambda d: d.update(failures=1), "the document: failures does not count the verdicts that fail"),
+        (lambda d: d["verdicts"][0].update(fails=True), "verdicts[0]: fails does not fit the finding 'same'"),
+    ],
+)
+def test_a_broken_check_is_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+    document = old("check.json")
+    spoil(document)
+    assert told in refused("check.json", document)
+
+
+def test_a_frame_missing_over_seeds_is_told() -> None:
+    document = old("report-over-seeds.json")
+    document["runs"][0]["position_rms_m"].pop()
+    assert "runs[0].position_rms_m has 5 entries, t_s has 6" in refused("report-over-seeds.json", document)

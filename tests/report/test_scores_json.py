@@ -1,0 +1,61 @@
+"""metrics.json holds every score there is, and says why one is missing."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from toolkit.report.comparison import Comparison
+
+from toolkit.documents import parse, to_text
+from toolkit.metrics import Scores, describe
+from toolkit.report.records.metrics import PROMISED_KEYS, Metrics
+from toolkit.report.scores_json import metrics_document
+
+
+@pytest.fixture(scope="module")
+def document(comparison: Comparison) -> dict[str, Any]:
+    return json.loads(to_text(metrics_document(comparison)))
+
+
+def test_what_is_written_is_read_back(comparison: Comparison) -> None:
+    built = metrics_document(comparison)
+    assert parse(to_text(built), Metrics) == built
+
+
+def test_every_run_and_output_has_one_entry(document: dict[str, Any]) -> None:
+    assert [(run["estimator"], run["output"], run["status"]) for run in document["runs"]] == [
+        ("steady", "causal", "ok"),
+        ("steady", "final", "ok"),
+        ("astray", "causal", "diverged"),
+        ("astray", "final", "diverged"),
+        ("late", "final", "ok"),
+        ("broken", "final", "failed"),
+    ]
+
+
+def test_the_metrics_package_knows_every_key_of_the_contract() -> None:
+    assert set(PROMISED_KEYS) <= describe().keys()
+
+
+def test_key_order_is_stable(document: dict[str, Any]) -> None:
+    assert list(document) == ["schema", "sequence", "audit", "runs"]
+    expected = ["name", "hash", "frames", "tracks", "observations", "duration_s", "path_m", "motion"]
+    assert list(document["sequence"]) == expected
+    for run in document["runs"]:
+        assert list(run["metrics"]) == list(describe())
+
+
+def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], without_truth: Comparison) -> None:
+    assert document["sequence"]["path_m"] > 0.0
+    blind = metrics_document(without_truth)
+    assert parse(to_text(blind), Metrics) == blind
+    assert blind.sequence.path_m is None
+
+
+def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison) -> None:
+    scores = Scores(dict.fromkeys(describe(), float("nan")), {})
+    broken = replace(comparison, rows=(replace(comparison.rows[0], scores=scores),))
+    built = metrics_document(broken)
+    assert parse(to_text(built), Metrics) == built
+    assert built.runs[0].metrics["ate_se3_m"] is None

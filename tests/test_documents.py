@@ -1,0 +1,111 @@
+"""A document is what its record says, and what is wrong with a file is told in one line: file, place, what, remedy."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from toolkit.documents import parse, read, schema_name, to_line, to_text, told_schema
+from toolkit.errors import DataError, OutputError
+
+
+class Leaf(Struct, frozen=True, kw_only=True):
+    """A part with a rule of its own."""
+
+    count: Annotated[int, Meta(ge=0)]
+    values: tuple[float | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.values) > self.count:
+            raise ValueError("values has more entries than count says")
+
+
+class Tree(Struct, frozen=True, kw_only=True):
+    """A document."""
+
+    schema: Literal["test.tree/1"]
+    leaves: dict[str, Leaf] = {}
+    rows: tuple[dict[str, dict[str, float]], ...] = ()
+    way: Literal["up", "down"] = "up"
+    note: str | UnsetType = UNSET
+
+
+def told(text: str | bytes) -> str:
+    with pytest.raises(DataError) as raised:
+        parse(text, Tree)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def of(body: str) -> str:
+    return f'{{"schema": "test.tree/1", {body}}}'
+
+
+def test_a_record_is_read_as_it_was_written() -> None:
+    tree = Tree(schema="test.tree/1", leaves={"a": Leaf(count=2, values=(0.1, None))}, rows=({"b": {"c": 1e-300}},))
+    assert parse(to_text(tree), Tree) == parse(to_line(tree), Tree) == tree
+    assert to_line(tree).count("\n") == 1
+    assert "note" not in to_text(tree)
+
+
+def test_not_a_number_is_never_written() -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_text(Tree(schema="test.tree/1", rows=({"a": {"b": float("nan")}},)))
+
+
+def test_a_record_that_breaks_its_rule_cannot_be_made() -> None:
+    with pytest.raises(ValueError, match="more entries"):
+        Leaf(count=0, values=(1.0,))
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        ('"leaves": {"a": {"count": 1}, "b": {"count": -1}}', "leaves.b.count: expected integer >= 0"),
+        ('"leaves": {"a": {"count": 1}, "b": {}}', "leaves.b: lacks count"),
+        ('"leaves": {"a": {"count": 1}, "b": {"count": 0, "values": [1]}}', "leaves.b: values has more entries"),
+        (
+            '"leaves": {"a": {"count": 9, "values": [1, "2"]}}',
+            "leaves.a.values[1]: expected number or null, got string",
+        ),
+        ('"leaves": {"a": {"count": true}}', "leaves.a.count: expected integer, got true or false"),
+        ('"rows": [{}, {"x": {"y": 1}, "z": {"u": 1, "v": null}}]', "rows[1].z.v: expected number, got null"),
+        ('"rows": [{"x": {"y": NaN}}]', "rows[0].x.y: expected number, got NaN or infinity"),
+        ('"rows": [{"x": {"y": 1e999}}]', "rows[0].x.y: expected number, got NaN or infinity"),
+        ('"rows": [{"x": {"y": -Infinity}}]', "rows[0].x.y: expected number, got NaN or infinity"),
+        ('"rows": {}', "rows: expected list, got object"),
+        ('"way": "left\\n - at `$.x`"', "way: cannot be 'left"),
+    ],
+)
+def test_the_place_is_named_with_every_key(body: str, expected: str) -> None:
+    assert expected in told(of(body))
+
+
+@pytest.mark.parametrize("text", ["", "{", "\x00", "[" * 100_000, b"\xff\xfe\x00", '{"schema": "test.tree/1"'])
+def test_what_is_not_json_is_told(text: str | bytes) -> None:
+    assert "cannot be read as JSON" in told(text)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null", "{}", '{"schema": null}', '{"schema": NaN}', '{"schema": []}'])
+def test_what_has_another_schema_is_told(text: str) -> None:
+    assert "has not the schema test.tree/1" in told(text)
+
+
+def test_the_file_and_the_remedy_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "tree.json"
+    with pytest.raises(DataError, match=r"tree\.json is missing; plant one$"):
+        read(path, Tree, remedy="plant one")
+    path.write_text(of('"way": 3'))
+    with pytest.raises(OutputError, match=r"tree\.json breaks the contract test\.tree/1: way: expected .*; plant one$"):
+        read(path, Tree, remedy="plant one", error=OutputError)
+    with pytest.raises(DataError, match="cannot be read"):
+        read(tmp_path, Tree)
+
+
+def test_the_schema_of_a_file_is_told_without_reading_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "tree.json"
+    assert told_schema(path) is None
+    for text, schema in ((of('"way": 3'), schema_name(Tree)), ("[]", None), ("{", None)):
+        path.write_text(text)
+        assert told_schema(path) == schema

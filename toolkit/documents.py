@@ -1,0 +1,183 @@
+"""The toolkit's JSON documents: typed records of msgspec, written, read back and described by a JSON schema.
+
+A record is a frozen ``msgspec.Struct`` whose first field, ``schema``, is the document's name and version. Its types,
+their bounds and its ``__post_init__`` are the contract: what breaks one of them is refused on reading, with the file
+and the place in it. Fields a record does not know are passed over, for a later version may add some.
+"""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import msgspec
+
+from toolkit.errors import DataError, VislamError
+
+Record = TypeVar("Record", bound=msgspec.Struct)
+Json = dict[str, Any]
+
+# What msgspec calls a type, in JSON's words.
+_KINDS = {
+    "int": "integer",
+    "float": "number",
+    "str": "string",
+    "bool": "true or false",
+    "array": "list",
+    "_NotFinite": "NaN or infinity",
+}
+# One step of msgspec's path to a value, such as $.runs[0].metrics[...]: a field, an entry of a list, or one of an
+# object whose keys are data, which it does not name.
+_STEP = re.compile(r"\.(?P<field>\w+)|\[(?P<index>\d+)\]|\[(?P<entry>\.\.\.)\]")
+_NOT_JSON = (ValueError, RecursionError)
+_PLACED = re.compile(r"(?P<what>.*) - at (key in )?`\$(?P<path>.*)`", re.DOTALL)
+
+
+def to_text(record: msgspec.Struct) -> str:
+    """Return a record as indented JSON; raises ValueError for NaN and infinity, which are not JSON."""
+    return json.dumps(msgspec.to_builtins(record), indent=2, allow_nan=False) + "\n"
+
+
+def to_line(record: msgspec.Struct) -> str:
+    """Return a record as JSON on a single line, for long series; raises ValueError for NaN and infinity."""
+    return json.dumps(msgspec.to_builtins(record), allow_nan=False) + "\n"
+
+
+def read(
+    path: Path, record: type[Record], *, remedy: str = "make it again", error: type[VislamError] = DataError
+) -> Record:
+    """Read the record in a file.
+
+    Raises ``error`` where the file cannot be read or breaks the contract: one line with the file, the place in the
+    document, what is wrong there, and ``remedy``.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise error(f"{path} is missing; {remedy}") from None
+    except OSError as why:
+        raise error(f"{path} cannot be read ({why.strerror or why}); {remedy}") from why
+    try:
+        return parse(content, record)
+    except DataError as why:
+        raise error(f"{path} {why}; {remedy}") from why
+
+
+def parse(content: bytes | str, record: type[Record]) -> Record:
+    """Return the record in the text of a document; raises DataError, which names the place of what is wrong."""
+    try:
+        document = _decoded(content)
+    except _NOT_JSON as why:
+        raise DataError(f"cannot be read as JSON ({why})") from why
+    wanted, given = schema_name(record), _schema_of(document)
+    if given != wanted:
+        what = "it has none" if given is None else f"its schema is {given!r}"
+        raise DataError(f"has not the schema {wanted}, which this version reads: {what}")
+    try:
+        return msgspec.convert(document, record)
+    except msgspec.ValidationError as why:
+        raise DataError(f"breaks the contract {wanted}: {_in_words(why, document, record)}") from why
+
+
+def schema_name(record: type[msgspec.Struct]) -> str:
+    """Return the name and version of a record's contract, such as vislam.metrics/1."""
+    (name,) = get_args(get_type_hints(record)["schema"])
+    return str(name)
+
+
+def told_schema(path: Path) -> object:
+    """Return what a file says its schema is, or None where it is not there, not JSON or has none."""
+    try:
+        document = _decoded(path.read_bytes())
+    except (OSError, *_NOT_JSON):
+        return None
+    return _schema_of(document)
+
+
+def schema(record: type[msgspec.Struct]) -> Json:
+    """Return the JSON schema (draft 2020-12) of a record."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(record)}
+
+
+class _NotFinite:
+    """What stands in a document in place of NaN or infinity, which JSON does not have: it is of no record's type."""
+
+    def __init__(self, written: str) -> None:
+        self._written = written
+
+    def __repr__(self) -> str:
+        return self._written
+
+
+def _decoded(content: bytes | str) -> object:
+    """Return what a text in JSON holds; a place with NaN or infinity is left for the record to refuse and name."""
+    return json.loads(content, parse_constant=_NotFinite, parse_float=_number)
+
+
+def _number(written: str) -> float | _NotFinite:
+    value = float(written)
+    return value if math.isfinite(value) else _NotFinite(written)
+
+
+def _schema_of(document: object) -> object:
+    return document.get("schema") if isinstance(document, dict) else None
+
+
+def _in_words(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:
+    """Say what is wrong and where, with the keys that msgspec leaves out of its paths."""
+    what, path = _parts(why)
+    steps = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in _place(path, document, record))
+    return f"{steps.removeprefix('.') or 'the document'}: {_plain(what)}"
+
+
+def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
+    """Return what msgspec says, and the path at which: of a key, that of the object it is in."""
+    told = _PLACED.fullmatch(str(why))
+    return (told["what"], told["path"]) if told else (str(why), "")
+
+
+def _plain(what: str) -> str:
+    """Return msgspec's words with JSON's names of the types."""
+    named = re.sub(r"`([\w| ]+)`", lambda kinds: _kinds(kinds[1].split(" | ")), what)
+    for theirs, ours in (("Object missing required field", "lacks"), ("Invalid enum value", "cannot be")):
+        named = named.replace(theirs, ours)
+    return " ".join((named[:1].lower() + named[1:]).split())
+
+
+def _kinds(kinds: list[str]) -> str:
+    return " or ".join(dict.fromkeys(_KINDS.get(kind, kind) for kind in kinds if kind != "int" or "float" not in kinds))
+
+
+def _place(path: str, document: object, record: type[msgspec.Struct]) -> tuple[str | int, ...]:
+    """Return the steps to what is wrong, in which every entry of an object is named if it can be told.
+
+    Of an object's entries the wrong one is that which, alone in the object, is refused at the same path.
+    """
+    steps: list[str | int] = []
+    value: Any = document
+    for step in _STEP.finditer(path):
+        if step["entry"]:
+            key = next((key for key in value if _refused_at(path, value, key, document, record)), None)
+        else:
+            key = step["field"] or int(step["index"])
+        if key is None:
+            break
+        steps.append(key)
+        value = value[key]
+    return tuple(steps)
+
+
+def _refused_at(path: str, entries: Json, key: str, document: object, record: type[msgspec.Struct]) -> bool:
+    """Say whether the document is refused at a path with only one of some entries of it."""
+    every = dict(entries)
+    try:
+        entries.clear()
+        entries[key] = every[key]
+        msgspec.convert(document, record)
+    except msgspec.ValidationError as why:
+        return _parts(why)[1] == path
+    finally:
+        entries.clear()
+        entries.update(every)
+    return False

@@ -1,0 +1,237 @@
+"""A baseline as a file: JSON that people can read and review, the values of all seeds of a metric on one line.
+
+The contract is ``vislam.baseline/1`` (docs/gate.md). Whatever is wrong with a file is said in one line, with the place.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
+
+from toolkit import documents
+from toolkit.estimate import Output, Status
+from toolkit.gate import releases
+from toolkit.gate.baseline import Baseline, BaselineError, Bounds, Case, Criterion, Measured, Series, Values, Worse
+from toolkit.settings import changes_of, settings_of
+
+_REMEDY = "make the baseline with vislam baseline"
+
+Percent = Annotated[float, Meta(ge=0)]
+Seed = Annotated[int, Meta(ge=0)]
+MetricValues = Annotated[
+    dict[str, Values], Meta(description="by metric key, a value for each seed; null where it was not computed")
+]
+
+
+class MarginRecord(Struct, frozen=True, kw_only=True):
+    """When a metric of simulated sequences is worse."""
+
+    worse: Worse
+    margin_percent: Annotated[Percent, Meta(description="the mean worsening that nobody minds")]
+
+
+class BoundRecord(Struct, frozen=True, kw_only=True):
+    """When a metric of a recording is worse."""
+
+    worse: Worse
+    bound_percent: Annotated[Percent, Meta(description="the worsening that a single value must keep below")]
+
+
+class BoundsRecord(Struct, frozen=True, kw_only=True):
+    """What counts as worse."""
+
+    simulated: Annotated[dict[str, MarginRecord], Meta(description="by metric key")]
+    recorded: Annotated[dict[str, BoundRecord], Meta(description="by metric key")]
+    coverage_points: Annotated[float, Meta(description="percent of the frames that may be lost", ge=0)]
+    speed_ratio: Annotated[float, Meta(description="how many times slower a run may become", gt=1)]
+
+
+class SeriesRecord(Struct, frozen=True, kw_only=True):
+    """One estimator on one sequence, by seed; an output it does not give is left out."""
+
+    status: tuple[Status, ...]
+    speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
+    causal: MetricValues | UnsetType = UNSET
+    final: MetricValues | UnsetType = UNSET
+
+
+class CaseRecord(Struct, frozen=True, kw_only=True):
+    """One sequence, on which measurements it was run, and what came of it."""
+
+    source: str
+    kind: Literal["simulated", "recorded"]
+    duration_s: Annotated[float, Meta(description="how long to simulate, or where to cut", gt=0)] | None
+    truth: Annotated[str | None, Meta(description="a file beside the recording")]
+    seeds: Annotated[tuple[Seed, ...], Meta(min_length=1)]
+    hashes: Annotated[tuple[str, ...], Meta(description="of what was read under each seed")]
+    fingerprints: Annotated[tuple[str, ...], Meta(description="the same, rounded to six digits")]
+    runs: Annotated[dict[str, SeriesRecord], Meta(description="by estimator", min_length=1)]
+
+    def __post_init__(self) -> None:
+        if len(set(self.seeds)) != len(self.seeds):
+            raise ValueError("seeds names one twice")
+        columns: dict[str, tuple[object, ...]] = {"hashes": self.hashes, "fingerprints": self.fingerprints}
+        for name, run in self.runs.items():
+            columns |= {f"runs.{name}.status": run.status, f"runs.{name}.speed": run.speed}
+            for output, metrics in (("causal", run.causal), ("final", run.final)):
+                for key, values in ({} if metrics is UNSET else metrics).items():
+                    columns[f"runs.{name}.{output}.{key}"] = values
+        for place, column in columns.items():
+            if len(column) != len(self.seeds):
+                raise ValueError(f"{place} does not have an entry a seed")
+
+
+class BaselineRecord(Struct, frozen=True, kw_only=True):
+    """What was run, with which releases, what came of it, and what counts as worse."""
+
+    schema: Literal["vislam.baseline/1"]
+    made_by: Annotated[dict[str, str | int | float], Meta(description="how, when and where it was made")]
+    releases: Annotated[dict[str, str], Meta(description="what it was made with and holds for")]
+    false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
+    bounds: BoundsRecord
+    sequences: Annotated[tuple[CaseRecord, ...], Meta(min_length=1)]
+    settings: Annotated[
+        dict[str, Any], Meta(description="those of every run that are no defaults; a default that changes is measured")
+    ] = {}
+
+
+def load_baseline(path: Path) -> Baseline:
+    """Read a baseline from its file, or from a folder the one made with the releases installed here.
+
+    Raises BaselineError where there is none, or it is not one.
+    """
+    if path.is_dir():
+        return _of_these_releases(path)
+    return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+
+
+def _of_these_releases(folder: Path) -> Baseline:
+    known = {path: load_baseline(path) for path in sorted(folder.glob("*.json"))}
+    fitting = {path: one for path, one in known.items() if not releases.differences(one.releases)}
+    if len(fitting) == 1:
+        return next(iter(fitting.values()))
+    here = ", ".join(f"{name} {release}" for name, release in releases.installed().items())
+    if not fitting:
+        raise BaselineError(f"{folder}: none of {len(known)} baselines is for {here}; make one with vislam baseline")
+    raise BaselineError(f"{folder}: {', '.join(path.name for path in fitting)} are all for {here}; name one of them")
+
+
+def check_releases(baseline: Baseline, name: str) -> None:
+    """Raise BaselineError where the baseline was made with other releases than are installed."""
+    others = releases.differences(baseline.releases)
+    if others:
+        raise BaselineError(
+            f"{name}: made with {'; '.join(others)}, which alone may change results; make a baseline with these "
+            "releases, or compare all the same with --allow-other-releases"
+        )
+
+
+def to_text(baseline: Baseline) -> str:
+    """Return the document; refuses NaN and infinity, which are not JSON."""
+    return _text(to_builtins(document(baseline)), "") + "\n"
+
+
+def document(baseline: Baseline) -> BaselineRecord:
+    """Return a baseline as a record."""
+    return BaselineRecord(
+        schema="vislam.baseline/1",
+        made_by=dict(baseline.made_by),
+        releases=dict(baseline.releases),
+        false_alarm_rate=baseline.false_alarm_rate,
+        bounds=_bounds_record(baseline.bounds),
+        settings=changes_of(baseline.settings),
+        sequences=tuple(_case_record(case, measured) for case, measured in baseline.cases),
+    )
+
+
+def from_document(record: BaselineRecord) -> Baseline:
+    """Return the baseline of a record."""
+    return Baseline(
+        record.releases,
+        tuple(_case(case) for case in record.sequences),
+        _bounds(record.bounds),
+        record.false_alarm_rate,
+        {name: str(value) for name, value in record.made_by.items()},
+        settings_of(record.settings, "the baseline's settings"),
+    )
+
+
+def _bounds_record(bounds: Bounds) -> BoundsRecord:
+    return BoundsRecord(
+        simulated={k: MarginRecord(worse=c.worse, margin_percent=c.percent) for k, c in bounds.simulated.items()},
+        recorded={k: BoundRecord(worse=c.worse, bound_percent=c.percent) for k, c in bounds.recorded.items()},
+        coverage_points=bounds.coverage_points,
+        speed_ratio=bounds.speed_ratio,
+    )
+
+
+def _bounds(record: BoundsRecord) -> Bounds:
+    return Bounds(
+        {key: Criterion(one.worse, one.margin_percent) for key, one in record.simulated.items()},
+        {key: Criterion(one.worse, one.bound_percent) for key, one in record.recorded.items()},
+        record.coverage_points,
+        record.speed_ratio,
+    )
+
+
+def _case_record(case: Case, measured: Measured) -> CaseRecord:
+    return CaseRecord(
+        source=case.source,
+        kind="simulated" if case.simulated else "recorded",
+        duration_s=case.duration_s,
+        truth=case.truth,
+        seeds=case.seeds,
+        hashes=measured.hashes,
+        fingerprints=measured.fingerprints,
+        runs={name: _series_record(series) for name, series in measured.runs.items()},
+    )
+
+
+def _case(record: CaseRecord) -> tuple[Case, Measured]:
+    case = Case(
+        source=record.source,
+        simulated=record.kind == "simulated",
+        seeds=record.seeds,
+        estimators=tuple(record.runs),
+        duration_s=record.duration_s,
+        truth=record.truth,
+    )
+    runs = {name: _series(series) for name, series in record.runs.items()}
+    return case, Measured(record.hashes, record.fingerprints, runs)
+
+
+def _series_record(series: Series) -> SeriesRecord:
+    given = {output: dict(metrics) for output, metrics in series.outputs.items()}
+    return SeriesRecord(
+        status=series.status,
+        speed=series.speed,
+        causal=given.get("causal", UNSET),
+        final=given.get("final", UNSET),
+    )
+
+
+def _series(record: SeriesRecord) -> Series:
+    outputs: dict[Output, dict[str, Values]] = {}
+    if record.causal is not UNSET:
+        outputs["causal"] = record.causal
+    if record.final is not UNSET:
+        outputs["final"] = record.final
+    return Series(record.status, record.speed, outputs)
+
+
+def _text(value: object, indent: str) -> str:
+    """Return JSON in which a list of numbers or short words is one line, and of hashes a line each."""
+    inner = indent + "  "
+    if isinstance(value, Mapping):
+        entries = [f"{json.dumps(key)}: {_text(entry, inner)}" for key, entry in value.items()]
+        brackets = "{}"
+    elif isinstance(value, tuple) and any(isinstance(entry, Mapping) or len(str(entry)) > 40 for entry in value):
+        entries = [_text(entry, inner) for entry in value]
+        brackets = "[]"
+    else:
+        return json.dumps(value, allow_nan=False)
+    if not entries:
+        return brackets
+    return brackets[0] + "\n" + ",\n".join(inner + entry for entry in entries) + f"\n{indent}" + brackets[1]

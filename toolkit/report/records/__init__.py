@@ -1,0 +1,61 @@
+"""The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
+
+Reading order: metrics (one run of each estimator), seeds (many), report (what the figures draw), manifest, check.
+How they are read and written is :mod:`toolkit.documents`; :mod:`toolkit.report.records.schemas` writes docs/schemas.
+"""
+
+from pathlib import Path
+
+from toolkit.documents import read
+from toolkit.report.records.check import CheckDocument
+from toolkit.report.records.manifest import Manifest
+from toolkit.report.records.metrics import Metrics
+from toolkit.report.records.report import Report, SeedsReport
+from toolkit.report.records.seeds import Seeds
+
+__all__ = [
+    "CheckDocument",
+    "Manifest",
+    "Metrics",
+    "Report",
+    "Seeds",
+    "SeedsReport",
+    "read_check",
+    "read_manifest",
+    "read_metrics",
+    "read_report",
+    "read_seeds",
+    "read_seeds_report",
+]
+
+_REPEAT = "repeat the comparison"
+
+
+def read_metrics(path: Path) -> Metrics:
+    """Read a ``metrics.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Metrics, remedy=_REPEAT)
+
+
+def read_seeds(path: Path) -> Seeds:
+    """Read a ``seeds.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Seeds, remedy=_REPEAT)
+
+
+def read_report(path: Path) -> Report:
+    """Read the ``report.json`` of a comparison; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Report, remedy=_REPEAT)
+
+
+def read_seeds_report(path: Path) -> SeedsReport:
+    """Read a ``report.json`` over seeds; raises DataError, in one line with the place, where it is not one."""
+    return read(path, SeedsReport, remedy=_REPEAT)
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a ``manifest.json``; raises DataError, in one line with the place, where it is not one."""
+    return read(path, Manifest, remedy=_REPEAT)
+
+
+def read_check(path: Path) -> CheckDocument:
+    """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
+    return read(path, CheckDocument, remedy="repeat vislam check")

@@ -1,0 +1,105 @@
+"""``metrics.json``, the contract ``vislam.metrics/1``: scores on one sequence (docs/metrics-json.md)."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from toolkit.estimate import Output, Status
+
+# The keys every document of the contract has, whatever metrics were added since: those of its first version. A metric
+# that is added later is not entered here, for documents written before it do not have it.
+PROMISED_KEYS = (
+    "ate_none_m",
+    "ate_se3_m",
+    "ate_yaw_m",
+    "ate_sim3_m",
+    "ate_se3_deg",
+    "rpe_1s_m",
+    "rpe_1s_deg",
+    "rpe_100m_percent",
+    "kitti_t_percent",
+    "kitti_r_deg_per_m",
+    "end_drift_percent",
+    "reproj_median_px",
+    "reproj_rmse_px",
+    "heldout_reproj_median_px",
+    "heldout_reproj_rmse_px",
+    "nis_mean",
+    "nees_pose_mean",
+    "nees_ori_mean",
+    "nees_pos_mean",
+    "nees_pose_in_band_percent",
+    "coverage_percent",
+    "pairs",
+    "frame_ms_mean",
+    "frame_ms_p95",
+    "frame_ms_max",
+    "total_s",
+    "cpu_s",
+    "peak_rss_mb",
+)
+ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
+
+MotionKind = Literal["twist", "imu"]
+Motion = Annotated[MotionKind, Meta(description="body velocities or raw IMU between the frames")]
+Count = Annotated[int, Meta(ge=0)]
+# A count stays an integer when it is read and written again.
+Value = int | float | None
+Notes = Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on the value")]
+
+
+def check_promised(metrics: dict[str, object]) -> None:
+    """Raise ValueError where one of the keys is missing that every document has."""
+    missing = next((key for key in PROMISED_KEYS if key not in metrics), None)
+    if missing is not None:
+        raise ValueError(f"metrics.{missing} is missing")
+
+
+class SequenceRead(Struct, frozen=True, kw_only=True):
+    """The sequence as the estimators read it, after the audit's repairs and ``--max-frames``."""
+
+    name: Annotated[str, Meta(description="the sequence's name")]
+    hash: Annotated[str, Meta(description="SHA-256 over measurements, calibration, noise, prior and truth")]
+    frames: Annotated[Count, Meta(description="camera frames")]
+    tracks: Annotated[Count, Meta(description="different tracks, those held out included")]
+    observations: Annotated[Count, Meta(description="stereo sightings, those held out included")]
+    duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
+    path_m: Annotated[float | None, Meta(description="length of the true path meanwhile; null without truth")]
+    motion: Motion
+
+
+class AuditEntry(Struct, frozen=True, kw_only=True):
+    """A fault the audit found in the recording."""
+
+    fault: Annotated[str, Meta(description="its name, as in vislam list")]
+    count: Annotated[int, Meta(description="in the fault's own unit, named in detail")]
+    repaired: Annotated[bool, Meta(description="whether the estimators read the data without it")]
+    detail: Annotated[str, Meta(description="one sentence")]
+
+
+class ScoredRun(Struct, frozen=True, kw_only=True):
+    """One kind of output of one estimator."""
+
+    estimator: Annotated[str, Meta(description="its name, as in vislam list, or what was read from a file")]
+    output: Annotated[Output, Meta(description="what it knew at each frame, or when it had seen everything")]
+    status: Annotated[
+        Status, Meta(description="ran to a plausible end; ran to the end and left what is plausible; could not go on")
+    ]
+    metrics: Annotated[dict[str, Value], ALL_PROMISED]
+    notes: Notes
+    log: Annotated[tuple[str, ...], Meta(description="what the estimator had to recover from")]
+
+    def __post_init__(self) -> None:
+        check_promised(dict(self.metrics))
+        for key, value in self.metrics.items():
+            if value is None and not self.notes.get(key):
+                raise ValueError(f"metrics.{key} is null, and notes does not say why")
+
+
+class Metrics(Struct, frozen=True, kw_only=True):
+    """Every estimator's scores on one sequence."""
+
+    schema: Literal["vislam.metrics/1"]
+    sequence: SequenceRead
+    audit: Annotated[tuple[AuditEntry, ...], Meta(description="in the order checked; empty for a clean recording")]
+    runs: Annotated[tuple[ScoredRun, ...], Meta(description="by estimator, causal before final")]

@@ -1,0 +1,177 @@
+"""``report.json``, the contract ``vislam.report/1``: what a report draws and says beyond the scores (docs/report.md).
+
+It has two forms: of a comparison, and of one over seeds. Times ``t_s`` count from the first frame; numbers have six
+digits; what is not finite is null.
+"""
+
+from collections.abc import Sized
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+from msgspec.structs import asdict
+
+from toolkit.estimate import Output
+
+Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
+Numbers = tuple[float | None, ...]
+Vector = tuple[float, float, float]
+
+
+class _Columns(Struct, frozen=True, kw_only=True):
+    """Columns of one table: of equal length, which decoding checks."""
+
+    def __post_init__(self) -> None:
+        _check_lengths({name: column for name, column in asdict(self).items() if name != "band"})
+
+
+def _check_lengths(columns: dict[str, Sized]) -> None:
+    """Raise ValueError where columns are not as long as the first."""
+    first, *others = columns
+    for name in others:
+        if len(columns[name]) != len(columns[first]):
+            raise ValueError(f"{name} has {len(columns[name])} entries, {first} has {len(columns[first])}")
+
+
+class ErrorKind(Struct, frozen=True, kw_only=True):
+    """What the errors of this report are."""
+
+    what: Annotated[str, Meta(description="error, or the difference from whom")]
+    caption: str
+
+
+class ErrorSeries(_Columns, frozen=True, kw_only=True):
+    """Errors along the recording, after the alignment."""
+
+    t_s: Times
+    path_m: Annotated[Numbers, Meta(description="along the truth")]
+    position_m: Numbers
+    heading_deg: Numbers
+
+
+class NeesSeries(_Columns, frozen=True, kw_only=True):
+    """NEES along the recording, each over its degrees of freedom."""
+
+    t_s: Times
+    pose: Numbers
+    orientation: Numbers
+    position: Numbers
+    band: Annotated[tuple[float, float], Meta(description="95 % band of the pose")]
+
+
+class NisSeries(_Columns, frozen=True, kw_only=True):
+    """NIS of each step that reports one."""
+
+    t_s: Times
+    per_dof: Annotated[Numbers, Meta(description="over the step's degrees of freedom")]
+    low: Annotated[Numbers, Meta(description="lower end of the 95 % band for as many")]
+    high: Annotated[Numbers, Meta(description="upper end of the 95 % band for as many")]
+
+
+class DrawnRun(Struct, frozen=True, kw_only=True):
+    """One kind of output of one estimator, in the order of metrics.json."""
+
+    estimator: str
+    output: Output
+    repeats_causal: Annotated[bool, Meta(description="this final answer is the causal one, which has its own entry")]
+    trajectory: Annotated[str | None, Meta(description="its TUM file in the run directory")]
+    rotation: Annotated[tuple[Vector, Vector, Vector], Meta(description="of its alignment, rows")]
+    translation_m: Annotated[Vector, Meta(description="rotation times a position plus this is in the truth's world")]
+    errors: Annotated[ErrorSeries | None, Meta(description="null where there are none, or with the causal entry")]
+    nees: Annotated[NeesSeries | str, Meta(description="or why there is none")]
+    nis: Annotated[NisSeries | str, Meta(description="or why there is none")]
+
+
+class StepTimes(Struct, frozen=True, kw_only=True):
+    """The wall clock of an estimator's steps."""
+
+    estimator: str
+    t_s: Times
+    step_ms: Numbers
+    finish_s: float | None
+
+    def __post_init__(self) -> None:
+        _check_lengths({"t_s": self.t_s, "step_ms": self.step_ms})
+
+
+class DrawnMap(Struct, frozen=True, kw_only=True):
+    """Where an estimator's landmarks are."""
+
+    estimator: str
+    landmarks: Annotated[str, Meta(description="their file in the run directory")]
+    output: Annotated[Output, Meta(description="with whose alignment they move")]
+
+
+class AuditWords(Struct, frozen=True, kw_only=True):
+    """A fault of the recording and what became of it."""
+
+    fault: str
+    count: int
+    outcome: str
+    detail: str
+
+
+class Words(Struct, frozen=True, kw_only=True):
+    """What the report says."""
+
+    sequence: Annotated[str, Meta(description="the recording in a line")]
+    notes: tuple[str, ...]
+    remarks: tuple[str, ...]
+    start: str
+    audit: tuple[AuditWords, ...]
+    facts: tuple[str, ...]
+    changes: Annotated[dict[str, str], Meta(description="on a ladder, what each rung changes")]
+
+
+class Report(Struct, frozen=True, kw_only=True):
+    """What the report of a comparison draws and says."""
+
+    schema: Literal["vislam.report/1"]
+    start_ns: Annotated[int, Meta(description="stamp of the first frame")]
+    truth: Annotated[str | None, Meta(description="the truth while the camera ran, a TUM file in the run directory")]
+    alignment: Annotated[str, Meta(description="in words, how estimates are laid over the truth")]
+    error: Annotated[ErrorKind | None, Meta(description="null where there are no errors")]
+    runs: Annotated[tuple[DrawnRun, ...], Meta(description="one for each of metrics.json, in its order")]
+    steps: tuple[StepTimes, ...]
+    maps: tuple[DrawnMap, ...]
+    words: Words
+
+
+class MeanNeesSeries(_Columns, frozen=True, kw_only=True):
+    """Pose NEES over 6, averaged over the seeds, with its 95 % band for as many runs."""
+
+    pose: Numbers
+    low: Numbers
+    high: Numbers
+
+
+class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
+    """One kind of output of one estimator, in the order of seeds.json; its series are over the frames."""
+
+    estimator: str
+    output: Output
+    nees: MeanNeesSeries | None
+    position_rms_m: Annotated[Numbers | None, Meta(description="root mean square over the seeds, not aligned")]
+
+
+class SeedsWords(Struct, frozen=True, kw_only=True):
+    """What the report over seeds says."""
+
+    sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
+    notes: tuple[str, ...]
+    verdicts: Annotated[tuple[str, ...], Meta(description="who is too sure of itself")]
+    start: str
+
+
+class SeedsReport(Struct, frozen=True, kw_only=True):
+    """What the report of a comparison over seeds draws and says."""
+
+    schema: Literal["vislam.report/1"]
+    t_s: Annotated[Times, Meta(description="of the frames")]
+    runs: Annotated[tuple[DrawnOverSeeds, ...], Meta(description="one for each of seeds.json, in its order")]
+    words: SeedsWords
+
+    def __post_init__(self) -> None:
+        for i, run in enumerate(self.runs):
+            nees = {} if run.nees is None else {f"runs[{i}].nees.pose": run.nees.pose}
+            errors = {} if run.position_rms_m is None else {f"runs[{i}].position_rms_m": run.position_rms_m}
+            _check_lengths({"t_s": self.t_s, **nees, **errors})

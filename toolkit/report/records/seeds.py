@@ -1,0 +1,104 @@
+"""``seeds.json``, the contract ``vislam.seeds/1``: scores over many seeds (docs/metrics-json.md)."""
+
+from typing import Annotated, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from toolkit.estimate import Output, Status
+from toolkit.report.records.metrics import ALL_PROMISED, Count, Motion, Notes, Value, check_promised
+
+
+class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
+    """What the recordings of all seeds have in common."""
+
+    name: Annotated[str, Meta(description="the sequence's name")]
+    source: Annotated[str, Meta(description="as it was asked for")]
+    frames: Annotated[Count, Meta(description="camera frames")]
+    duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
+    motion: Motion
+
+
+class MetricOverSeeds(Struct, frozen=True, kw_only=True):
+    """One metric: its spread over the runs that are ok, null where there are none, and its value under each seed."""
+
+    n: Annotated[Count, Meta(description="how many runs that are ok have a value")]
+    mean: float | None
+    median: float | None
+    std: Annotated[float | None, Meta(description="with n - 1 in its divisor; null for a single value")]
+    least: float | None
+    lower_quartile: float | None
+    upper_quartile: float | None
+    most: float | None
+    values: Annotated[tuple[Value, ...], Meta(description="one a seed, whatever the run's status")]
+
+    def __post_init__(self) -> None:
+        of_any = (self.mean, self.median, self.least, self.lower_quartile, self.upper_quartile, self.most)
+        if any((value is None) != (self.n == 0) for value in of_any) or (self.std is None) != (self.n < 2):
+            raise ValueError(f"n is {self.n}, which its mean, median, std, least, most or a quartile does not fit")
+
+
+class WholeRuns(Struct, frozen=True, kw_only=True):
+    """What is taken over frames and seeds together; of the pose NEES, over 6, its mean over the seeds at each frame."""
+
+    position_rmse_m: Annotated[float | None, Meta(description="root mean square over frames and seeds, not aligned")]
+    runs: Annotated[Count, Meta(description="the most runs that have a NEES at one frame")]
+    nees_pose_band: Annotated[tuple[float, float] | None, Meta(description="95 % band of the mean of so many runs")]
+    nees_pose_in_band_percent: Annotated[float | None, Meta(description="share of the frames within their band")]
+    nees_pose_above_percent: Annotated[float | None, Meta(description="share of the frames above their band")]
+
+
+class RunOverSeeds(Struct, frozen=True, kw_only=True):
+    """One kind of output of one estimator under all seeds."""
+
+    estimator: Annotated[str, Meta(description="its name, as in vislam list")]
+    output: Annotated[Output, Meta(description="what it knew at each frame, or when it had seen everything")]
+    change: (
+        Annotated[str, Meta(description="on a ladder only: what it changes against the rung before")] | UnsetType
+    ) = UNSET
+    status: Annotated[tuple[Status, ...], Meta(description="one a seed")]
+    counts: Annotated[dict[Status, Count], Meta(description="how many seeds ended each way")]
+    metrics: Annotated[dict[str, MetricOverSeeds], ALL_PROMISED]
+    notes: Notes
+    over_seeds: WholeRuns
+
+    def __post_init__(self) -> None:
+        ends: tuple[Status, ...] = ("ok", "diverged", "failed")
+        if self.counts != {status: self.status.count(status) for status in ends}:
+            raise ValueError("counts does not count status")
+        check_promised(dict(self.metrics))
+        for key, metric in self.metrics.items():
+            if len(metric.values) != len(self.status):
+                raise ValueError(f"metrics.{key}.values does not have an entry a seed")
+            if metric.n == 0 and not self.notes.get(key):
+                raise ValueError(f"metrics.{key} has no value, and notes does not say why")
+
+
+class LogEntry(Struct, frozen=True, kw_only=True):
+    """What one run had to say."""
+
+    estimator: str
+    seed: int
+    status: Status
+    log: Annotated[tuple[str, ...], Meta(description="what the estimator had to recover from")]
+
+
+class Seeds(Struct, frozen=True, kw_only=True):
+    """Every estimator's scores over many seeds of one sequence."""
+
+    schema: Literal["vislam.seeds/1"]
+    sequence: SequenceOfSeeds
+    seeds: Annotated[tuple[int, ...], Meta(description="in order")]
+    hashes: Annotated[
+        tuple[str | None, ...], Meta(description="of what was read under each seed; null where no run lived to tell")
+    ]
+    start: Annotated[str, Meta(description="where every run started")]
+    estimators: Annotated[tuple[str, ...], Meta(description="in order")]
+    runs: Annotated[tuple[RunOverSeeds, ...], Meta(description="by estimator, causal before final")]
+    log: Annotated[tuple[LogEntry, ...], Meta(description="every run that had something to say")]
+
+    def __post_init__(self) -> None:
+        if len(self.hashes) != len(self.seeds):
+            raise ValueError("hashes does not have an entry a seed")
+        for i, run in enumerate(self.runs):
+            if len(run.status) != len(self.seeds):
+                raise ValueError(f"runs[{i}].status does not have an entry a seed")

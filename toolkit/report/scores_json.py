@@ -1,0 +1,159 @@
+"""The scores of a comparison as records: ``metrics.json`` for one seed, ``seeds.json`` for many."""
+
+import math
+
+import numpy as np
+from msgspec import UNSET
+
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.statistics import Spread
+from toolkit.metrics import describe, known_metrics
+from toolkit.report.records.metrics import AuditEntry, Metrics, ScoredRun, SequenceRead, Value
+from toolkit.report.records.seeds import LogEntry, MetricOverSeeds, RunOverSeeds, Seeds, SequenceOfSeeds, WholeRuns
+from toolkit.sequence import Sequence
+
+
+def metrics_document(comparison: Comparison) -> Metrics:
+    """Return the scores of a comparison; a value that is not finite becomes null with a note."""
+    return Metrics(
+        schema="vislam.metrics/1",
+        sequence=_sequence(comparison.sequence),
+        audit=tuple(
+            AuditEntry(fault=f.fault, count=f.count, repaired=f.repaired, detail=f.detail) for f in comparison.findings
+        ),
+        runs=tuple(_run(row) for row in comparison.rows),
+    )
+
+
+def seeds_document(over: Comparison) -> Seeds:
+    """Return the scores of a comparison over seeds."""
+    return Seeds(
+        schema="vislam.seeds/1",
+        sequence=SequenceOfSeeds(
+            name=over.name,
+            source=over.source,
+            frames=over.frames_s.size,
+            duration_s=float(over.frames_s[-1]),
+            motion=over.sequence.motion_kind,
+        ),
+        seeds=over.seeds,
+        hashes=over.hashes,
+        start=over.prior.source,
+        estimators=over.estimators,
+        runs=tuple(_run_over_seeds(group, over) for group in over.rows),
+        log=tuple(
+            LogEntry(estimator=o.estimator, seed=o.seed, status=o.status, log=o.log) for o in over.outcomes if o.log
+        ),
+    )
+
+
+def path_length_m(sequence: Sequence) -> float | None:
+    """Return the length of the true path while the camera ran, or None without truth."""
+    if sequence.truth is None:
+        return None
+    t_ns = sequence.truth.t_ns
+    during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
+    positions = sequence.truth.T_world_imu[during, :3, 3]
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def _sequence(sequence: Sequence) -> SequenceRead:
+    return SequenceRead(
+        name=sequence.name,
+        hash=sequence.content_hash(),
+        frames=sequence.frame_count,
+        tracks=int(np.unique(sequence.observations.track_id).size),
+        observations=len(sequence.observations),
+        duration_s=sequence.duration_s,
+        path_m=path_length_m(sequence),
+        motion=sequence.motion_kind,
+    )
+
+
+def _run(row: Row) -> ScoredRun:
+    given, notes = row.scores.values, dict(row.scores.notes)
+    known, counts = describe(), {metric.key for metric in known_metrics() if metric.count}
+    metrics: dict[str, Value] = {}
+    for key in (*known, *sorted(given.keys() - known.keys())):
+        value = given.get(key)
+        if value is None:
+            metrics[key] = None
+            notes.setdefault(key, "not computed")
+        elif not math.isfinite(value):
+            metrics[key] = None
+            notes[key] = f"the value is {value}, which JSON cannot hold"
+        else:
+            metrics[key] = int(value) if key in counts else float(value)
+    return ScoredRun(
+        estimator=row.estimator,
+        output=row.output,
+        status=row.status,
+        metrics=metrics,
+        notes={key: notes[key] for key in sorted(notes)},
+        log=tuple(row.run.log),
+    )
+
+
+def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
+    spreads = {key: group.spread(key) for key in describe()}
+    return RunOverSeeds(
+        estimator=group.estimator,
+        output=group.output,
+        change=over.changes.get(group.estimator, UNSET),
+        status=tuple(outcome.status for outcome in group.outcomes),
+        counts=dict(group.counts),
+        metrics={key: _metric(spread, tuple(group.values(key))) for key, spread in spreads.items()},
+        notes={key: group.reason(key) for key, spread in spreads.items() if spread is None},
+        over_seeds=_whole_runs(group),
+    )
+
+
+def _metric(spread: Spread | None, values: tuple[Value, ...]) -> MetricOverSeeds:
+    if spread is None:
+        return MetricOverSeeds(
+            n=0,
+            mean=None,
+            median=None,
+            std=None,
+            least=None,
+            lower_quartile=None,
+            upper_quartile=None,
+            most=None,
+            values=values,
+        )
+    return MetricOverSeeds(
+        n=spread.n,
+        mean=spread.mean,
+        median=spread.median,
+        std=spread.std,
+        least=spread.least,
+        lower_quartile=spread.lower_quartile,
+        upper_quartile=spread.upper_quartile,
+        most=spread.most,
+        values=values,
+    )
+
+
+def _whole_runs(group: Row) -> WholeRuns:
+    """Return the RMSE over frames and seeds, not aligned, and the NEES averaged over the seeds at each frame.
+
+    The band is that of the largest number of runs any frame has.
+    """
+    nees, errors_m = group.mean_nees, group.position_m
+    position_rmse_m = None if errors_m is None else float(np.sqrt(np.nanmean(errors_m**2)))
+    if nees is None:
+        return WholeRuns(
+            position_rmse_m=position_rmse_m,
+            runs=0,
+            nees_pose_band=None,
+            nees_pose_in_band_percent=None,
+            nees_pose_above_percent=None,
+        )
+    most = int(nees.runs.argmax())
+    return WholeRuns(
+        position_rmse_m=position_rmse_m,
+        runs=int(nees.runs[most]),
+        nees_pose_band=(float(nees.low[most]), float(nees.high[most])),
+        nees_pose_in_band_percent=nees.in_band_percent,
+        nees_pose_above_percent=nees.too_sure_percent,
+    )
