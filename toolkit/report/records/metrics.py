@@ -6,11 +6,10 @@ from msgspec import Meta, Struct
 
 from toolkit.estimate import Output, Status
 
-# The keys every document of the contract has, whatever metrics were added since: those of its first version. A metric
-# that is added later is not entered here, for documents written before it do not have it.
+# The keys every document of the contract has, whatever metrics were added since: those of its first version, as the
+# metric files say.
 from toolkit.metrics import contract_keys
 
-# The keys that every document has, as the metric files say.
 PROMISED_KEYS = contract_keys()
 ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
 
