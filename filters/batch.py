@@ -8,12 +8,11 @@ mapped along that, for a start that has run off, dead-reckoned or too sure of it
 import gtsam
 import numpy as np
 
-from filters.kalman.known_pose_mapping import MapAlong
+from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.smoothing.covariance_recovery import with_covariances
-from filters.smoothing.landmarks import restricted, worth_smoothing
-from filters.smoothing.robust import seen_ids, solve_in_stages
+from filters.smoothing.robust import seen_ids, solve_robustly, worth_smoothing
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
@@ -34,11 +33,11 @@ class Batch:
     """Remembers every packet and solves for all of them in the end."""
 
     def __init__(self, setup: Setup) -> None:
-        self._rig = setup.rig
+        self._rig, self._outliers = setup.rig, setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
-        self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates(), WindowSize(CLONES[setup.motion_kind]))
-        self._map = MapAlong(setup.rig)
+        self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates())
+        self._map = KnownPoseMapper(setup.rig, self._outliers.gate_probability)
         self._packets: list[Packet] = []
         self._estimates: list[Estimate] = []
 
@@ -46,15 +45,16 @@ class Batch:
         """Remember the packet and carry the causal pass on; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
-        self._map.see(packet.frame, self._estimates[-1].T_world_imu)
+        self._map.add(packet.frame, self._estimates[-1].T_world_imu)
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, and for the covariance of every state."""
         known = self._map.landmarks()
         shown = [packet.frame for packet in self._packets]
         track_ids = worth_smoothing(shown, known)
-        frames = [restricted(frame, np.isin(frame.track_ids, track_ids)) for frame in shown]
-        smoothed = solve_in_stages(self._motion_factors(), frames, self._rig, self._start(known, track_ids))
+        frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in shown]
+        start = self._start(known, track_ids)
+        smoothed = solve_robustly(self._motion_factors(), frames, self._rig, start, self._outliers)
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         seen = seen_ids(smoothed.frames)

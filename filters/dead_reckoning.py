@@ -1,6 +1,6 @@
 """Prediction alone: the measured motion integrated from the start, vision unused (Kang, III-A, eqs. 1-2)."""
 
-from filters.kalman.online_output import Speaker
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.models.motion import motion_model, predicted
@@ -12,7 +12,7 @@ DEFAULT = True
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Speaker(DeadReckoning(setup))
+    return OnlineOutput(DeadReckoning(setup))
 
 
 class DeadReckoning:

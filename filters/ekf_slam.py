@@ -7,7 +7,7 @@ global position and heading stay exactly unobservable (Huang, Mourikis & Roumeli
 
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.online_output import Speaker
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 30, "+ cross-covariances"
@@ -15,4 +15,4 @@ RUNG, CHANGE = 30, "+ cross-covariances"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Speaker(JointEkf(setup, AtFirstEstimates()))
+    return OnlineOutput(JointEkf(setup, AtFirstEstimates()))

@@ -15,7 +15,7 @@ from filters.kalman import iterated
 from filters.kalman.anchored import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.online_output import Speaker
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 50, "+ iterated update"
@@ -24,4 +24,4 @@ RUNG, CHANGE = 50, "+ iterated update"
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
-    return Speaker(JointEkf(setup, AtLatestEstimates(), belief, iterated.correct))
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, iterated.correct))

@@ -3,8 +3,8 @@
 import numpy as np
 
 from filters.kalman.correction import correct_landmarks
-from filters.kalman.landmarks import TrackedMap
-from filters.kalman.online_output import Speaker
+from filters.kalman.landmark_map import TrackedMap
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.models.motion import motion_model, predicted
@@ -13,7 +13,7 @@ from toolkit.sequence import Packet
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Speaker(Mapping(setup))
+    return OnlineOutput(Mapping(setup))
 
 
 class Mapping:

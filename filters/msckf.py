@@ -1,8 +1,8 @@
 """Sliding window of cloned poses tied by tracks (Mourikis & Roumeliotis 2007)."""
 
 from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.online_output import Speaker
-from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from filters.kalman.online_output import OnlineOutput
+from filters.kalman.sliding_window import SlidingWindowFilter
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 60, "+ window of past poses"
@@ -10,5 +10,4 @@ RUNG, CHANGE = 60, "+ window of past poses"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    size = WindowSize(CLONES[setup.motion_kind])
-    return Speaker(SlidingWindowFilter(setup, AtLatestEstimates(), size))
+    return OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates()))

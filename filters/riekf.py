@@ -11,7 +11,7 @@ error depend on what is estimated.
 from filters.kalman.invariant import InvariantBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
-from filters.kalman.online_output import Speaker
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians"
@@ -19,4 +19,4 @@ RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Speaker(JointEkf(setup, AtLatestEstimates(), InvariantBelief))
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), InvariantBelief))

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
-from filters.kalman.landmarks import LandmarkMap, TrackedMap
-from filters.kalman.online_output import Speaker
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap
+from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -29,7 +29,7 @@ RUNG, CHANGE = 10, "+ vision, as the report has it"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Speaker(SeedEkf(setup))
+    return OnlineOutput(SeedEkf(setup))
 
 
 class SeedEkf:

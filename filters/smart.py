@@ -13,9 +13,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from filters.smoothing.landmarks import restricted
-from filters.smoothing.outlier_check import bound_to_its_map, slipped
-from filters.smoothing.structureless import Sightings
+from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
+from filters.smoothing.structureless import RobustCamera, Sightings
 from filters.smoothing.window import Prior, Window
 from filters.smoothing.window_solver import Solution, solved, without_oldest
 from filters.smoothing.window_tracks import Tracked
@@ -28,19 +27,21 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration"
-LAG_S = 2.0
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Smart(setup, LAG_S)
+    return Smart(setup, setup.settings.window.lag_s)
 
 
 class Smart:
     """Adds a packet to the window, solves it, lets the oldest states go."""
 
     def __init__(self, setup: Setup, lag_s: float) -> None:
+        outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
+        self._camera = RobustCamera(setup.rig, outliers.smoother_huber)
+        self._outlier_check = OutlierCheck(setup.rig, outliers.gate_probability)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
         self._tracked = _nothing()
@@ -53,12 +54,12 @@ class Smart:
         """Take in one packet and say where the IMU is."""
         tracked = self._grown(packet)
         try:
-            self._solution = solved(tracked.window, self._rig)
+            self._solution = solved(tracked.window, self._camera)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
             self._complete_all()
             tracked = self._begun(packet)
-            self._solution = solved(tracked.window, self._rig)
+            self._solution = solved(tracked.window, self._camera)
         self._tracked = replace(tracked, window=self._solution.window)
         self._read(packet)
         self._shorten(packet)
@@ -75,8 +76,8 @@ class Smart:
             return self._begun(packet)
         increment = self._motion.integrate(packet.motion, self._belief.bias)
         prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
-        expected = bound_to_its_map(self._belief).predicted(prediction)
-        sound = restricted(packet.frame, ~slipped(packet.frame, points, expected, self._rig))
+        expected = relative_to_its_map(self._belief).predicted(prediction)
+        sound = self._outlier_check.without_outliers(packet.frame, points, expected)
         self._belief = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
@@ -123,7 +124,7 @@ class Smart:
         leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
         if leaving:
             self._complete(range(leaving))
-            window = without_oldest(self._tracked.window, leaving, self._rig)
+            window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
 
 

@@ -26,6 +26,8 @@ GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02
 _BLIND_VELOCITY_SIGMA, _BLIND_TILT_SIGMA = 10.0, 0.1
 # The estimators read the window's measurements again: in the start they count for a ninth.
 _INFLATION = 9.0
+# The start's own, whatever the estimators use: each frame is triangulated by itself, so its landmarks need a depth that
+# is known to half itself at a pixel of noise; and Huber's threshold is the median norm of a sound whitened residual.
 _LEAST_DISPARITY_PX = 2.0
 _HUBER = 1.5
 

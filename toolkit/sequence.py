@@ -248,6 +248,10 @@ class StereoFrame:
     track_ids: IntArray
     uvs_px: Array
 
+    def select(self, rows: BoolArray | IntArray) -> "StereoFrame":
+        """Return the frame with the sightings of a mask (N,) or an index (M,) only."""
+        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Packet:

@@ -1,1 +1,7 @@
-"""Parts of the handwritten filters: beliefs, corrections, gates. Nothing here infers with GTSAM."""
+"""Parts of the handwritten filters, in NumPy; GTSAM only preintegrates IMU samples, inside the shared models.
+
+Decoupled filters: ``landmark_map`` (one small Gaussian a landmark), ``correction``, ``gate``.
+Joint filters: ``joint`` (the belief and its covariance), ``linearisation``, ``joint_landmarks``, ``joint_ekf``; then
+``invariant``, ``anchored`` and ``iterated`` for riekf and iekf, ``multiview``, ``triangulation``, ``track_gate`` and
+``sliding_window`` for the MSCKFs. ``online_output`` makes an estimator of each.
+"""

@@ -9,35 +9,40 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.gate import STEREO_GATE, huber_weights, mahalanobis_squared
-from filters.kalman.landmarks import LandmarkMap
+from filters.kalman.gate import FrameGate
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap
+from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
+from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import StereoRig
+from toolkit.sequence import StereoFrame, StereoRig
 
 
 class PoseCorrection(NamedTuple):
-    """The corrected belief, who passed the gate (N,), and the NIS (N,) of every sighting, of three degrees each."""
+    """The corrected belief, and which sightings (N,) passed the gate."""
 
     belief: Belief
     accepted: BoolArray
-    nis: Array
 
 
-def correct_pose(belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig) -> PoseCorrection:
+def correct_pose(
+    belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate, huber_threshold: float
+) -> PoseCorrection:
     """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation.
 
-    A sighting outside the 95 % gate is left out, one that strains it is given Huber's weight.
+    A sighting outside the gate is left out; the others are weighed by Huber's loss of the norm of their residual,
+    whitened by the noise of sighting and landmark.
     """
     predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
     residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
     own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2
     nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
-    accepted = (nis < STEREO_GATE) & (predicted.depth_m > 0.0)
-    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov)), 0.0)
+    accepted = gate.accepts(nis, 3, predicted.depth_m > 0.0)
+    huber = huber_weights(mahalanobis_squared(residual_px, own_cov), huber_threshold)
+    weights = np.where(accepted, huber, 0.0)
     corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
-    return PoseCorrection(corrected, accepted, nis)
+    return PoseCorrection(corrected, accepted)
 
 
 def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:
@@ -75,10 +80,28 @@ def correct_landmarks(
     return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), predicted.depth_m)
 
 
-def correct_landmarks_gated(
-    landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig, trusted: BoolArray
+def correct_landmarks_below(
+    landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig, nis_bound: Array
 ) -> LandmarkMap:
-    """Correct the trusted (N,) landmarks whose sightings also pass the gate; leave the others as they are."""
+    """Correct those landmarks whose sightings have a NIS below a bound (N,); leave the others as they are."""
     corrected, nis, depth_m = correct_landmarks(landmarks, uvs_px, T_world_imu, pose_cov, rig)
-    accepted = trusted & (nis < STEREO_GATE) & (depth_m > 0.0)
-    return landmarks.corrected(accepted, corrected.points, corrected.covs)
+    return landmarks.corrected((nis < nis_bound) & (depth_m > 0.0), corrected.points, corrected.covs)
+
+
+class KnownPoseMapper:
+    """Maps landmarks along given poses, each by its own EKF; a sighting outside the gate corrects nothing."""
+
+    def __init__(self, rig: StereoRig, gate_probability: float) -> None:
+        self._rig, self._map = rig, TrackedMap(rig)
+        self._nis_bound = chi2_bound(3, gate_probability)
+
+    def add(self, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Correct the landmarks the frame shows again and start its new ones, seen from a pose (4, 4)."""
+        seen, uvs_px = self._map.seen_again(frame)
+        if len(seen):
+            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, self._nis_bound)
+        self._map.keep(seen, frame, T_world_imu)
+
+    def landmarks(self) -> Landmarks:
+        """Return every landmark there ever was, as last known."""
+        return self._map.landmarks()

@@ -1,31 +1,47 @@
-"""Who may speak: the chi-square gate at its 95 % quantile, and the weights of those who speak too loudly."""
+"""The chi-square gate of one frame: which innovations may correct, and what its tests add up to."""
+
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
-from toolkit.geometry import Array, IntArray
-
-GATE_QUANTILE = 0.95
-STEREO_GATE = float(chdtri(3, 1.0 - GATE_QUANTILE))
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gating import chi2_bound
 
 
-def gate_at(dof: IntArray) -> Array:
-    """Return the chi-square quantile of the gate at each number of degrees of freedom (N,)."""
-    return np.asarray(chdtri(dof, 1.0 - GATE_QUANTILE), dtype=float)
+@dataclass
+class FrameGate:
+    """Accepts innovations below the chi-square quantile of a probability and counts them.
 
+    ``nis`` and ``dof`` are sums over what was accepted, ``tested`` and ``accepted`` numbers of innovations, and
+    ``unconverged`` the number of iterated updates that were broken off.
+    """
 
-# Huber's threshold on the norm of a whitened (uL, uR, v): the median of its chi distribution is 1.54.
-HUBER_THRESHOLD = 1.5
+    probability: float
+    nis: float = 0.0
+    dof: int = 0
+    tested: int = 0
+    accepted: int = 0
+    unconverged: int = 0
 
+    def bound(self, dof: IntArray | int) -> Array:
+        """Return the NIS that is just accepted at each number of degrees of freedom (N,)."""
+        return chi2_bound(dof, self.probability)
 
-def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
-    """Return r^T S^-1 r (N,) of residuals (N, d) with covariances (N, d, d)."""
-    solved = np.linalg.solve(covs, residuals[..., None])[..., 0]
-    distance: Array = np.einsum("ni,ni->n", residuals, solved)
-    return distance
+    def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
+        """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
+        accepted = np.asarray((nis < self.bound(dof)) & in_front)
+        self.nis += float(nis[accepted].sum())
+        self.dof += int(np.broadcast_to(dof, nis.shape)[accepted].sum())
+        self.tested += accepted.size
+        self.accepted += int(accepted.sum())
+        return accepted
 
-
-def huber_weights(distances_squared: Array) -> Array:
-    """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,)."""
-    weights: Array = np.minimum(1.0, HUBER_THRESHOLD / np.sqrt(np.maximum(distances_squared, 1e-12)))
-    return weights
+    def info(self) -> dict[str, float]:
+        """Return the figures by the names an Estimate's info has."""
+        return {
+            "nis": self.nis,
+            "nis_dof": self.dof,
+            "gate_tested": self.tested,
+            "gate_accepted": self.accepted,
+            "unconverged": self.unconverged,
+        }

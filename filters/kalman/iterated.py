@@ -14,9 +14,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from filters.kalman import joint_landmarks
-from filters.kalman.diagnostics import Innovation
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
-from filters.kalman.joint_landmarks import Seen
+from filters.kalman.joint_landmarks import LandmarkSightings
 from filters.kalman.linearisation import Linearisation
 from toolkit.geometry import Array, BoolArray
 from toolkit.sequence import StereoFrame, StereoRig
@@ -31,44 +31,44 @@ class Iterate(NamedTuple):
 
     delta: Array
     pull: Array
-    seen: Seen
+    seen: LandmarkSightings
     cost: float
 
 
-class Step(NamedTuple):
+class PullStep(NamedTuple):
     """A change of the pull (k,), and the length of what it changes in standard deviations after the update."""
 
     pull: Array
     length: float
 
 
-class Outcome(NamedTuple):
+class Iterated(NamedTuple):
     """The best correction that was found, and whether it is the most probable one."""
 
     best: Iterate
     converged: bool
 
 
-def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation) -> None:
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct everything by the landmarks of the state, every one of which the frame must show.
 
-    The gate is asked once, at the prediction. The covariance is reduced by Jacobians at the corrected estimate. An
+    The gate tests once, at the prediction. The covariance is reduced by Jacobians at the corrected estimate. An
     iteration that does not converge ends at the lowest cost it has reached; where not even the first step
-    lowered it, the frame teaches nothing.
+    lowered it, the frame corrects nothing.
     """
     if not len(joint.landmark_ids):
         return
-    seen = joint_landmarks.look(joint, frame, at, rig)
-    accepted = joint_landmarks.admitted(joint, seen, innovation)
+    seen = joint_landmarks.predicted_sightings(joint, frame, at, rig)
+    accepted = joint_landmarks.accepted(joint, seen, gate)
     measurement = Measurement(joint, frame, at, rig, accepted)
     if not measurement.rows.any():
         return
     best, converged = most_probable(measurement)
-    innovation.unconverged += not converged
+    gate.unconverged += not converged
     if converged or best.pull.any():
         joint.move(best.delta)
         H, _ = measurement.stacked(best.seen)
-        joint.learn(H, joint_landmarks.columns(joint))
+        joint.reduce_covariance(H, joint_landmarks.columns(joint))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +84,13 @@ class Measurement:
     def after(self, pull: Array) -> Iterate:
         """Return the correction of a pull (k,)."""
         delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
-        seen = joint_landmarks.look(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        seen = joint_landmarks.predicted_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[joint_landmarks.columns(self.prediction)] @ pull
         in_front = (seen.depth_m[self.rows] > 0.0).all()
         cost = float(prior + np.square(seen.residuals[self.rows]).sum()) if in_front else np.inf
         return Iterate(delta, pull, seen, cost)
 
-    def step(self, now: Iterate) -> Step:
+    def step(self, now: Iterate) -> PullStep:
         """Return the step to the minimum of the cost linearised at a correction."""
         part = joint_landmarks.columns(self.prediction)
         P = self.prediction.cov[part, part]
@@ -100,27 +100,27 @@ class Measurement:
         innovation_cov = carried @ H.T + np.eye(len(H))
         pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[part]) - now.pull
         # |step|^2 in the metric P^-1 + H^T H
-        return Step(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
+        return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
 
-    def stacked(self, seen: Seen) -> tuple[Array, Array]:
+    def stacked(self, seen: LandmarkSightings) -> tuple[Array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
-        said = joint_landmarks.spread(self.prediction, seen)
-        return said.H[self.rows].reshape(-1, said.H.shape[2]), said.residuals[self.rows].reshape(-1)
+        rows = joint_landmarks.stacked(self.prediction, seen)
+        return rows.H[self.rows].reshape(-1, rows.H.shape[2]), rows.residuals[self.rows].reshape(-1)
 
 
-def most_probable(measurement: Measurement) -> Outcome:
+def most_probable(measurement: Measurement) -> Iterated:
     """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
     part = joint_landmarks.columns(measurement.prediction)
     now = measurement.after(np.zeros(part.stop - part.start))
     for _ in range(MOST_STEPS):
         step = measurement.step(now)
         if step.length < NEGLIGIBLE_STEP:
-            return Outcome(measurement.after(now.pull + step.pull), converged=True)
+            return Iterated(measurement.after(now.pull + step.pull), converged=True)
         lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
         if lower is None:
-            return Outcome(now, converged=False)
+            return Iterated(now, converged=False)
         now = lower
-    return Outcome(now, converged=False)
+    return Iterated(now, converged=False)
 
 
 def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:

@@ -105,8 +105,8 @@ class JointBelief:
         self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
         self.move(half_gain.T @ solve_triangular(root, residual, lower=True, check_finite=False))
 
-    def learn(self, H: Array, columns: slice) -> None:
-        """Reduce the covariance by what whitened measurements with Jacobian (m, k) tell; the estimates stay."""
+    def reduce_covariance(self, H: Array, columns: slice) -> None:
+        """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
         _, half_gain = self._half_gain(H, columns)
         self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
 

@@ -10,10 +10,11 @@ from typing import Protocol
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.multiview import Sightings
+from filters.kalman.multiview import TrackSightings
+from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.triangulation import triangulate
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
@@ -26,9 +27,9 @@ class Correct(Protocol):
     """Corrects a joint belief by the landmarks of its state, every one of which the frame must show."""
 
     def __call__(
-        self, joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation, /
+        self, joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate, /
     ) -> None:
-        """Correct and say what was tested."""
+        """Correct; the gate counts what was tested."""
 
 
 class JointEkf:
@@ -45,6 +46,7 @@ class JointEkf:
         correct: Correct = joint_landmarks.correct,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
+        self._gate_probability = setup.settings.outliers.gate_probability
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
@@ -55,16 +57,16 @@ class JointEkf:
         return self._joint
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
+        """Take in one packet and return the state at its frame."""
         if packet.motion is not None:
             propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        innovation = Innovation()
+        gate = FrameGate(self._gate_probability)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        self._correct(self._joint, packet.frame, self._at, self._rig, innovation)
+        self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
-        return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())
+        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""
@@ -75,11 +77,11 @@ class JointEkf:
         """Start the tracks the state does not have from this one view of them."""
         joint = self._joint
         new = ~np.isin(frame.track_ids, joint.landmark_ids)
-        sightings = Sightings(
+        sightings = TrackSightings(
             frame.track_ids[new], frame.uvs_px[new][:, None], np.ones((int(new.sum()), 1), dtype=bool)
         )
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
         if len(points):
             linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
-            joint_landmarks.keep(joint, sightings.track_ids, points, linearised)
+            joint_landmarks.add_tracks(joint, sightings.track_ids, points, linearised)

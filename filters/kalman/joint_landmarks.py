@@ -8,16 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.diagnostics import Innovation, LandmarkMemory
-from filters.kalman.gate import STEREO_GATE, mahalanobis_squared
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
-from filters.kalman.multiview import Linearised, Sightings
+from filters.kalman.multiview import Linearised, TrackSightings
+from filters.kalman.online_output import LandmarkMemory
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
 
-class Seen(NamedTuple):
+class LandmarkSightings(NamedTuple):
     """Whitened residuals (L, 3) of the state's landmarks, Jacobians to pose (L, 3, 6) and landmark (L, 3, 3), depth."""
 
     residuals: Array
@@ -26,7 +27,7 @@ class Seen(NamedTuple):
     depth_m: Array
 
 
-class Innovations(NamedTuple):
+class StackedSightings(NamedTuple):
     """Whitened residuals (L, 3) of the state's landmarks with Jacobians (L, 3, k) to clones and landmarks."""
 
     residuals: Array
@@ -40,45 +41,45 @@ def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) 
     joint.forget_landmarks(lost)
 
 
-def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, innovation: Innovation) -> None:
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     if not len(joint.landmark_ids):
         return
-    seen = look(joint, frame, at, rig)
-    accepted = admitted(joint, seen, innovation)
-    if accepted.any():
-        said = spread(joint, seen)
-        H, residuals = said.H[accepted], said.residuals[accepted]
+    seen = predicted_sightings(joint, frame, at, rig)
+    passed = accepted(joint, seen, gate)
+    if passed.any():
+        rows = stacked(joint, seen)
+        H, residuals = rows.H[passed], rows.residuals[passed]
         joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
 
 
-def look(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> Seen:
-    """Return what the frame says of all landmarks of the state, every one of which it must show."""
+def predicted_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
+    """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
     rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    sightings = Sightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
+    sightings = TrackSightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
     newest = joint.clones[-1:]
     now = multiview.linearise(sightings, joint.points, newest, newest, rig)
     there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)
-    return Seen(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0])
+    return LandmarkSightings(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0])
 
 
-def spread(joint: JointBelief, seen: Seen) -> Innovations:
+def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:
     """Spread Jacobians to the newest clone and to each landmark over the columns of all clones and landmarks."""
     clones, count = 6 * len(joint.clones), len(seen.H_pose)
     H = np.zeros((count, 3, clones + 3 * count))
     H[:, :, clones - 6 : clones] = seen.H_pose
     own = H[:, :, clones:].reshape(count, 3, count, 3)
     own[np.arange(count), :, np.arange(count), :] = seen.H_point
-    return Innovations(seen.residuals, H)
+    return StackedSightings(seen.residuals, H)
 
 
 def columns(joint: JointBelief) -> slice:
-    """Return the columns of the error state that :class:`Innovations` speaks of."""
+    """Return the columns of the error state that :class:`StackedSightings` has."""
     return slice(joint.clone_columns.start, joint.cov.shape[0])
 
 
-def admitted(joint: JointBelief, seen: Seen, innovation: Innovation) -> BoolArray:
+def accepted(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> BoolArray:
     """Return which landmarks (L,) are in front of the camera with residuals that pass the gate, and count them.
 
     A point behind the camera has an image by the formula, which may be the measured one, but no camera sees it.
@@ -86,9 +87,7 @@ def admitted(joint: JointBelief, seen: Seen, innovation: Innovation) -> BoolArra
     H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
     predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
     nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
-    accepted = (nis < STEREO_GATE) & (seen.depth_m > 0.0)
-    innovation.add(nis, np.full(len(nis), 3), accepted)
-    return accepted
+    return gate.accepts(nis, 3, seen.depth_m > 0.0)
 
 
 def _pose_and_landmark_cov(joint: JointBelief) -> Array:
@@ -99,7 +98,7 @@ def _pose_and_landmark_cov(joint: JointBelief) -> Array:
     return np.asarray(joint.cov[rows[:, :, None], rows[:, None, :]])
 
 
-def keep(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
+def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
     """Put N tracks seen from the clones into the state, with the correlations their sightings give them.
 
     A landmark's error is that which its measurements' errors and the poses' errors give its best point:

@@ -14,16 +14,16 @@ from toolkit.models import stereo
 from toolkit.sequence import StereoRig
 
 
-class Sightings(NamedTuple):
-    """F tracks as seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px and who saw what (F, W)."""
+class TrackSightings(NamedTuple):
+    """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W)."""
 
     track_ids: IntArray
     uvs_px: Array
     seen: BoolArray
 
-    def select(self, rows: BoolArray) -> "Sightings":
+    def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return some of the tracks."""
-        return Sightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
+        return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
 
 
 class Linearised(NamedTuple):
@@ -34,8 +34,16 @@ class Linearised(NamedTuple):
     H_point: Array
     depth_m: Array
 
+    def select(self, rows: BoolArray | IntArray) -> "Linearised":
+        """Return those of some tracks."""
+        return Linearised(*[array[rows] for array in self])
 
-def linearise(sightings: Sightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
+    def joined(self, other: "Linearised") -> "Linearised":
+        """Return both together."""
+        return Linearised(*[np.concatenate(pair) for pair in zip(self, other, strict=True)])
+
+
+def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
     """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
@@ -58,11 +66,20 @@ def _seen_from(poses: Array, points: Array, rig: StereoRig) -> stereo.StereoPred
 
 
 class Constraints(NamedTuple):
-    """What F tracks say of the W poses alone: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
+    """What F tracks constrain the W poses by: whitened residuals (F, 3W - 3), Jacobians (F, 3W - 3, 6W), dof (F,)."""
 
     residuals: Array
     H: Array
     dof: IntArray
+
+    def select(self, rows: BoolArray | IntArray) -> "Constraints":
+        """Return those of some tracks."""
+        return Constraints(self.residuals[rows], self.H[rows], self.dof[rows])
+
+    def joined(self, other: "Constraints") -> "Constraints":
+        """Return both together."""
+        residuals, H = np.concatenate([self.residuals, other.residuals]), np.concatenate([self.H, other.H])
+        return Constraints(residuals, H, np.concatenate([self.dof, other.dof]))
 
 
 def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:

@@ -1,8 +1,10 @@
-"""Makes an estimator of a filter: its final word is what it said at every frame."""
+"""Makes an estimator of a filter, whose final answer is its online output: the estimates it gave frame by frame."""
 
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.geometry import Array, IntArray
 from toolkit.sequence import Packet
 
 
@@ -10,24 +12,39 @@ class Filter(Protocol):
     """Answers at every frame and remembers its landmarks."""
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
+        """Take in one packet and return the state at its frame."""
 
     def landmarks(self) -> Landmarks:
         """Return every landmark the filter ever had, as last known."""
 
 
-class Speaker:
-    """Remembers what a filter said."""
+class OnlineOutput:
+    """Keeps the estimates of a filter."""
 
-    def __init__(self, spoken_for: Filter) -> None:
-        self._filter = spoken_for
-        self._said: list[Estimate] = []
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
+        self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Pass the packet on and remember the answer."""
-        self._said.append(self._filter.step(packet))
-        return self._said[-1]
+        """Pass the packet on and keep the estimate."""
+        self._estimates.append(self._filter.step(packet))
+        return self._estimates[-1]
 
     def finish(self) -> Finished:
-        """Return what was said at every frame and the landmarks as last known."""
-        return Finished(Trajectory.of(self._said), self._filter.landmarks())
+        """Return the estimates of every frame and the landmarks as last known."""
+        return Finished(Trajectory.of(self._estimates), self._filter.landmarks())
+
+
+@dataclass
+class LandmarkMemory:
+    """Every landmark a filter has had, as last known."""
+
+    points: dict[int, Array] = field(default_factory=dict)
+
+    def remember(self, track_ids: IntArray, points: Array) -> None:
+        """Store landmarks (N,) at points (N, 3)."""
+        self.points.update(zip(track_ids.tolist(), points, strict=True))
+
+    def landmarks(self) -> Landmarks:
+        """Return them all."""
+        return Landmarks.of(self.points)

@@ -1,100 +1,92 @@
 """The multi-state constraint Kalman filter: a window of cloned poses, tied by tracks whose landmarks are eliminated.
 
-What it approximates: a track speaks once, when it ends or spans the window, and poses that left the window are
+What it approximates: a track corrects once, when it ends or spans the window, and poses that left the window are
 never corrected again (Mourikis & Roumeliotis 2007). With ``landmarks`` the tracks that span the window stay in
 the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator
 design for vision-aided inertial navigation").
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.multiview import Constraints, Sightings
-from filters.kalman.track_gate import FEWEST_SIGHTINGS, TrackGate
-from filters.kalman.tracks import WindowTracks
+from filters.kalman.multiview import Constraints, TrackSightings
+from filters.kalman.online_output import LandmarkMemory
+from filters.kalman.track_gate import TrackGate
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet, StereoFrame
 
-# An IMU ties poses over a second so well that tracks may take as long to speak. A measured twist is a
-# hundred times looser: a track that waits lets the pose run off, and its linearisation with it.
-CLONES = {"imu": 12, "twist": 5}
-
-
-@dataclass(frozen=True)
-class WindowSize:
-    """How many past poses are kept and how many long-lived landmarks."""
-
-    clones: int
-    landmarks: int = 0
-
 
 class SlidingWindowFilter:
-    """Propagate, clone, correct by landmarks and by finished tracks, drop the oldest pose."""
+    """Propagate, clone, correct by landmarks and by finished tracks, drop the oldest pose.
 
-    def __init__(self, setup: Setup, linearisation: Linearisation, size: WindowSize) -> None:
-        self._rig, self._size, self._at = setup.rig, size, linearisation
+    ``landmarks`` is how many long-lived landmarks the state may have.
+    """
+
+    def __init__(self, setup: Setup, linearisation: Linearisation, landmarks: int = 0) -> None:
+        self._rig, self._at = setup.rig, linearisation
+        self._gate_probability = setup.settings.outliers.gate_probability
         self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._most_clones, self._most_landmarks = self._motion.clones(setup.settings.window), landmarks
         self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks = WindowTracks()
         self._memory = LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
+        """Take in one packet and return the state at its frame."""
         if packet.motion is not None:
             propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        innovation = Innovation()
+        gate = FrameGate(self._gate_probability)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, innovation)
+        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._tracks.add_frame(_without(packet.frame, self._joint))
-        self._correct_by_tracks(innovation)
-        if len(self._joint.clones) > self._size.clones:
+        self._correct_by_tracks(gate)
+        if len(self._joint.clones) > self._most_clones:
             self._forget_oldest_clone()
-        return self._joint.core.estimate(packet.frame.t_ns, **innovation.info())
+        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
         """Return every landmark that was ever triangulated, as last known."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
-    def _correct_by_tracks(self, innovation: Innovation) -> None:
-        """Let the tracks that ended speak, and those that span a full window, for its oldest pose leaves next.
+    def _correct_by_tracks(self, gate: FrameGate) -> None:
+        """Correct by the tracks that ended, and by those that span a full window, for its oldest pose leaves next.
 
         All at once, unless there is room for landmarks: what a landmark is linearised at for life is triangulated
         after the window has been corrected by the others.
         """
-        speaking = self._tracks.ended()
-        full = len(self._joint.clones) > self._size.clones
+        used = self._tracks.ended()
+        full = len(self._joint.clones) > self._most_clones
         if full and not self._room:
-            speaking = speaking | self._tracks.spanning()
-        self._speak(self._tracks.take(speaking), innovation)
+            used = used | self._tracks.spanning()
+        self._correct_by(self._tracks.take(used), gate)
         if full and self._room:
-            self._speak(self._tracks.take(self._tracks.spanning()), innovation)
+            self._correct_by(self._tracks.take(self._tracks.spanning()), gate)
 
     @property
     def _room(self) -> int:
-        return max(self._size.landmarks - len(self._joint.landmark_ids), 0)
+        return max(self._most_landmarks - len(self._joint.landmark_ids), 0)
 
-    def _speak(self, sightings: Sightings, innovation: Innovation) -> None:
-        """Correct the window by tracks; keep as many of those still seen as landmarks as there is room for."""
+    def _correct_by(self, sightings: TrackSightings, gate: FrameGate) -> None:
+        """Correct the window by tracks; add as many of those still seen as landmarks as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        heard = TrackGate(joint, self._at, self._rig).passed(sightings, innovation)
-        if not len(heard.points):
+        accepted = TrackGate(joint, self._at, self._rig).accepted(sightings, gate)
+        if not len(accepted.points):
             return
-        self._memory.remember(heard.track_ids, heard.points)
-        kept = heard.select(np.flatnonzero(heard.seen[:, -1])[: self._room])
+        self._memory.remember(accepted.track_ids, accepted.points)
+        kept = accepted.select(np.flatnonzero(accepted.seen[:, -1])[: self._room])
         if len(kept.points):
-            joint_landmarks.keep(joint, kept.track_ids, kept.points, kept.linearised)
-        H, residuals = multiview.compressed(*_stacked(heard.said))
+            joint_landmarks.add_tracks(joint, kept.track_ids, kept.points, kept.linearised)
+        H, residuals = multiview.compressed(*_stacked(accepted.constraints))
         joint.update(H, residuals, joint.clone_columns)
 
     def _forget_oldest_clone(self) -> None:
@@ -102,14 +94,57 @@ class SlidingWindowFilter:
         self._tracks.drop_column(0)
 
 
+class WindowTracks:
+    """The tracks not yet used: sightings of A tracks from the W poses of the window, one column a clone."""
+
+    def __init__(self) -> None:
+        self._ids: IntArray = np.empty(0, dtype=np.int64)
+        self._uvs_px = np.empty((0, 0, 3))
+        self._seen = np.empty((0, 0), dtype=bool)
+
+    def add_frame(self, frame: StereoFrame) -> None:
+        """Append the frame's sightings as a new column; ids unknown so far start new tracks."""
+        new = np.setdiff1d(frame.track_ids, self._ids, assume_unique=True)
+        ids = np.concatenate([self._ids, new])
+        count, window = len(ids), self._seen.shape[1] + 1
+        uvs_px, seen = np.zeros((count, window, 3)), np.zeros((count, window), dtype=bool)
+        uvs_px[: len(self._ids), :-1], seen[: len(self._ids), :-1] = self._uvs_px, self._seen
+        order = np.argsort(ids)
+        rows = order[np.searchsorted(ids, frame.track_ids, sorter=order)]
+        uvs_px[rows, -1], seen[rows, -1] = frame.uvs_px, True
+        self._ids, self._uvs_px, self._seen = ids, uvs_px, seen
+
+    def drop_column(self, column: int) -> None:
+        """Forget what was seen from one pose."""
+        self._uvs_px = np.delete(self._uvs_px, column, axis=1)
+        self._seen = np.delete(self._seen, column, axis=1)
+        self._keep(np.asarray(self._seen.any(axis=1)))
+
+    def ended(self) -> BoolArray:
+        """Say which tracks (A,) the newest pose does not see."""
+        return np.asarray(~self._seen[:, -1])
+
+    def spanning(self) -> BoolArray:
+        """Say which tracks (A,) the oldest and the newest pose see."""
+        return np.asarray(self._seen[:, 0] & self._seen[:, -1])
+
+    def take(self, rows: BoolArray) -> TrackSightings:
+        """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
+        taken = TrackSightings(self._ids[rows], self._uvs_px[rows], self._seen[rows])
+        self._keep(np.logical_not(rows))
+        return taken
+
+    def _keep(self, rows: BoolArray) -> None:
+        self._ids, self._uvs_px, self._seen = self._ids[rows], self._uvs_px[rows], self._seen[rows]
+
+
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of the state's landmarks."""
-    rows = ~np.isin(frame.track_ids, joint.landmark_ids)
-    return StereoFrame(frame.t_ns, frame.track_ids[rows], frame.uvs_px[rows])
+    return frame.select(~np.isin(frame.track_ids, joint.landmark_ids))
 
 
-def _stacked(said: Constraints) -> tuple[Array, Array]:
-    """Return the rows of all tracks that say anything, under each other."""
-    H = said.H.reshape(-1, said.H.shape[2])
-    speaks = H.any(axis=1)
-    return H[speaks], said.residuals.reshape(-1)[speaks]
+def _stacked(constraints: Constraints) -> tuple[Array, Array]:
+    """Return the rows of all tracks under each other, without those that are padding."""
+    H = constraints.H.reshape(-1, constraints.H.shape[2])
+    used = H.any(axis=1)
+    return H[used], constraints.residuals.reshape(-1)[used]

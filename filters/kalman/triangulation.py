@@ -10,14 +10,12 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.sequence import StereoRig
 
 _ITERATIONS, _FIRST_DAMPING = 6, 1e-3
-# What a track says is freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
+# A track's residuals are freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
 _RELATIVE_DECREASE = 1e-4
-# A track whose best disparity is below this tells the direction but not the depth; its linearisation is no use.
-LEAST_DISPARITY_PX = 1.0
-_LEAST_DEPTH_M = 0.1
 
 
 class _Views(NamedTuple):
@@ -47,8 +45,8 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
     """Return the points (F, 3) that fit sightings (F, W, 3) px from poses (W, 4, 4) best, and which (F,) to rely on.
 
     ``seen`` (F, W) marks the sightings, of which every track must have one. The start is the stereo triangulation
-    with the largest disparity. A point is reliable if it lies in front of every pose that saw it and had a disparity
-    worth the name.
+    with the largest disparity. A point is reliable if it lies in front of every pose that saw it and had a
+    disparity that tells its depth.
     """
     if not len(seen):
         return np.empty((0, 3)), np.empty(0, dtype=bool)
@@ -64,7 +62,7 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if not unsettled.any():
             break
-    return fit.points, wide & (fit.depth_m > _LEAST_DEPTH_M)
+    return fit.points, wide & (fit.depth_m > LEAST_DEPTH_M)
 
 
 def _nearest(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:

@@ -1,6 +1,6 @@
 """How an incremental smoother's graph grows by one packet: new factors, first values, and what they concern.
 
-Sightings of tracks that have slipped to something else are left out.
+Sightings of tracks that have gone over to another point are left out.
 """
 
 from collections.abc import Mapping
@@ -9,21 +9,16 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from filters.kalman.gate import STEREO_GATE
-from filters.kalman.landmarks import LEAST_DISPARITY_PX
-from filters.smoothing.landmarks import restricted
-from filters.smoothing.outlier_check import bound_to_its_map, slipped
+from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors
+from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame
-
-# Sightings that have not slipped but strain the filters' gate are weighed down from the gate's own bound.
-HUBER_THRESHOLD = float(np.sqrt(STEREO_GATE))
 
 
 @dataclass
@@ -41,7 +36,9 @@ class Growth:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._stereo = StereoFactors(setup.rig, gtsam.noiseModel.mEstimator.Huber.Create(HUBER_THRESHOLD))
+        self._outliers = setup.settings.outliers
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(self._outliers.smoother_huber)
+        self._stereo = StereoFactors(setup.rig, huber)
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -50,8 +47,8 @@ class Growth:
         """Return what a packet adds, the new state being predicted from the latest known."""
         grown = Grown()
         expected = self._add_state(packet, grown)
-        sound = ~slipped(packet.frame, self._points, expected, self._setup.rig)
-        self._add_sightings(restricted(packet.frame, sound), packet.index, grown)
+        check = OutlierCheck(self._setup.rig, self._outliers.gate_probability)
+        self._add_sightings(check.without_outliers(packet.frame, self._points, expected), packet.index, grown)
         return grown
 
     def solved(self, newest: Estimate, points: Mapping[int, Array]) -> None:
@@ -66,7 +63,7 @@ class Growth:
 
     def _add_state(self, packet: Packet, grown: Grown) -> Belief:
         """Add the new state; return it as expected against the map."""
-        expected = bound_to_its_map(self.belief)
+        expected = relative_to_its_map(self.belief)
         if packet.motion is None:
             grown.factors.push_back(self.motion.hold(self.belief, packet.index))
         else:
@@ -84,8 +81,8 @@ class Growth:
     def _add_sightings(self, frame: StereoFrame, k: int, grown: Grown) -> None:
         near = stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX
         known = np.array([i in self._points for i in frame.track_ids.tolist()], dtype=bool)
-        used = restricted(frame, known | near)
-        new = restricted(frame, ~known & near)
+        used = frame.select(known | near)
+        new = frame.select(~known & near)
         points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._setup.rig)
         for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
             grown.values.insert(L(track_id), point)

@@ -11,33 +11,19 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri
 
-from filters.kalman.gate import mahalanobis_squared
-from filters.smoothing.landmarks import restricted
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
-from toolkit.geometry import Array
+from toolkit.estimate import Landmarks
+from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X, kind_of
+from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.settings import Outliers
 
-
-@dataclass(frozen=True)
-class Stage:
-    """One solve of the schedule: its robust loss and when it stops."""
-
-    loss: gtsam.noiseModel.mEstimator.Base
-    stopping: Stopping
-
-
-# Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go.
-SCHEDULE = (
-    Stage(gtsam.noiseModel.mEstimator.Huber.Create(1.5), Stopping(1e-2, 20)),
-    Stage(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), Stopping(1e-3, 60)),
-)
-_LAST = Stopping(1e-4, 60)
-# A sound sighting is farther from the right solution than this once in a thousand.
-FAR_SIGHTING = float(chdtri(3, 1e-3))
+# Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go. The last solve
+# starts where these end.
+_HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,26 +35,41 @@ class Smoothed:
     frames: list[StereoFrame]
 
 
-def solve_in_stages(
-    motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame], rig: StereoRig, start: gtsam.Values
+def solve_robustly(
+    motion: gtsam.NonlinearFactorGraph,
+    frames: list[StereoFrame],
+    rig: StereoRig,
+    start: gtsam.Values,
+    outliers: Outliers,
 ) -> Smoothed:
-    """Solve the motion factors together with the frames' sightings, as the schedule says.
+    """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
     """
-    values = start
-    for stage in SCHEDULE:
-        graph = _with_sightings(motion, frames, StereoFactors(rig, stage.loss))
-        values = solve(graph, _only_seen(values, frames), stage.stopping).values
+    loss, values = gtsam.noiseModel.mEstimator, start
+    for robust, stopping in (
+        (loss.Huber.Create(outliers.batch_huber), _HUBER_STOPPING),
+        (loss.Cauchy.Create(outliers.batch_cauchy), _CAUCHY_STOPPING),
+    ):
+        graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
+        values = solve(graph, _only_seen(values, frames), stopping).values
         frames = _without_those_behind(frames, values, rig)
-    frames = [
-        restricted(frame, distance_squared < FAR_SIGHTING)
-        for frame, distance_squared, _ in _residuals(frames, values, rig)
-    ]
+    bound = chi2_bound(3, 1.0 - outliers.batch_cut_probability)
+    frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
     graph = _with_sightings(motion, frames, StereoFactors(rig))
-    solution = solve(graph, _only_seen(values, frames), _LAST)
-    return Smoothed(solution, graph, frames)
+    return Smoothed(solve(graph, _only_seen(values, frames), _LAST_STOPPING), graph, frames)
+
+
+def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:
+    """Return the ids (M,) of the known landmarks seen often and near enough."""
+    ids = np.concatenate([f.track_ids for f in frames])
+    disparities_px = np.concatenate([stereo.disparity_px(f.uvs_px) for f in frames])
+    unique_ids, row_of, counts = np.unique(ids, return_inverse=True, return_counts=True)
+    largest_px = np.full(unique_ids.size, -np.inf)
+    np.maximum.at(largest_px, row_of, disparities_px)
+    good = (counts >= FEWEST_SIGHTINGS) & (largest_px >= LEAST_DISPARITY_PX)
+    return np.intersect1d(unique_ids[good], known.track_ids, assume_unique=True)
 
 
 def seen_ids(frames: list[StereoFrame]) -> list[int]:
@@ -107,4 +108,4 @@ def _residuals(
 def _without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:
     behind = [frame.track_ids[depth_m <= 0.0] for frame, _, depth_m in _residuals(frames, values, rig)]
     dropped = np.concatenate(behind)
-    return [restricted(frame, ~np.isin(frame.track_ids, dropped)) for frame in frames]
+    return [frame.select(~np.isin(frame.track_ids, dropped)) for frame in frames]

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csc_array
 
-from filters.smoothing.graph_builder import HUBER_THRESHOLD
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
@@ -22,6 +21,14 @@ from toolkit.sequence import StereoRig
 _BEHIND_NORM = 100.0
 # Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
 _LEAST_INFORMATION_PER_M2 = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class RobustCamera:
+    """A rig, and the threshold of Huber's loss by which its whitened sightings are weighed."""
+
+    rig: StereoRig
+    huber: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +45,7 @@ class Sightings:
         return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
 
 
-class Seen(NamedTuple):
+class PointsInView(NamedTuple):
     """Where N sightings' points are: attitudes (N, 3, 3) of the IMU, the points (N, 3) there, depths (N,) m."""
 
     R_world_imu: Array
@@ -67,12 +74,12 @@ class Reduced(NamedTuple):
         return (self.root @ whitened[..., None])[..., 0]
 
 
-def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> Seen:
+def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> PointsInView:
     """Return where the points (M, 3) of sightings are, seen from their poses (K, 4, 4) of the IMU in the world."""
     T_imu_world = se3_inverse(poses)[sightings.pose]
     with np.errstate(invalid="ignore"):
         points_imu = (T_imu_world[:, :3, :3] @ points[sightings.point, :, None])[..., 0] + T_imu_world[:, :3, 3]
-        return Seen(poses[sightings.pose, :3, :3], points_imu, stereo.in_camera(points_imu, rig)[:, 2])
+        return PointsInView(poses[sightings.pose, :3, :3], points_imu, stereo.in_camera(points_imu, rig)[:, 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,39 +88,42 @@ class Vision:
 
     counts: tuple[int, int]
     sightings: Sightings
-    seen: Seen
-    rig: StereoRig
+    seen: PointsInView
+    camera: RobustCamera
 
     @classmethod
-    def at(cls, poses: Array, points: Array, sightings: Sightings, rig: StereoRig) -> "Vision":
+    def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
         """Evaluate sightings at poses of the IMU in the world and points in the world."""
-        return cls((len(poses), len(points)), sightings, seen_from(poses, points, sightings, rig), rig)
+        seen = seen_from(poses, points, sightings, camera.rig)
+        return cls((len(poses), len(points)), sightings, seen, camera)
 
     @property
     def loss(self) -> float:
         """The sum of Huber's losses of the whitened residuals, half a square each where small."""
         norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
-        beyond = HUBER_THRESHOLD * (norm - HUBER_THRESHOLD / 2)
-        return float(np.where(norm <= HUBER_THRESHOLD, 0.5 * norm**2, beyond).sum())
+        huber = self.camera.huber
+        beyond = huber * (norm - huber / 2)
+        return float(np.where(norm <= huber, 0.5 * norm**2, beyond).sum())
 
     def reduced(self) -> Reduced:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
-        weights = np.where(self.seen.in_front, np.sqrt(HUBER_THRESHOLD / np.maximum(self._norm, HUBER_THRESHOLD)), 0.0)
-        weighted = weights[:, None, None] * stereo.whitener(self.rig)
+        huber = self.camera.huber
+        weights = np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
+        weighted = weights[:, None, None] * stereo.whitener(self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
         return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
         """The points as predicted; those behind the camera from a place that has an image."""
-        in_front, somewhere = self.seen.in_front, transform(self.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
+        in_front, somewhere = self.seen.in_front, transform(self.camera.rig.T_imu_cam, np.array([0.0, 0.0, 1.0]))
         points_imu = np.where(in_front[:, None], self.seen.points_imu, somewhere)
-        return stereo.linearise(points_imu, self.seen.R_world_imu, self.rig)
+        return stereo.linearise(points_imu, self.seen.R_world_imu, self.camera.rig)
 
     @cached_property
     def _residual(self) -> Array:
         """Measured less predicted, whitened (N, 3)."""
-        return (self.sightings.uv_px - self._predicted.uv_px) @ stereo.whitener(self.rig).T
+        return (self.sightings.uv_px - self._predicted.uv_px) @ stereo.whitener(self.camera.rig).T
 
     @cached_property
     def _norm(self) -> Array:

@@ -11,9 +11,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import cholesky
 
-from filters.smoothing.structureless import Reduced, Sightings, Vision
+from filters.smoothing.structureless import Reduced, RobustCamera, Sightings, Vision
 from toolkit.geometry import Array
-from toolkit.sequence import StereoRig
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +91,9 @@ class Evaluated:
     vision: Vision
 
     @classmethod
-    def of(cls, window: Window, rig: StereoRig) -> "Evaluated":
+    def of(cls, window: Window, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
-        vision = Vision.at(window.poses, window.points, window.sightings, rig)
+        vision = Vision.at(window.poses, window.points, window.sightings, camera)
         return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
 
     @cached_property

@@ -11,11 +11,10 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from filters.smoothing.structureless import Sightings
+from filters.smoothing.structureless import RobustCamera, Sightings
 from filters.smoothing.window import Evaluated, Prior, System, Window
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
-from toolkit.sequence import StereoRig
 
 MOST_ITERATIONS = 5
 # Newton's method doubles its digits: after a step of so few sigmas of all states together the next is of a tenth of
@@ -44,17 +43,17 @@ class Solution:
         return np.asarray(half.T @ half)
 
 
-def solved(window: Window, rig: StereoRig) -> Solution:
+def solved(window: Window, camera: RobustCamera) -> Solution:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
     """
-    here, damping = Evaluated.of(window, rig), 0.0
+    here, damping = Evaluated.of(window, camera), 0.0
     if not np.isfinite(here.error):
         raise EstimatorError("the window's error is not a number; look for NaN in the measurements or the start")
     for _ in range(MOST_ITERATIONS):
         system = here.linearised()
-        step = _descent(here, system, damping, rig)
+        step = _descent(here, system, damping, camera)
         decrease, here = here.error - step.there.error, step.there
         if step.sigmas <= LAST_STEP_SIGMAS or decrease <= RELATIVE_DECREASE * here.error:
             break
@@ -65,12 +64,12 @@ def solved(window: Window, rig: StereoRig) -> Solution:
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
 
-def without_oldest(window: Window, count: int, rig: StereoRig) -> Window:
+def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
     """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
     seen = window.sightings
     spoken = np.unique(seen.point[seen.pose < count])
     told = replace(_only(window, spoken), motion=window.motion[: count + 1])
-    system, gone = Evaluated.of(told, rig).linearised(), count * window.size
+    system, gone = Evaluated.of(told, camera).linearised(), count * window.size
     root = np.linalg.cholesky(system.information[:gone, :gone])
     across = solve_triangular(root, system.information[:gone, gone:], lower=True)
     information = system.information[gone:, gone:] - across.T @ across
@@ -101,12 +100,12 @@ class _Step(NamedTuple):
     damping: float
 
 
-def _descent(here: Evaluated, system: System, damping: float, rig: StereoRig) -> _Step:
+def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _Step:
     """Return a step that costs no more, damped as far as that takes, or one of no length."""
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
-            there = Evaluated.of(_moved(here.window, system, step), rig)
+            there = Evaluated.of(_moved(here.window, system, step), camera)
             if there.error <= here.error:
                 return _Step(there, float(np.sqrt(step @ system.vector)), damping)
         except np.linalg.LinAlgError:

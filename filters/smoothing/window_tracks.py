@@ -4,12 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from filters.kalman.landmarks import LEAST_DISPARITY_PX
-from filters.smoothing.landmarks import restricted
 from filters.smoothing.structureless import Sightings, seen_from
 from filters.smoothing.window import Window
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.sequence import StereoFrame, StereoRig
 
 
@@ -27,8 +26,8 @@ class Tracked:
     def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "Tracked":
         """Add what the newest state sees: tracks known go on, new ones near enough start where stereo puts them."""
         known = np.isin(frame.track_ids, self.track_ids)
-        new = restricted(frame, ~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
-        used = restricted(frame, known | np.isin(frame.track_ids, new.track_ids))
+        new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
+        used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
         ids = np.concatenate([self.track_ids, new.track_ids])
         points = np.concatenate([self.window.points, stereo.triangulate_world(new.uvs_px, T_world_imu, rig)])
         order = np.argsort(ids)

@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.smoothing.landmarks import restricted
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
@@ -73,14 +72,14 @@ def recorded(scenario: Scenario, noise_scale: float, seed: int = SEED) -> Record
 class BatchAtTruth:
     """One Gauss-Newton step from the truth over everything, and its marginals."""
 
-    def __init__(self, recording: Recording, speaking: IntArray) -> None:
-        """Take in the prior, every motion, and every sighting of the tracks that speak (M,)."""
+    def __init__(self, recording: Recording, used: IntArray) -> None:
+        """Take in the prior, every motion, and every sighting of the tracks used (M,)."""
         self._recording = recording
         graph, values = self._motion()
         camera = StereoFactors(recording.sequence.rig)
         seen = set[int]()
         for packet in recording.sequence.packets():
-            frame = restricted(packet.frame, np.isin(packet.frame.track_ids, speaking))
+            frame = packet.frame.select(np.isin(packet.frame.track_ids, used))
             seen.update(frame.track_ids.tolist())
             for factor in camera.of(frame, packet.index):
                 graph.add(factor)

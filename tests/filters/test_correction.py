@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters.kalman import gate
 from filters.kalman.correction import correct_landmarks, correct_pose, updated_by_pose_sightings
-from filters.kalman.landmarks import LandmarkMap
+from filters.kalman.gate import FrameGate
+from filters.kalman.landmark_map import LandmarkMap
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
+from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
 from toolkit.models.imu import IMU_LAYOUT
 from toolkit.models.state import Belief, Layout
 from toolkit.models.twist import TWIST_LAYOUT
@@ -18,6 +19,7 @@ from toolkit.simulation import DRIVE
 
 RIG = DRIVE.rig
 N = 60
+PROBABILITY, HUBER = 0.95, 1.5
 # Both forms invert matrices whose condition is about 1e6 here: nine digits are left of sixteen.
 RELATIVE = 1e-9
 
@@ -108,16 +110,18 @@ def test_three_rows_with_half_the_variance_of_v_are_the_reports_four_rows(layout
 def test_pose_correction_is_that_update_with_the_weights_and_gates_it_reports():
     belief, landmarks, uvs_px = scene(TWIST_LAYOUT)
     uvs_px[::7] += 80.0
-    corrected = correct_pose(belief, landmarks, uvs_px, RIG)
+    gate = FrameGate(PROBABILITY)
+    corrected = correct_pose(belief, landmarks, uvs_px, RIG, gate, HUBER)
     assert not corrected.accepted[::7].any()
     predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
     residual_px = uvs_px - predicted.uv_px
     own_cov = RIG.cov_uv_px2 + predicted.d_uv_d_point @ landmarks.covs @ np.swapaxes(predicted.d_uv_d_point, 1, 2)
     innovation_cov = own_cov + predicted.d_uv_d_pose @ belief.cov[:6, :6] @ np.swapaxes(predicted.d_uv_d_pose, 1, 2)
     nis = np.array([r @ np.linalg.inv(S) @ r for r, S in zip(residual_px, innovation_cov, strict=True)])
-    np.testing.assert_array_equal(corrected.accepted, nis < gate.STEREO_GATE)
-    np.testing.assert_allclose(corrected.nis, nis, rtol=RELATIVE)
-    weights = gate.huber_weights(gate.mahalanobis_squared(residual_px, own_cov))
+    np.testing.assert_array_equal(corrected.accepted, nis < chi2_bound(3, PROBABILITY))
+    assert (gate.tested, gate.accepted, gate.dof) == (N, corrected.accepted.sum(), 3 * corrected.accepted.sum())
+    assert gate.nis == pytest.approx(nis[corrected.accepted].sum(), rel=RELATIVE)
+    weights = huber_weights(mahalanobis_squared(residual_px, own_cov), HUBER)
     kept = np.flatnonzero(corrected.accepted)
     noise = np.zeros((3 * kept.size, 3 * kept.size))
     for row, i in enumerate(kept):
@@ -144,30 +148,3 @@ def test_landmark_correction_is_a_kalman_update_of_each_landmark_alone(pose_know
         tolerance = RELATIVE * np.abs(P).max()
         np.testing.assert_allclose(corrected.landmarks.covs[i], expected_cov, rtol=0.0, atol=tolerance)
         assert corrected.nis[i] == pytest.approx(residual @ np.linalg.inv(innovation_cov) @ residual, rel=RELATIVE)
-
-
-def test_gate_passes_95_percent_of_gaussian_innovations():
-    rng = np.random.default_rng(4)
-    covs = np.array([correlated(3, rng) for _ in range(100_000)])
-    drawn = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.standard_normal((len(covs), 3)))
-    passed = gate.mahalanobis_squared(drawn, covs) < gate.STEREO_GATE
-    # The share of 100,000 draws has a standard error of 0.07 %: half a percent is seven of them.
-    assert passed.mean() == pytest.approx(0.95, abs=0.005)
-
-
-def test_gate_shuts_out_what_is_not_a_number():
-    distances = gate.mahalanobis_squared(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, 0.0]]), np.stack([np.eye(3)] * 2))
-    np.testing.assert_array_equal(distances < gate.STEREO_GATE, [False, True])
-
-
-def test_huber_weights_are_one_inside_the_threshold_and_fall_with_the_distance_outside():
-    distances = np.array([0.0, 0.5, 1.0, 1.0 + 1e-9, 2.0, 10.0]) * gate.HUBER_THRESHOLD
-    weights = gate.huber_weights(distances**2)
-    np.testing.assert_allclose(weights, [1.0, 1.0, 1.0, 1.0, 0.5, 0.1], atol=1e-8)
-
-
-def test_huber_weights_make_the_derivative_of_hubers_loss():
-    """w(d) d = d loss / dd, with loss = d^2 / 2 inside and k d - k^2 / 2 outside."""
-    distances, k = np.linspace(0.1, 8.0, 50), gate.HUBER_THRESHOLD
-    slope = np.where(distances <= k, distances, k)
-    np.testing.assert_allclose(gate.huber_weights(distances**2) * distances, slope, rtol=1e-12)

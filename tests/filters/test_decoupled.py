@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.decoupled import DecoupledEkf
+from filters.ekf import DecoupledEkf
 from toolkit.estimator import Setup
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate

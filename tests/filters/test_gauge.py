@@ -15,7 +15,7 @@ import pytest
 
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates
-from filters.kalman.sliding_window import CLONES, SlidingWindowFilter, WindowSize
+from filters.kalman.sliding_window import SlidingWindowFilter
 from toolkit.geometry import Array, skew
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
@@ -31,8 +31,8 @@ SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, 
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
 FILTERS = {
     "ekf-slam": JointEkf,
-    "msckf": lambda setup, at: SlidingWindowFilter(setup, at, WindowSize(CLONES[setup.motion_kind])),
-    "msckf-slam": lambda setup, at: SlidingWindowFilter(setup, at, WindowSize(CLONES[setup.motion_kind], landmarks=15)),
+    "msckf": SlidingWindowFilter,
+    "msckf-slam": lambda setup, at: SlidingWindowFilter(setup, at, landmarks=15),
 }
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
@@ -69,7 +69,7 @@ class Watched:
         return self._at.points(joint)
 
 
-class Said(NamedTuple):
+class Answers(NamedTuple):
     """What a filter said at every step: means (K, 4, 4), covariances (K, d, d), and the gauge (K, d, 4) it kept."""
 
     poses: Array
@@ -82,7 +82,7 @@ class Said(NamedTuple):
 
 
 @cache
-def run(name: str, scenario: str, at: type, recorded, *, loose: bool) -> Said:
+def run(name: str, scenario: str, at: type, recorded, *, loose: bool) -> Answers:
     recording = recorded(SCENARIOS[scenario], 1.0)
     setup = recording.setup
     first = motion_model(setup.noise, setup.gravity_world).initial_belief(setup.prior)
@@ -96,7 +96,7 @@ def run(name: str, scenario: str, at: type, recorded, *, loose: bool) -> Said:
         poses.append(estimate.T_world_imu)
         covs.append(estimate.cov)
         gauge.append(gauge_directions(watched.joint.first_core if watched.joint else first))
-    return Said(np.array(poses), np.array(covs), np.array(gauge))
+    return Answers(np.array(poses), np.array(covs), np.array(gauge))
 
 
 def loosened(prior: Prior, first: Belief) -> Prior:

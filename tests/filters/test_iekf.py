@@ -15,16 +15,18 @@ import pytest
 
 from filters.kalman import iterated, joint_landmarks
 from filters.kalman.anchored import AnchoredBelief, inverse_depth, inverse_depth_jacobian
-from filters.kalman.diagnostics import Innovation, LandmarkMemory
+from filters.kalman.gate import FrameGate
 from filters.kalman.invariant import InvariantBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates, propagate
+from filters.kalman.online_output import LandmarkMemory
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log, skew, transform
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
+from toolkit.settings import Outliers, Settings
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 AT = AtLatestEstimates()
@@ -94,9 +96,9 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
         moved = joint.displaced(delta + np.r_[change[:6], np.zeros(part.start - 6), change])
-        return measurement.stacked(joint_landmarks.look(moved, frame, AT, rig))[1]
+        return measurement.stacked(joint_landmarks.predicted_sightings(moved, frame, AT, rig))[1]
 
-    seen = joint_landmarks.look(joint.displaced(delta), frame, AT, rig)
+    seen = joint_landmarks.predicted_sightings(joint.displaced(delta), frame, AT, rig)
     H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
     H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
     expected = -numerical(residuals, part.stop - part.start)
@@ -209,13 +211,8 @@ class LagZero:
         return np.concatenate([pose, (relative[..., 0] + with_pose).reshape(-1)])
 
 
-def open_the_gate(monkeypatch) -> None:
-    monkeypatch.setattr(joint_landmarks, "STEREO_GATE", np.inf)
-
-
 @both_kinds
-def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario, monkeypatch) -> None:
-    open_the_gate(monkeypatch)
+def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario) -> None:
     joint, frame, rig = given = scene(scenario)
     smoothed = LagZero(given).solved()
     pose = smoothed.atPose3(X(0)).matrix()
@@ -223,10 +220,10 @@ def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario, monkey
     measurement = given.measurement()
     nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.clone_columns.start))
     single = joint.displaced(measurement.after(measurement.step(nothing).pull).delta)
-    innovation = Innovation()
-    iterated.correct(joint, frame, AT, rig, innovation)
+    gate = FrameGate(probability=1.0)
+    iterated.correct(joint, frame, AT, rig, gate)
 
-    assert innovation.unconverged == 0
+    assert gate.unconverged == 0
     assert np.abs(joint.points - points).max() < 1e-6
     assert np.abs(se3_log(se3_inverse(pose) @ joint.core.T_world_imu)).max() < 1e-6
     np.testing.assert_allclose(joint.clones[-1], joint.core.T_world_imu, rtol=0.0, atol=1e-12)
@@ -234,9 +231,8 @@ def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario, monkey
 
 
 @both_kinds
-def test_its_covariance_is_the_moved_predictions_and_the_sightings_at_convergence(scenario, monkeypatch) -> None:
+def test_its_covariance_is_the_moved_predictions_and_the_sightings_at_convergence(scenario) -> None:
     """``(P^-1 + H^T H)^-1`` with GTSAM's Jacobians at the corrected estimate."""
-    open_the_gate(monkeypatch)
     joint, frame, rig = given = scene(scenario)
     graph, measurement, part = LagZero(given), given.measurement(), joint_landmarks.columns(joint)
     best, _ = iterated.most_probable(measurement)
@@ -244,19 +240,19 @@ def test_its_covariance_is_the_moved_predictions_and_the_sightings_at_convergenc
     moved.move(best.delta)
     information = graph.sightings_information(moved.core.T_world_imu, moved.points)
     expected = np.linalg.inv(np.linalg.inv(moved.cov[part, part]) + information)
-    iterated.correct(joint, frame, AT, rig, Innovation())
+    iterated.correct(joint, frame, AT, rig, FrameGate(probability=1.0))
     sigma = np.sqrt(np.diag(expected))
     assert np.abs((joint.cov[part, part] - expected) / np.outer(sigma, sigma)).max() < 1e-6
     assert (sigma < 0.99 * np.sqrt(np.diag(moved.cov[part, part]))).any()
 
 
-def test_where_no_step_lowers_the_cost_the_frame_teaches_nothing(monkeypatch) -> None:
+def test_where_no_step_lowers_the_cost_the_frame_corrects_nothing(monkeypatch) -> None:
     monkeypatch.setattr(iterated, "_shortened", lambda *_: iter([]))
     joint, frame, rig = scene(FLIGHT, disturbed=0.3)
-    before, innovation = copy(joint), Innovation()
-    iterated.correct(joint, frame, AT, rig, innovation)
-    assert innovation.accepted > 0
-    assert innovation.info()["unconverged"] == 1
+    before, gate = copy(joint), FrameGate(0.95)
+    iterated.correct(joint, frame, AT, rig, gate)
+    assert gate.accepted > 0
+    assert gate.info()["unconverged"] == 1
     np.testing.assert_array_equal(joint.cov, before.cov)
     np.testing.assert_array_equal(joint.points, before.points)
     np.testing.assert_array_equal(joint.core.T_world_imu, before.core.T_world_imu)
@@ -273,11 +269,11 @@ def test_an_iteration_that_is_broken_off_ends_at_its_lowest_cost(monkeypatch) ->
 
 
 @both_kinds
-def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(scenario, monkeypatch) -> None:
+def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(scenario) -> None:
     """The gate is open and every frame shows each landmark where another one is."""
-    open_the_gate(monkeypatch)
     sequence = recording(scenario, 1.0, tracks=12)
-    setup, rng, unconverged = setup_of(sequence), np.random.default_rng(0), 0.0
+    open_gate = Settings(outliers=Outliers(gate_probability=1.0))
+    setup, rng, unconverged = replace(setup_of(sequence), settings=open_gate), np.random.default_rng(0), 0.0
     ekf = JointEkf(setup, AT, anchored(sequence.rig), iterated.correct)
     for packet in sequence.packets():
         frame = packet.frame

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from filters.isam2 import Isam2
-from filters.smoothing import incremental
+from filters.smoothing import cached_linearisation, incremental
 from filters.smoothing.cached_linearisation import MOVED, Held, contained, held_of, renewed
 from filters.smoothing.frozen_variables import Resting
 from filters.smoothing.incremental import FLUID_FRAMES, MOST_RECOVERIES, IncrementalTree
@@ -154,6 +154,8 @@ def test_what_none_of_the_last_frames_concerned_rests():
     for keys in ([X(3), L(2)], [X(4)], [X(5)]):
         resting.concerns(keys)
     assert list(resting.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
+    assert resting.all_of([X(3), L(2)])
+    assert not resting.all_of([X(3), X(4)])
 
 
 def test_a_state_at_rest_is_linearised_where_it_was_until_the_end(monkeypatch):
@@ -176,6 +178,21 @@ def test_a_state_at_rest_is_linearised_where_it_was_until_the_end(monkeypatch):
         assert not any(moved[FLUID_FRAMES + 1 :])
     final = estimator.finish().trajectory
     assert not np.allclose(final.T_world_imu[1], points[-1].atPose3(X(1)).matrix(), atol=1e-9)
+
+
+def test_a_python_factor_whose_states_rest_is_renewed_no_more(monkeypatch):
+    """With a threshold that any motion passes: the others are renewed in every frame."""
+    monkeypatch.setattr(cached_linearisation, "MOVED", 0.0)
+    sequence = simulate(replace(DRIVE, duration_s=4.0), 0)
+    estimator, before = isam2_of(sequence), dict[tuple[int, ...], Held]()
+    for packet in sequence.packets():
+        estimator.step(packet)
+        now = {held.keys: held for held in estimator._tree._held.values()}
+        kept = {keys for keys, held in before.items() if now[keys] is held}
+        # A frame puts variables to rest before it renews what does not rest.
+        assert kept == {keys for keys in before if estimator._tree._resting.all_of(keys)}
+        before = now
+    assert kept
 
 
 def isam2_of(sequence: Sequence) -> Isam2:

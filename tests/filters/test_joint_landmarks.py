@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters.kalman import iterated, joint_landmarks
-from filters.kalman.diagnostics import Innovation
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
 from toolkit.geometry import Array, transform
@@ -37,9 +37,9 @@ def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
 @pytest.mark.parametrize(("depth_m", "accepted"), [(4.0, 1), (-4.0, 0)], ids=["in front", "behind"])
 def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residual(correct, depth_m, accepted):
     """A residual of half a pixel passes the gate on either side: what differs is the side alone."""
-    joint, innovation = belief_with_a_landmark(depth_m), Innovation()
+    joint, gate = belief_with_a_landmark(depth_m), FrameGate(0.95)
     cov, point = joint.cov.copy(), joint.points.copy()
-    correct(joint, frame_of(joint, np.array([0.5, 0.0, 0.5])), AtLatestEstimates(), SEQUENCE.rig, innovation)
-    assert (innovation.tested, innovation.accepted) == (1, accepted)
+    correct(joint, frame_of(joint, np.array([0.5, 0.0, 0.5])), AtLatestEstimates(), SEQUENCE.rig, gate)
+    assert (gate.tested, gate.accepted) == (1, accepted)
     assert np.array_equal(joint.cov, cov) == (not accepted)
     assert np.array_equal(joint.points, point) == (not accepted)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from filters.kalman.landmarks import LEAST_DISPARITY_PX, LandmarkMap, TrackedMap, first_sighting
+from filters.kalman.landmark_map import LandmarkMap, TrackedMap, first_sighting
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE, simulate
 

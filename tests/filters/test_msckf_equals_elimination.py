@@ -14,14 +14,14 @@ import pytest
 from filters.kalman import joint_landmarks, multiview
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
-from filters.kalman.multiview import Linearised, Sightings
-from filters.kalman.sliding_window import SlidingWindowFilter, WindowSize
-from filters.kalman.tracks import WindowTracks
+from filters.kalman.multiview import Linearised, TrackSightings
+from filters.kalman.sliding_window import SlidingWindowFilter, WindowTracks
 from filters.kalman.triangulation import triangulate
-from filters.smoothing.landmarks import restricted
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, StereoFactors, V, X
 from toolkit.models.motion import motion_model
+from toolkit.settings import Settings
+from toolkit.settings import Window as WindowSettings
 from toolkit.simulation import DRIVE, FLIGHT
 
 CLONES = 6
@@ -33,7 +33,7 @@ class Window(NamedTuple):
     """A belief with a clone a frame and no correction yet, and what the clones saw."""
 
     joint: JointBelief
-    sightings: Sightings
+    sightings: TrackSightings
     points: Array
     linearised: Linearised
 
@@ -71,7 +71,7 @@ class GaussNewtonStep:
         seen = gtsam.NonlinearFactorGraph()
         for packet in recording.sequence.packets():
             used = np.isin(packet.frame.track_ids, window.sightings.track_ids)
-            for factor in StereoFactors(recording.sequence.rig).of(restricted(packet.frame, used), packet.index):
+            for factor in StereoFactors(recording.sequence.rig).of(packet.frame.select(used), packet.index):
                 seen.add(factor)
         linear = seen.linearize(values)
         # A factor on more than three variables is to be had from Python as a conditional only.
@@ -109,10 +109,12 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
     joint, sightings, points, linearised = window
     step = GaussNewtonStep(window, recording)
     before = joint.core, joint.clones
-    first = Linearised(*[array[:kept] for array in linearised])
-    joint_landmarks.keep(joint, sightings.track_ids[:kept], points[:kept], first)
-    said = multiview.without_landmark(linearised, sightings.seen)
-    H, residuals = multiview.compressed(said.H.reshape(-1, said.H.shape[2]), said.residuals.ravel())
+    first = linearised.select(np.arange(kept))
+    joint_landmarks.add_tracks(joint, sightings.track_ids[:kept], points[:kept], first)
+    constraints = multiview.without_landmark(linearised, sightings.seen)
+    H, residuals = multiview.compressed(
+        constraints.H.reshape(-1, constraints.H.shape[2]), constraints.residuals.ravel()
+    )
     joint.update(H, residuals, joint.clone_columns)
     mean, cov = step.of(sightings.track_ids[:kept].tolist())
     assert np.abs(moved(before, joint, points[:kept]) - mean).max() < 1e-6
@@ -128,23 +130,24 @@ def scenario_of(scenario, frames):
 
 
 # With room for every track, each sighting is used once however long the run; with none, while the window fills.
-SIZES = {"one window": (WindowSize(clones=9), 10), "every landmark kept": (WindowSize(clones=4, landmarks=10**6), 21)}
+SIZES = {"one window": (9, 0, 10), "every landmark kept": (4, 10**6, 21)}
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda s: s.name)
 @pytest.mark.parametrize("at", [AtFirstEstimates(), AtLatestEstimates()], ids=["first", "latest"])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_filter_says_what_the_batch_of_its_tracks_says(scenario, at, size, oracle):
+def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, size, oracle):
     """Errors of 1e-6 of the stated noise: the gates are open and second orders out of sight."""
-    window, frames = SIZES[size]
+    clones, landmarks, frames = SIZES[size]
     recording = oracle.recorded(scenario_of(scenario, frames), 1e-6)
-    msckf = SlidingWindowFilter(recording.setup, at, window)
+    settings = Settings(window=WindowSettings(imu_clones=clones, twist_clones=clones))
+    msckf = SlidingWindowFilter(replace(recording.setup, settings=settings), at, landmarks)
     for packet in recording.sequence.packets():
         estimate = msckf.step(packet)
         assert estimate.info["gate_accepted"] == estimate.info["gate_tested"]
-    spoke = msckf.landmarks().track_ids
-    assert len(spoke) > 20
-    mean, cov = oracle.batch(recording, spoke).state(packet.index)
+    used = msckf.landmarks().track_ids
+    assert len(used) > 20
+    mean, cov = oracle.batch(recording, used).state(packet.index)
     # The corrections are a millionth of centimetres; the second order is a millionth of that.
     assert np.abs(recording.error_of(estimate, packet.index) - mean).max() < 1e-3 * np.abs(mean).max()
     oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)

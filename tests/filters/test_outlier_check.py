@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.smoothing.outlier_check import bound_to_its_map, slipped
+from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from toolkit.geometry import se3, se3_inverse
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model, predicted
@@ -14,18 +14,18 @@ from toolkit.sequence import Packet, Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
 CLEAN = replace(DRIVE, duration_s=20.0)
-SLIPPING = replace(CLEAN, camera=replace(CLEAN.camera, outlier_rate=0.05, outlier_px=(20.0, 30.0)))
+MISMATCHED = replace(CLEAN, camera=replace(CLEAN.camera, outlier_rate=0.05, outlier_px=(20.0, 30.0)))
 
 
 def expected_states(sequence: Sequence) -> list[tuple[Packet, Belief]]:
-    """Return each packet but the first with the state its motion foretells from the truth one frame earlier."""
+    """Return each packet but the first with the state its motion predicts from the truth one frame earlier."""
     model = motion_model(sequence.noise, sequence.gravity_world)
     prior, truth, result = model.initial_belief(sequence.prior), sequence.truth, []
     for packet in list(sequence.packets())[1:]:
         k = packet.index - 1
         v_world = np.zeros(3) if truth.v_world is None else truth.v_world[k]
         before = replace(prior, T_world_imu=truth.T_world_imu[k], v_world=v_world, bias=truth.bias[k])
-        before = bound_to_its_map(before)
+        before = relative_to_its_map(before)
         result.append((packet, predicted(before, model, packet.motion)))
     return result
 
@@ -40,21 +40,23 @@ def landmarks_of(scenario: Scenario, seed: int) -> dict[int, np.ndarray]:
     return points
 
 
-def test_slips_of_twenty_pixels_are_told_from_sound_sightings():
-    """Which sightings slipped is known because their stream of randomness moves no other."""
-    sequence = simulate(SLIPPING, 3)
+def test_errors_of_twenty_pixels_are_told_from_sound_sightings():
+    """Which sightings are wrong is known because their stream of randomness moves no other."""
+    sequence = simulate(MISMATCHED, 3)
     struck = (sequence.visible.uv_px != simulate(CLEAN, 3).visible.uv_px).any(axis=1)
-    slips = set(zip(sequence.visible.frame[struck].tolist(), sequence.visible.track_id[struck].tolist(), strict=True))
+    wrong = set(zip(sequence.visible.frame[struck].tolist(), sequence.visible.track_id[struck].tolist(), strict=True))
     points, before = landmarks_of(CLEAN, 3), set[int]()
     caught = missed = accused = sound = 0
     for packet, expected in expected_states(sequence):
         ids = packet.frame.track_ids.tolist()
-        told = slipped(packet.frame, {i: points[i] for i in before & set(ids)}, expected, sequence.rig)
-        for i, is_told in zip(ids, told.tolist(), strict=True):
-            if i in before and (packet.index, i) in slips:
-                caught, missed = caught + is_told, missed + (not is_told)
+        found = OutlierCheck(sequence.rig, 0.95).outliers(
+            packet.frame, {i: points[i] for i in before & set(ids)}, expected
+        )
+        for i, is_outlier in zip(ids, found.tolist(), strict=True):
+            if i in before and (packet.index, i) in wrong:
+                caught, missed = caught + is_outlier, missed + (not is_outlier)
             elif i in before:
-                accused, sound = accused + is_told, sound + (not is_told)
+                accused, sound = accused + is_outlier, sound + (not is_outlier)
         before = set(ids)
     assert caught + missed > 200
     # Twenty pixels are ten standard deviations and more.
@@ -69,24 +71,24 @@ def test_a_wrong_state_blames_no_track(scenario):
     sequence, points = simulate(scenario, 0), landmarks_of(scenario, 0)
     packet, expected = expected_states(sequence)[2]
     beside = replace(expected, T_world_imu=expected.T_world_imu @ se3(np.eye(3), np.array([0.0, 1.0, 1.0])))
-    assert not slipped(packet.frame, points, beside, sequence.rig).any()
+    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, points, beside).any()
 
 
 def test_where_the_world_is_does_not_matter():
-    """However little is known of the pose in the world, a slip against the map stays one."""
-    sequence = simulate(SLIPPING, 3)
+    """However little is known of the pose in the world, an outlier against the map stays one."""
+    sequence = simulate(MISMATCHED, 3)
     points = landmarks_of(CLEAN, 3)
     vague = replace(sequence.prior, cov=sequence.prior.cov + 1e6 * np.eye(15))
-    told = []
+    found = []
     for start in (sequence, replace(sequence, prior=vague)):
         packet, expected = expected_states(start)[20]
-        told.append(slipped(packet.frame, points, bound_to_its_map(expected), sequence.rig))
-    np.testing.assert_array_equal(told[0], told[1])
+        found.append(OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, points, relative_to_its_map(expected)))
+    np.testing.assert_array_equal(found[0], found[1])
 
 
-def test_a_landmark_not_yet_known_has_not_slipped():
-    sequence = simulate(SLIPPING, 3)
+def test_a_sighting_of_an_unknown_landmark_is_no_outlier():
+    sequence = simulate(MISMATCHED, 3)
     packet, expected = expected_states(sequence)[0]
-    assert not slipped(packet.frame, {}, expected, sequence.rig).any()
+    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, {}, expected).any()
     moved = replace(expected, T_world_imu=se3_inverse(expected.T_world_imu))
-    assert not slipped(packet.frame, {}, moved, sequence.rig).any()
+    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, {}, moved).any()

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from filters.smart import Smart
-from filters.smoothing.structureless import HUBER_THRESHOLD, Sightings, Vision
+from filters.smoothing.structureless import RobustCamera, Sightings, Vision
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
+from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
-RIG = FLIGHT.rig
+RIG, HUBER = FLIGHT.rig, DEFAULTS.outliers.smoother_huber
+CAMERA = RobustCamera(RIG, HUBER)
 POSES, POINTS = 4, 7
 
 
@@ -50,7 +52,7 @@ def ordering(*kinds_and_counts):
     return result
 
 
-def projection_factors(seen, huber=HUBER_THRESHOLD):
+def projection_factors(seen, huber=HUBER):
     graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, gtsam.noiseModel.mEstimator.Huber.Create(huber))
     for k in range(POSES):
         rows = seen.pose == k
@@ -66,7 +68,7 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
     information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
     n = 6 * POSES
     across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
-    reduced = Vision.at(poses, points, outlying, RIG).reduced()
+    reduced = Vision.at(poses, points, outlying, CAMERA).reduced()
     # Rounding, relative to the largest entry.
     scale = np.abs(reduced.information).max()
     np.testing.assert_allclose(
@@ -78,7 +80,7 @@ def test_it_says_of_the_poses_what_gtsam_projection_factors_say_once_their_landm
 def test_its_loss_is_that_of_gtsam_projection_factors(scene):
     poses, points, seen = scene
     expected = projection_factors(seen).error(gtsam_values(poses, points))
-    assert Vision.at(poses, points, seen, RIG).loss == pytest.approx(expected, rel=1e-9)
+    assert Vision.at(poses, points, seen, CAMERA).loss == pytest.approx(expected, rel=1e-9)
 
 
 def test_point_steps_complete_the_step_of_the_whole_system(scene):
@@ -87,7 +89,7 @@ def test_point_steps_complete_the_step_of_the_whole_system(scene):
     information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
     held = information + np.eye(len(information)) * np.repeat([1.0, 0.0], [6 * POSES, 3 * POINTS])
     step = np.linalg.solve(held, vector.ravel())
-    reduced = Vision.at(poses, points, seen, RIG).reduced()
+    reduced = Vision.at(poses, points, seen, CAMERA).reduced()
     np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
 
 
@@ -106,14 +108,14 @@ def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
             factor.add(gtsam.StereoPoint2(*exact[row]), X(int(seen.pose[row])), calibration)
         graph.add(factor)
     expected = graph.linearize(gtsam_values(poses, [])).hessian(ordering((X, POSES)))[0]
-    reduced = Vision.at(poses, points, replace(seen, uv_px=exact), rig).reduced()
+    reduced = Vision.at(poses, points, replace(seen, uv_px=exact), RobustCamera(rig, HUBER)).reduced()
     # GTSAM triangulates linearly: the point is exact to rounding times the condition of that problem.
     np.testing.assert_allclose(reduced.information, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def test_global_position_and_rotation_gain_no_information(scene):
     poses, points, seen = scene
-    information = Vision.at(poses, points, seen, RIG).reduced().information
+    information = Vision.at(poses, points, seen, CAMERA).reduced().information
     rigid = np.concatenate([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
     assert np.abs(information @ rigid).max() < 1e-9 * np.abs(information).max()
 
@@ -123,9 +125,9 @@ def test_a_sighting_from_behind_says_nothing_but_costs(scene):
     behind = points.copy()
     behind[0] = transform(RIG.T_imu_cam, np.array([0.0, 0.0, -4.0]))
     others = seen.of_points(np.arange(1, POINTS))
-    one, other = (Vision.at(poses, behind, s, RIG).reduced() for s in (seen, others))
+    one, other = (Vision.at(poses, behind, s, CAMERA).reduced() for s in (seen, others))
     np.testing.assert_allclose(one.information, other.information, atol=1e-9)
-    assert Vision.at(poses, behind, seen, RIG).loss > Vision.at(poses, behind, others, RIG).loss
+    assert Vision.at(poses, behind, seen, CAMERA).loss > Vision.at(poses, behind, others, CAMERA).loss
 
 
 def blacked_out(sequence):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from filters.kalman import multiview
-from filters.kalman.diagnostics import Innovation
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates, propagate
-from filters.kalman.multiview import Sightings
+from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TrackGate
 from filters.kalman.triangulation import triangulate
 from toolkit.models import stereo
@@ -34,50 +34,49 @@ def scene():
     points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]
     uvs_px = np.stack([stereo.predict(points, T, sequence.rig).uv_px for T in joint.clones], axis=1)
     uvs_px += rng.normal(size=uvs_px.shape) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T * 0.5
-    return joint, sequence.rig, Sightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool))
+    return joint, sequence.rig, TrackSightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool))
 
 
-def slipped(sightings: Sightings, slips: dict[int, list[int]]) -> Sightings:
+def mismatched(sightings: TrackSightings, errors: dict[int, list[int]]) -> TrackSightings:
     uvs_px = sightings.uvs_px.copy()
-    for track, views in slips.items():
+    for track, views in errors.items():
         for n, view in enumerate(views):
             uvs_px[track, view] += [[40.0, 40.0, -30.0], [-35.0, -30.0, 25.0], [20.0, 60.0, 45.0]][n]
     return sightings._replace(uvs_px=uvs_px)
 
 
-def ask(scene, sightings: Sightings):
+def tested(scene, sightings: TrackSightings):
     joint, rig, _ = scene
-    innovation = Innovation()
-    heard = TrackGate(joint, AtLatestEstimates(), rig).passed(sightings, innovation)
-    return heard, innovation
+    gate = FrameGate(0.95)
+    return TrackGate(joint, AtLatestEstimates(), rig).accepted(sightings, gate), gate
 
 
 def test_sound_tracks_all_pass_as_they_are(scene):
-    heard, innovation = ask(scene, scene[2])
-    assert sorted(heard.track_ids) == list(range(TRACKS))
-    assert innovation.tested == innovation.accepted == TRACKS
-    assert (heard.said.dof == 3 * WINDOW - 3).all()
+    accepted, gate = tested(scene, scene[2])
+    assert sorted(accepted.track_ids) == list(range(TRACKS))
+    assert gate.tested == gate.accepted == TRACKS
+    assert (accepted.constraints.dof == 3 * WINDOW - 3).all()
 
 
 @pytest.mark.parametrize("view", [0, 2, WINDOW - 1])
-def test_the_slipped_sighting_is_the_one_given_up(scene, view):
-    heard, innovation = ask(scene, slipped(scene[2], {4: [view]}))
-    row = heard.track_ids.tolist().index(4)
-    assert heard.said.dof[row] == 3 * (WINDOW - 1) - 3
-    assert not heard.linearised.H_pose[row, view].any()
-    assert (innovation.tested, innovation.accepted) == (TRACKS + 1, TRACKS)
+def test_the_mismatched_sighting_is_the_one_left_out(scene, view):
+    accepted, gate = tested(scene, mismatched(scene[2], {4: [view]}))
+    row = accepted.track_ids.tolist().index(4)
+    assert accepted.constraints.dof[row] == 3 * (WINDOW - 1) - 3
+    assert not accepted.linearised.H_pose[row, view].any()
+    assert (gate.tested, gate.accepted) == (TRACKS + 1, TRACKS)
 
 
-def test_two_slips_cost_the_track(scene):
-    heard, innovation = ask(scene, slipped(scene[2], {7: [0, 3]}))
-    assert 7 not in heard.track_ids
-    assert (innovation.tested, innovation.accepted) == (TRACKS + 1, TRACKS - 1)
+def test_two_mismatches_cost_the_track(scene):
+    accepted, gate = tested(scene, mismatched(scene[2], {7: [0, 3]}))
+    assert 7 not in accepted.track_ids
+    assert (gate.tested, gate.accepted) == (TRACKS + 1, TRACKS - 1)
 
 
-def test_the_fall_foretold_is_what_leaving_the_sighting_out_brings(scene):
+def test_the_fall_predicted_is_what_leaving_the_sighting_out_brings(scene):
     """The NIS without a sighting, from the precision of all, equals that of the track linearised without it."""
     joint, rig, sightings = scene
-    bad = slipped(sightings, {4: [2]})
+    bad = mismatched(sightings, {4: [2]})
     gate = TrackGate(joint, AtLatestEstimates(), rig)
     without = bad.select(np.array([4]))._replace(seen=(np.arange(WINDOW) != 2)[None])
     points, _ = triangulate(without.uvs_px, without.seen, joint.clones, rig)
@@ -85,22 +84,22 @@ def test_the_fall_foretold_is_what_leaving_the_sighting_out_brings(scene):
     alone = multiview.linearise(without, points, joint.clones, joint.clones, rig)
 
     def nis(linearised, seen):
-        said = multiview.without_landmark(linearised, seen)
-        return float(said.residuals[0] @ gate._precision(said)[0] @ said.residuals[0])
+        constraints = multiview.without_landmark(linearised, seen)
+        return float(constraints.residuals[0] @ gate._precision(constraints)[0] @ constraints.residuals[0])
 
     assert nis(with_it, np.ones((1, WINDOW), dtype=bool)) > 50.0 * nis(alone, without.seen)
-    heard, _ = ask(scene, bad)
-    assert heard.points[heard.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
+    accepted, _ = tested(scene, bad)
+    assert accepted.points[accepted.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
 
 
-def test_a_track_seen_twice_that_disagrees_is_not_heard(scene):
+def test_a_track_seen_twice_that_disagrees_is_rejected(scene):
     twice = scene[2]._replace(seen=np.tile(np.arange(WINDOW) < 2, (TRACKS, 1)))
-    heard, _ = ask(scene, slipped(twice, {3: [1]}))
-    assert 3 not in heard.track_ids
-    assert len(heard.track_ids) == TRACKS - 1
+    accepted, _ = tested(scene, mismatched(twice, {3: [1]}))
+    assert 3 not in accepted.track_ids
+    assert len(accepted.track_ids) == TRACKS - 1
 
 
-def test_no_track_at_all_is_heard_in_silence(scene):
-    heard, innovation = ask(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
-    assert len(heard.points) == 0
-    assert innovation.tested == 0
+def test_no_track_at_all_is_no_test(scene):
+    accepted, gate = tested(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
+    assert len(accepted.points) == 0
+    assert gate.tested == 0

@@ -141,7 +141,7 @@ def _second_run(document: Document) -> Document:
         ),
         (lambda d: d["sequence"].update(frames=True), "sequence.frames: expected integer, got true or false"),
         (lambda d: d["sequence"].update(frames=-1), "sequence.frames: expected integer >= 0"),
-        (lambda d: _second_run(d).update(status="fine"), "runs[1].status: cannot be 'fine'"),
+        (lambda d: _second_run(d).update(status="fine"), "runs[1].status: cannot be 'fine', only diverged, failed, ok"),
         (lambda d: d.update(schema="vislam.metrics/2"), "its schema is 'vislam.metrics/2'"),
         (lambda d: d["audit"].append({"fault": "gap", "count": 1, "repaired": True}), "audit[0]: lacks detail"),
         (lambda d: d.pop("runs"), "the document: lacks runs"),

@@ -13,6 +13,7 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.tracks import by_track
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import Observations
 
@@ -21,8 +22,6 @@ LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
 # Share of the tracks detected in a frame. Measured: 0.96 to 1 where they are doubled, at most 0.22 in any other
 # frame of the real recordings and 0.40 in simulated ones, where few and far points begin a track.
 LEAST_SHARE, LEAST_TRACKS = 0.8, 6
-# Disparities from which a ratio means something.
-LEAST_DISPARITY_PX = 1.0
 
 
 def check(evidence: Evidence) -> Symptom | None:

@@ -15,6 +15,7 @@ from toolkit.geometry import Array, skew, so3_exp
 from toolkit.models.factors import B, V, X, joint_prior
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction
 from toolkit.sequence import ImuMotion, ImuNoise, Motion, Prior
+from toolkit.settings import Window
 
 IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)
@@ -128,6 +129,10 @@ class ImuModel:
         assert isinstance(motion, ImuMotion)
         preintegration = preintegrate(motion, bias, self._params)
         return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
+
+    def clones(self, window: Window) -> int:
+        """Return many: an IMU ties poses over a second so well that tracks may wait as long."""
+        return window.imu_clones
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose, velocity in the world (3,) and biases."""

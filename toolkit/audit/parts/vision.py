@@ -12,6 +12,7 @@ import numpy as np
 
 from toolkit.audit.parts.tracks import Neighbours, neighbours
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log, skew
+from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
@@ -22,8 +23,6 @@ ITERATIONS = 6
 LEAST_SUPPORT = 8.0
 # A residual that is this many times the scatter of its interval has half the weight.
 CAUCHY_SIGMAS = 2.0
-LEAST_DISPARITY_PX = 1.0
-LEAST_DEPTH_M = 0.1
 # Floor of an interval's squared scatter, for recordings without noise.
 LEAST_SCALE2 = 1e-6
 # Median of a chi-square variable with three degrees of freedom.

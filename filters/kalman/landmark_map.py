@@ -8,10 +8,8 @@ import numpy as np
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.sequence import StereoFrame, StereoRig
-
-# A smaller disparity leaves the depth uncertain by more than itself at a pixel of noise: wait for a better view.
-LEAST_DISPARITY_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)

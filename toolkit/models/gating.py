@@ -1,0 +1,48 @@
+"""Which sightings may inform an estimate: the tests every estimator shares, and their thresholds, each with its source.
+
+What a user may choose among them is a setting (:class:`toolkit.settings.Outliers`). Two users have constants of their
+own, so that neither moves with an estimator's: the search for a start, which triangulates each frame by itself, and
+the held-out metric, which judges all estimators alike.
+"""
+
+import numpy as np
+from scipy.special import chdtri
+
+from toolkit.geometry import Array, IntArray
+
+# At a disparity of this and a pixel of noise the depth is uncertain by as much as itself: wait for a better view.
+LEAST_DISPARITY_PX = 1.0
+# A point nearer to the camera than this is not triangulated: no lens of ours is focused there.
+LEAST_DEPTH_M = 0.1
+# A landmark that only one pose has seen ties no poses together.
+FEWEST_SIGHTINGS = 2
+# A track whose NIS is this many times the gate's bound holds a mismatch: by chance twice the 95 % quantile is exceeded
+# once in 740 tracks of three degrees of freedom (two sightings), once in 30,000 of twelve (five sightings).
+MISMATCHED_TRACK_FACTOR = 2.0
+# A smoother relinearises and weighs doubtful sightings down, so it leaves out only what no chance explains: four times
+# the 95 % quantile of three degrees of freedom is exceeded less than once in a million.
+MISMATCHED_SIGHTING_FACTOR = 4.0
+# Mismatches come one by one. Where more of the tracks than this disagree with the state, it is the state that is wrong.
+MOST_MISMATCHED = 0.5
+
+
+def chi2_bound(dof: IntArray | int, probability: float) -> Array:
+    """Return the value that chi-square variables with ``dof`` (N,) degrees of freedom stay below so often."""
+    return np.asarray(chdtri(dof, 1.0 - probability), dtype=float)
+
+
+def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
+    """Return r^T S^-1 r (N,) of residuals (N, d) with covariances (N, d, d)."""
+    solved = np.linalg.solve(covs, residuals[..., None])[..., 0]
+    distance: Array = np.einsum("ni,ni->n", residuals, solved)
+    return distance
+
+
+def huber_weights(distances_squared: Array, threshold: float) -> Array:
+    """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,).
+
+    A whitened (uL, uR, v) has a norm of 1.54 in the median (chi distribution): a threshold of 1.5 weighs down the
+    larger half of sound sightings a little and a mismatch in inverse proportion to its norm.
+    """
+    weights: Array = np.minimum(1.0, threshold / np.sqrt(np.maximum(distances_squared, 1e-12)))
+    return weights
