@@ -1,0 +1,245 @@
+"""Comparisons within a program say what the command line says, from a script, a notebook or standard input."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import toolkit
+from toolkit.api import Result
+from toolkit.audit import faults
+from toolkit.datasets import load_sequence
+from toolkit.errors import VislamError
+from toolkit.estimator import LADDER, defaults, find
+from toolkit.metrics import describe
+from toolkit.report.table import comparison_table
+
+FRAMES = 20
+RECORDING = Path(__file__).parents[1] / "data" / "drive_small"
+
+# A comparison in two processes, and what a reader would do with it; the same program in three surroundings.
+PROGRAM = textwrap.dedent(f"""
+    import toolkit
+    from toolkit.estimator import find
+
+    def build(setup):
+        return find("dead-reckoning").load()(setup)
+
+    r = toolkit.compare("drive", ["dead-reckoning"], own={{"mine": build}}, max_frames={FRAMES}, seeds=2, workers=2)
+    mine, other = (r.metrics[name, "final"]["ate_se3_m"] for name in ("mine", "dead-reckoning"))
+    print("metrics agree:", mine == other)
+    print(r)
+""")
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return toolkit.compare("drive", ["dead-reckoning", "ekf"], max_frames=FRAMES, workers=1)
+
+
+@pytest.fixture(scope="module")
+def over() -> Result:
+    return toolkit.compare("drive", "dead-reckoning", max_frames=FRAMES, seed=4, seeds=2, workers=1)
+
+
+def ate(result: Result) -> list[float | None]:
+    return [row.value("ate_se3_m") for row in result.comparison.rows]
+
+
+def test_a_sequence_and_its_name_give_the_same(result: Result) -> None:
+    again = toolkit.compare(load_sequence("drive"), ["dead-reckoning", "ekf"], max_frames=FRAMES, workers=1)
+    assert ate(again) == ate(result)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_recording_and_its_truth_are_paths_or_strings(
+    tmp_path: Path, result: Result, kind: Callable[[Path], str | Path]
+) -> None:
+    result.save(tmp_path / "run")
+    truth = tmp_path / "run/trajectories/truth.tum"
+    compared = toolkit.compare(kind(RECORDING), "dead-reckoning", truth=kind(truth), max_frames=FRAMES)
+    assert compared.comparison.sequence.truth is not None
+    np.testing.assert_array_equal(compared.comparison.sequence.truth.t_ns, np.array(_stamps(truth)))
+
+
+def _stamps(tum: Path) -> list[int]:
+    lines = (line for line in tum.read_text().splitlines() if not line.startswith("#"))
+    return [int(line.split()[0].replace(".", "")) for line in lines]
+
+
+@pytest.mark.parametrize(
+    "names", ["ekf", ["ekf"], ("ekf",), iter(["ekf"])], ids=["a name", "list", "tuple", "iterator"]
+)
+def test_estimators_are_one_name_or_several(result: Result, names: str | Iterable[str]) -> None:
+    alone = toolkit.compare("drive", names, max_frames=FRAMES)
+    assert alone.comparison.estimators == ("ekf",)
+    assert ate(alone) == ate(result)[2:]
+
+
+def test_without_names_the_default_estimators_are_compared() -> None:
+    assert toolkit.compare("drive", max_frames=3, workers=1).comparison.estimators == defaults() != ()
+
+
+def test_an_estimator_that_is_no_file_is_compared_under_its_own_name(result: Result) -> None:
+    with_own = toolkit.compare(
+        "drive", "ekf", own={"mine": find("dead-reckoning").load()}, max_frames=FRAMES, workers=1
+    )
+    assert list(with_own.runs) == ["ekf", "mine"]
+    assert with_own.metrics["mine", "final"]["ate_se3_m"] == result.metrics["dead-reckoning", "final"]["ate_se3_m"]
+    assert list(toolkit.compare("drive", own=own, max_frames=FRAMES).runs) == ["mine"]
+
+
+def test_faults_that_are_kept_are_not_repaired() -> None:
+    drive = load_sequence("drive")
+    uv_px = drive.observations.uv_px.copy()
+    uv_px[::97, 1] = uv_px[::97, 0]  # no disparity
+    faulty = replace(drive, observations=replace(drive.observations, uv_px=uv_px))
+    found = [toolkit.compare(faulty, [], keep=keep, max_frames=FRAMES).comparison.findings for keep in ((), faults())]
+    assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
+
+
+def test_only_the_ladder_tells_what_its_rungs_change(result: Result) -> None:
+    assert not result.comparison.changes
+    assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
+
+
+def test_a_table_has_the_columns_asked_for_in_their_order_by_key_or_name(result: Result) -> None:
+    whole, chosen = comparison_table(result.comparison), result.table("nis_mean", "ATE SE(3)").table
+    assert [heading[:2] for heading in chosen.headings[whole.labels :]] == [("NIS", "mean"), ("ATE", "SE(3)")]
+    at = [heading[:2] for heading in whole.headings].index(("ATE", "SE(3)"))
+    assert [row[-1] for row in chosen.rows] == [row[at] for row in whole.rows]
+    assert len(result.table("all").table.headings) > len(whole.headings)
+
+
+def test_an_unknown_column_is_refused(result: Result) -> None:
+    with pytest.raises(VislamError, match=r"no column is called ate_se3 \(did you mean ate_se3_m\?\)"):
+        result.table("ate_se3")
+
+
+def test_a_table_is_text_and_markdown(result: Result) -> None:
+    shown = result.table("ATE SE(3)")
+    assert " ATE SE(3) [m] |" in shown._repr_markdown_()
+    assert "dead-reckoning" in str(shown)
+    assert repr(shown) == str(shown)
+
+
+def test_a_result_shows_its_table(result: Result, over: Result) -> None:
+    for one, title in ((result, "drive"), (over, "drive, 2 seeds")):
+        assert repr(one) == f"{title}\n{one.table()}"
+        assert one._repr_markdown_() == one.table()._repr_markdown_()
+        assert max(map(len, repr(one).splitlines())) <= 100
+
+
+def test_figures_come_by_name(result: Result, over: Result) -> None:
+    assert {"top_all", "top_ekf", "errors_over_time"} <= result.figures.keys()
+    assert set(over.figures) == {"errors_over_seeds", "nees_over_seeds"}
+    assert all(isinstance(figure, Figure) for figure in over.figures.values())
+    assert result.figures["top_all"] is result.figures["top_all"]
+
+
+def test_metrics_are_those_of_the_rows_and_of_the_mean_over_seeds(result: Result, over: Result) -> None:
+    assert list(result.metrics) == [(row.estimator, row.output) for row in result.comparison.rows]
+    assert set(result.metrics["ekf", "causal"]) == set(describe())
+    assert [result.metrics[row.estimator, row.output]["ate_se3_m"] for row in result.comparison.rows] == ate(result)
+    values = [record.value for record in over.records() if record[3:5] == ("final", "ate_se3_m")]
+    assert over.metrics["dead-reckoning", "final"]["ate_se3_m"] == pytest.approx(np.mean(values))  # type: ignore[arg-type]
+    with pytest.raises(
+        VislamError, match=r"there is no \('batch', 'final'\); there are \('dead-reckoning', 'causal'\)"
+    ):
+        result.metrics["batch", "final"]
+    with pytest.raises(KeyError, match=r"no metric is called ate_se3.*did you mean ate_se3_m"):
+        result.metrics["ekf", "final"]["ate_se3"]
+
+
+def test_records_are_a_row_of_every_value(result: Result, over: Result) -> None:
+    rows = list(over.records())
+    assert {(row.sequence, row.seed, row.estimator, row.output) for row in rows} == {
+        ("drive", seed, "dead-reckoning", output) for seed in (4, 5) for output in ("causal", "final")
+    }
+    assert len(rows) == 2 * 2 * len(describe())
+    by_key = {row[1:5]: row.value for row in result.records()}
+    for line in result.comparison.rows:
+        for key in describe():
+            assert by_key[0, line.estimator, line.output, key] == line.value(key)
+
+
+def test_seeds_are_repeated_from_the_first(over: Result) -> None:
+    assert over.comparison.seeds == (4, 5)
+    assert len(set(over.comparison.hashes)) == 2
+    assert over.runs == {}
+
+
+def test_settings_are_a_record_or_nested_values(result: Result) -> None:
+    told = {"noise": {"pixel_sigma_px": 0.5}, "first_seed": 1}
+    by_values = toolkit.compare("drive", "ekf", settings=told, max_frames=FRAMES)
+    by_record = toolkit.compare("drive", "ekf", settings=by_values.comparison.settings, max_frames=FRAMES)
+    assert ate(by_values) == ate(by_record) != ate(result)[2:]
+    with pytest.raises(
+        VislamError, match=r"there is no setting noise.pixel_sigma; did you mean noise.pixel_sigma_px\?"
+    ):
+        toolkit.compare("drive", settings={"noise": {"pixel_sigma": 1.0}})
+
+
+def test_a_result_is_saved_as_a_run_directory(tmp_path: Path, over: Result, unrendered: None) -> None:
+    assert over.save(str(tmp_path / "run")) == tmp_path / "run"
+    assert (tmp_path / "run/seeds.json").is_file()
+
+
+def surrounded(words: list[str], program: str | None, folder: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    told = subprocess.run(
+        [sys.executable, *words],
+        input=program,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (told.returncode, told.stderr) == (0, "")
+    return told.stdout
+
+
+def as_script(folder: Path) -> str:
+    (folder / "unguarded.py").write_text(PROGRAM)
+    return surrounded(["unguarded.py"], None, folder)
+
+
+def from_standard_input(folder: Path) -> str:
+    return surrounded(["-"], PROGRAM, folder)
+
+
+def in_a_notebook(folder: Path) -> str:
+    """Run it as a kernel does: each statement executed in the namespace of a main module without a file."""
+    kernel = textwrap.dedent("""
+        import ast, sys
+        main = sys.modules["__main__"].__dict__
+        for cell in ast.parse(sys.stdin.read()).body:
+            exec(compile(ast.Module([cell], []), "<cell>", "exec"), main)
+    """)
+    return surrounded(["-c", kernel], PROGRAM, folder)
+
+
+@pytest.mark.parametrize("run", [as_script, from_standard_input, in_a_notebook])
+def test_it_runs_in_processes_from_anywhere_and_once(tmp_path: Path, run: Callable[[Path], str]) -> None:
+    """No guard around the main program, no file to import again: and what the program prints, it prints once."""
+    told = run(tmp_path)
+    assert told.count("metrics agree: True\n") == 1
+    assert told.splitlines()[1] == "drive, 2 seeds"
+    assert "mine" in told
+
+
+def test_nothing_slow_is_imported_before_it_is_used() -> None:
+    slow = ("numpy", "gtsam", "matplotlib", "loky", "toolkit.api")
+    program = f"import sys, toolkit; print([name for name in {slow!r} if name in sys.modules], dir(toolkit))"
+    told = surrounded(["-c", program], None, Path())
+    assert told.startswith("[] ")
+    assert all(repr(name) in told for name in toolkit.__all__)
