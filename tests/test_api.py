@@ -88,9 +88,8 @@ def test_without_names_the_default_estimators_are_compared() -> None:
 
 
 def test_an_estimator_that_is_no_file_is_compared_under_its_own_name(result: Result) -> None:
-    with_own = toolkit.compare(
-        "drive", "ekf", own={"mine": find("dead-reckoning").load()}, max_frames=FRAMES, workers=1
-    )
+    own = {"mine": find("dead-reckoning").load()}
+    with_own = toolkit.compare("drive", "ekf", own=own, max_frames=FRAMES, workers=1)
     assert list(with_own.runs) == ["ekf", "mine"]
     assert with_own.metrics["mine", "final"]["ate_se3_m"] == result.metrics["dead-reckoning", "final"]["ate_se3_m"]
     assert list(toolkit.compare("drive", own=own, max_frames=FRAMES).runs) == ["mine"]
