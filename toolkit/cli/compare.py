@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
     from toolkit.experiment import Plan
     from toolkit.experiment.configuration import Configuration
+    from toolkit.report.table import Columns
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
@@ -81,10 +82,9 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.experiment import comparisons, prepared_cases
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
-    from toolkit.report.table import columns_asked
     from toolkit.report.terminal import comparison_text
 
-    columns = columns_asked(options.columns)
+    columns = _columns(options.columns)
     asked = _configuration(options)
     plan, progress_for = _plan(asked, options.workers), of_this_process()
     cases = prepared_cases(plan, progress_for)
@@ -98,6 +98,18 @@ def command(options: argparse.Namespace) -> int:
         print_above(f"\nresults: {directory}\n")
         all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
+
+
+def _columns(names: tuple[str, ...]) -> Columns:
+    """Return the columns asked for; a name that is no metric's is a UsageError."""
+    from toolkit.cli.arguments import UsageError
+    from toolkit.errors import VislamError
+    from toolkit.report.table import columns_asked
+
+    try:
+        return columns_asked(names)
+    except VislamError as error:
+        raise UsageError(str(error)) from error
 
 
 def _configuration(options: argparse.Namespace) -> Configuration:

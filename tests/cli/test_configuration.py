@@ -1,0 +1,179 @@
+"""What a comparison is asked for: files of settings, single settings, columns, and a run repeated from its manifest."""
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from toolkit import runner
+from toolkit.cli.compare import SEQUENCES
+from toolkit.datasets import built_in_names
+from toolkit.estimator import defaults
+from toolkit.metrics import cost, known_metrics
+
+Vislam = Callable[..., int]
+OneLine = Callable[[], str]
+
+pytestmark = pytest.mark.usefixtures("unrendered")
+QUICK = ("--max-frames", "10", "--workers", "1")
+COST = {metric.key for metric in cost.METRICS}
+
+
+def manifest(run: str = "run") -> dict[str, Any]:
+    read: dict[str, Any] = json.loads(Path(run, "manifest.json").read_text())
+    return read
+
+
+def metrics(run: str) -> list[dict[str, Any]]:
+    """Return the scores of a run directory without those of its cost."""
+    runs: list[dict[str, Any]] = json.loads(Path(run, "metrics.json").read_text())["runs"]
+    for one in runs:
+        one["metrics"] = {key: value for key, value in one["metrics"].items() if key not in COST}
+    return runs
+
+
+def test_a_file_says_what_is_compared_and_with_which_settings(vislam: Vislam) -> None:
+    Path("run.toml").write_text(
+        'start = "truth"\nfirst_seed = 7\n'
+        "[window]\nlag_s = 3.0\n[noise]\npixel_sigma_px = 0.7\n"
+        '[compare]\nsequences = ["drive-imu"]\nestimators = ["dead-reckoning"]\nmax_frames = 8\nkeep = ["time-gap"]\n'
+    )
+    assert vislam("compare", "--config", "run.toml", "--out", "run") == 0
+    told = manifest()
+    assert (told["sequence"]["name"], told["estimators"], told["seeds"]) == (
+        "drive-imu",
+        ["dead-reckoning"],
+        {"sequence": 7},
+    )
+    assert "truth" in told["start"]
+    assert told["settings"]["window"]["lag_s"] == 3.0
+    assert told["settings"]["noise"]["pixel_sigma_px"] == 0.7
+    assert (told["compare"]["max_frames"], told["compare"]["keep"]) == (8, ["time-gap"])
+    assert json.loads(Path("run/metrics.json").read_text())["sequence"]["frames"] == 8
+
+
+def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam) -> None:
+    Path("run.toml").write_text(
+        'start = "truth"\nfirst_seed = 7\n[window]\nlag_s = 3.0\nimu_clones = 9\n'
+        '[compare]\nsequences = ["drive-imu"]\nestimators = ["batch"]\nmax_frames = 8\n'
+    )
+    words = ("drive", "--estimators", "dead-reckoning", "--max-frames", "5", "--seed", "2", "--start", "measurements")
+    given = ("--set", "window.lag_s=4", "--set", "first_seed=9", "--set", "start=truth")
+    assert vislam("compare", "--config", "run.toml", *words, *given, "--out", "run") == 0
+    told = manifest()
+    settings = told["settings"]
+    assert (settings["window"]["lag_s"], settings["window"]["imu_clones"]) == (4.0, 9)
+    assert (settings["first_seed"], settings["start"]) == (2, "measurements")
+    assert (told["compare"]["sequences"], told["compare"]["estimators"]) == (["drive"], ["dead-reckoning"])
+    assert told["compare"]["max_frames"] == 5
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--set", "window.lag=3"), "there is no setting window.lag; did you mean window.lag_s?"),
+        (("--set", "window.lag_s=soon"), "window.lag_s"),
+        (("--set", "window.lag_s"), "--set takes KEY=VALUE"),
+        (("--set", "window.imu_clones=1"), "window.imu_clones"),
+        (("--config", "wrong.toml"), "wrong.toml: there is no setting outliers.gate; did you mean"),
+        (("--config", "asked.toml"), "asked.toml: there is no compare.estimator; did you mean estimators?"),
+        (("--config", "typed.toml"), "typed.toml: compare: "),
+        (("--config", "broken.toml"), "broken.toml: is not TOML"),
+        (("--config", "absent.toml"), "absent.toml: cannot be read"),
+        (("--config", "absent.json"), "absent.json: cannot be read"),
+        (("--config", "other.json"), "other.json: holds no settings"),
+    ],
+)
+def test_a_setting_that_does_not_exist_is_2_in_one_line_before_anything_runs(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], why: str
+) -> None:
+    monkeypatch.setattr(runner, "run", None)
+    Path("wrong.toml").write_text("[outliers]\ngate = 0.9\n")
+    Path("asked.toml").write_text('[compare]\nestimator = ["ekf"]\n')
+    Path("typed.toml").write_text("[compare]\nmax_frames = 1\n")
+    Path("broken.toml").write_text("window = [")
+    Path("other.json").write_text("{}")
+    assert vislam("compare", "drive", "--estimators", "dead-reckoning", *words, "--out", "run") == 2
+    assert why in one_line()
+    assert not Path("run").exists()
+
+
+def test_an_option_that_an_estimator_does_not_have_is_told_before_anything_runs(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "run", None)
+    assert vislam("compare", "drive", "--estimators", "ekf", "--set", "estimators.ekf.gain=2", "--out", "run") == 5
+    assert "estimator ekf has no option gain" in one_line()
+
+
+def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
+    """In as many processes as there are processors, with whatever changed the first: settings, start, seed, cut."""
+    words = ("--estimators", "dead-reckoning,ekf", "--max-frames", "12", "--seed", "3", "--start", "truth")
+    assert vislam("compare", "drive", *words, "--set", "noise.pixel_sigma_px=0.7", "--no-repair", "--out", "once") == 0
+    assert vislam("compare", "--config", "once/manifest.json", "--out", "again") == 0
+    assert metrics("again") == metrics("once")
+    once, again = manifest("once"), manifest("again")
+    for told in (once, again):
+        for key in ("command", "date"):
+            del told[key]
+    assert again == once
+
+
+def test_a_run_over_seeds_is_repeated_from_its_manifest(vislam: Vislam) -> None:
+    words = ("--estimators", "dead-reckoning", *QUICK)
+    assert vislam("compare", "drive", *words, "--seeds", "2", "--seed", "4", "--out", "once") == 0
+    assert vislam("compare", "--config", "once/manifest.json", "--workers", "1", "--out", "again") == 0
+    once, again = (json.loads(Path(run, "seeds.json").read_text()) for run in ("once", "again"))
+    assert again["seeds"] == once["seeds"] == [4, 5]
+    assert again["hashes"] == once["hashes"]
+    for mine, theirs in zip(again["runs"], once["runs"], strict=True):
+        for key in mine["metrics"].keys() - COST:
+            assert mine["metrics"][key] == theirs["metrics"][key]
+
+
+def test_without_words_the_default_sequences_and_estimators_are_compared(vislam: Vislam) -> None:
+    assert set(SEQUENCES) <= set(built_in_names())
+    assert vislam("compare", "--max-frames", "3", "--workers", "1", "--out", "run") == 0
+    assert {path.name for path in Path("run").iterdir()} == set(SEQUENCES)
+    for sequence in SEQUENCES:
+        assert manifest(f"run/{sequence}")["estimators"] == list(defaults())
+
+
+def table(told: str) -> list[str]:
+    """Return the lines of a printed table, its headings with it."""
+    return told.partition("start:")[0].partition("\n\n")[2].strip().splitlines()
+
+
+def test_columns_are_those_asked_for(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run")
+    assert vislam(*words, "--columns", "ate_sim3_m,NIS mean") == 0
+    heads = [line.split() for line in table(capsys.readouterr().out)[:2]]
+    assert heads == [["estimator", "output", "status", "ATE", "NIS"], ["Sim(3)", "mean"]]
+
+
+def test_an_unknown_column_is_answered_with_the_nearest_before_anything_runs(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "run", None)
+    assert vislam("compare", "drive", "--columns", "ate_se3", "--out", "run") == 2
+    assert "no column is called ate_se3 (did you mean ate_se3_m?)" in one_line()
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize("width", ["40", "400"])
+def test_piped_output_is_never_wrapped_or_cut(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", width)
+    words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run", "--columns", "all")
+    assert vislam(*words) == 0
+    *heads, rule, line = table(capsys.readouterr().out)
+    with_value = [key for key, value in json.loads(Path("run/metrics.json").read_text())["runs"][0]["metrics"].items()]
+    columns = len(re.findall("-+", rule))
+    assert len(rule) > 100
+    assert columns == len(line.split())
+    assert 3 + 10 < columns <= 3 + len(with_value) <= 3 + len(known_metrics())
+    assert max(map(len, heads)) <= len(rule)

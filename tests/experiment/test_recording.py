@@ -1,0 +1,75 @@
+"""What the estimators read: the noise, the start, the seeds and the cut that the settings ask for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.experiment import Plan
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.sequence import ImuNoise, MotionNoise, TwistNoise
+from toolkit.settings import DEFAULTS, Noise, settings_of
+
+
+def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
+    """Return the pixel covariance (3, 3) px^2 and the motion noise that estimators are told."""
+    sequence = prepare(Recording(source, max_frames=5, noise=Noise(**noise))).sequence
+    return sequence.rig.cov_uv_px2, sequence.noise
+
+
+@pytest.mark.parametrize("source", ["drive", "drive-imu"])
+def test_without_settings_the_noise_is_the_recordings(source: str) -> None:
+    recorded = load_sequence(source)
+    cov_uv_px2, noise = told(source)
+    np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
+    assert noise == recorded.noise
+
+
+def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion() -> None:
+    recorded = load_sequence("drive").rig.cov_uv_px2
+    cov_uv_px2, _ = told("drive", pixel_sigma_px=0.7)
+    np.testing.assert_allclose(np.diag(cov_uv_px2)[:2], 0.49, rtol=1e-12)
+    np.testing.assert_allclose(cov_uv_px2 / cov_uv_px2[0, 0], recorded / recorded[0, 0], rtol=1e-12)
+
+
+def test_a_factor_on_twists_scales_both_densities() -> None:
+    before, (_, after) = load_sequence("drive").noise, told("drive", motion_scale=3.0)
+    assert isinstance(before, TwistNoise)
+    assert isinstance(after, TwistNoise)
+    np.testing.assert_array_equal(after.velocity_noise_density, 3.0 * before.velocity_noise_density)
+    np.testing.assert_array_equal(after.gyro_noise_density, 3.0 * before.gyro_noise_density)
+
+
+def test_a_factor_on_an_imu_leaves_its_random_walks() -> None:
+    before, (_, after) = load_sequence("drive-imu").noise, told("drive-imu", motion_scale=3.0)
+    assert isinstance(before, ImuNoise)
+    densities = ("gyro_noise_density", "accel_noise_density")
+    assert after == replace(before, **{name: 3.0 * getattr(before, name) for name in densities})
+
+
+def test_a_start_from_the_truth_is_the_truth_and_says_so() -> None:
+    from_truth = prepare(Recording("drive", max_frames=5, start="truth"))
+    assert from_truth.sequence.truth is not None
+    np.testing.assert_allclose(from_truth.prior.T_world_imu, from_truth.sequence.truth.T_world_imu[0], atol=1e-12)
+    assert "truth" in from_truth.prior.source
+    assert prepare(Recording("drive", max_frames=5)).prior.source != from_truth.prior.source
+
+
+def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
+    whole = load_sequence("drive")
+    frames = prepare(Recording("drive", max_frames=7))
+    assert (frames.sequence.frame_count, frames.whole.frame_count) == (7, whole.frame_count)
+    seconds = prepare(Recording(whole, duration_s=1.0))
+    t_ns = seconds.sequence.frames_t_ns
+    assert t_ns[-1] - t_ns[0] <= 10**9 < whole.frames_t_ns[t_ns.size] - t_ns[0]
+
+
+def test_a_plan_reads_its_recordings_by_the_settings() -> None:
+    given = {"first_seed": 5, "seeds": 3, "start": "truth", "noise": {"pixel_sigma_px": 0.7}}
+    plan = Plan(("drive",), ("ekf",), settings=settings_of(given, "here"), max_frames=9, keep=frozenset({"time-gap"}))
+    assert plan.seeds == (5, 6, 7)
+    assert plan.recording("drive", 6) == Recording(
+        "drive", 6, keep=frozenset({"time-gap"}), start="truth", max_frames=9, noise=Noise(pixel_sigma_px=0.7)
+    )
+    assert Plan(("drive",), ("ekf",)).seeds == (DEFAULTS.first_seed,)
