@@ -36,6 +36,11 @@ class Scene(NamedTuple):
         uv_px[self.rows[len(self.rows) // 3]] += sigmas * (whitener @ np.array([1.0, 1.0, 0.0])) / np.sqrt(2.0)
         return replace(self.sequence, observations=replace(observations, uv_px=uv_px))
 
+    def error_m(self, run: Run) -> float:
+        """Return the error of a run's final position at FRAME."""
+        error = se3_inverse(run.final.T_world_imu[FRAME]) @ self.sequence.truth.T_world_imu[FRAME]
+        return float(np.linalg.norm(se3_log(error)[3:]))
+
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
@@ -54,11 +59,9 @@ def scene() -> Scene:
 @pytest.fixture
 def pull(scene, run_estimator) -> Callable[[str, float], float]:
     """Return a function: the error (m) of the final position at FRAME that a sighting off by some sigmas makes."""
-    truth = scene.sequence.truth.T_world_imu[FRAME]
 
     def pulled(name: str, sigmas: float) -> float:
-        estimated = run_estimator(name, scene.with_error(sigmas)).final.T_world_imu[FRAME]
-        return float(np.linalg.norm(se3_log(se3_inverse(estimated) @ truth)[3:]))
+        return scene.error_m(run_estimator(name, scene.with_error(sigmas)))
 
     return pulled
 
@@ -84,6 +87,20 @@ def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_
     assert pull(name, 2.5) / at_one == pytest.approx(2.5, rel=0.02)
     assert pull(name, 6.5) / at_one == pytest.approx(3.0, rel=0.1)  # 6.5 would be full weight
     assert pull(name, 12.0) < NOTHING_M
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
+def test_what_the_measured_motion_leaves_open_is_no_slip(scene, run_estimator, name):
+    """Off by 9.5 sigma: slipped after the motion as measured, possible after one known half as well."""
+    sequence = scene.with_error(9.5)
+    noise = sequence.noise
+    doubtful = replace(
+        noise,
+        velocity_noise_density=2.0 * noise.velocity_noise_density,
+        gyro_noise_density=2.0 * noise.gyro_noise_density,
+    )
+    assert scene.error_m(run_estimator(name, sequence)) < NOTHING_M
+    assert scene.error_m(run_estimator(name, replace(sequence, noise=doubtful))) > 100.0 * NOTHING_M
 
 
 def test_batch_counts_in_full_what_chance_explains_and_nothing_else(pull):

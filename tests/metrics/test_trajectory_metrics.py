@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from toolkit.geometry import about_z, se3, se3_exp
+from toolkit.geometry import about_z, se3, se3_exp, transform
 from toolkit.metrics import score_run
 from toolkit.metrics._shared.alignment import fit_se3, fit_sim3, fit_yaw, place_yaw
 from toolkit.metrics._shared.scores import Unavailable
@@ -97,6 +97,10 @@ def test_placing_by_heading_recovers_a_pure_heading():
 def test_a_fit_needs_three_pairs():
     with pytest.raises(Unavailable, match="needs 3"):
         fit_se3(np.zeros((2, 3)), np.zeros((2, 3)))
+    corners = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 3.0]])
+    T_other_here = se3_exp(np.array([0.4, -1.1, 2.0, 3.0, -5.0, 7.0]))
+    fit = fit_se3(transform(T_other_here, corners), corners)
+    np.testing.assert_allclose(fit.rotation, T_other_here[:3, :3], atol=1e-14)  # an SVD of numbers near one
 
 
 def test_scale_has_no_fit_where_the_estimate_stands_still():
