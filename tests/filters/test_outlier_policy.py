@@ -79,6 +79,19 @@ def test_ekf_holds_a_sighting_from_one_and_a_half_sigma_on_and_drops_it_beyond_i
     assert pull("ekf", 6.0) < NOTHING_M
 
 
+@pytest.mark.parametrize("name", ["ekf-slam", "iekf", "riekf"])
+def test_joint_filters_count_in_full_what_passes_their_gate_and_nothing_else(pull, name):
+    """The gate's 2.8 sigma are of an innovation that has the landmark's and the pose's variance in it too: 4.2."""
+    at_one = pull(name, 1.0)
+    assert at_one > 100.0 * NOTHING_M
+    assert pull(name, 3.8) / at_one == pytest.approx(3.8, rel=0.02)
+    assert pull(name, 5.0) < NOTHING_M
+
+
+def test_the_reports_filter_has_no_gate_and_follows_whatever_it_sees(pull):
+    assert pull("seed-ekf", 12.0) / pull("seed-ekf", 1.0) == pytest.approx(12.0, rel=0.1)
+
+
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
 def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_has_slipped(pull, name):
     """The gate's bound is 2.8 sigma, of a residual of which the fit takes a tenth; slipped is what is beyond 7.9."""
