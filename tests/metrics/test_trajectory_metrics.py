@@ -161,6 +161,14 @@ def test_short_paths_have_no_long_segments(make_sequence, drive, score):
         assert "100 m" in scores.notes[key]
 
 
+@pytest.mark.parametrize(("step_m", "scored"), [(54.0, True), (56.0, False)])
+def test_a_pair_that_is_more_than_a_tenth_longer_than_100_m_is_left_out(make_sequence, score, step_m, scored):
+    """Two steps are the first beyond 100 m: 108 or 112."""
+    poses = se3(np.eye(3), np.outer(np.arange(30.0), [step_m, 0.0, 0.0]))
+    sequence = make_sequence(poses, track_count=3)
+    assert (score(sequence, poses).values["rpe_100m_percent"] is not None) == scored
+
+
 def test_end_drift_is_the_last_error_over_the_path(make_sequence, score):
     poses = se3(np.eye(3), np.outer(np.arange(51.0), [2.0, 0.0, 0.0]))
     sequence = make_sequence(poses, track_count=3)
