@@ -8,7 +8,7 @@ import pytest
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import Observations, Sequence, is_held_out
-from toolkit.simulation import DRIVE, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
 from toolkit.simulation.scenarios import noise_free
 
 LAG_S, RATE_HZ = 2.0, 10.0
@@ -59,14 +59,28 @@ def test_a_landmark_has_a_disparity_of_a_pixel_or_more(exact, run_estimator, nam
     assert far not in known
 
 
+@pytest.mark.parametrize(("scenario", "poses"), [(DRIVE, 6), (DRIVE_IMU, 13)], ids=["twist", "imu"])
+@pytest.mark.parametrize("name", ["msckf", "msckf-fej"])
+def test_a_track_corrects_the_window_once_it_spans_it(run_estimator, name, scenario, poses):
+    """Twists tie the poses of half a second well enough, an IMU those of 1.2 s; a pose adds three rows to a track."""
+    sequence = simulate(noise_free(replace(scenario, duration_s=1.5)), 0)
+    seen = sequence.observations
+    at_first = seen.track_id[seen.frame == 0]
+    longest = max(at_first[~is_held_out(at_first)], key=lambda i: int((seen.track_id == i).sum()))
+    alone = replace(sequence, observations=seen.select(seen.track_id == longest))
+    dof = run_estimator(name, alone).info["nis_dof"]
+    assert int(np.flatnonzero(dof > 0)[0]) == poses - 1
+    assert dof.max() == 3 * poses - 3
+
+
 @pytest.mark.parametrize("name", ["fixed-lag", "smart"])
 def test_a_state_is_open_to_what_is_seen_within_the_lag(run_estimator, name):
-    """Sightings of a frame are moved, all by a few pixels: the frame 1.9 s before it hears of it, that of 2.2 s not."""
+    """All sightings of a frame are moved by 2 px: the pose 1.9 s before it changes, that 2.2 s before does not."""
     sequence = simulate(replace(DRIVE, duration_s=LAG_S + 1.0), 0)
     seen, changed = sequence.observations, 28
     moved = seen.uv_px + np.where(seen.frame == changed, 1.0, 0.0)[:, None] * np.array([2.0, 2.0, 0.0])
     as_is = run_estimator(name, sequence).final.T_world_imu
     otherwise = run_estimator(name, replace(sequence, observations=replace(seen, uv_px=moved))).final.T_world_imu
-    heard = np.flatnonzero((as_is != otherwise).any(axis=(1, 2)))
+    changed_poses = np.flatnonzero((as_is != otherwise).any(axis=(1, 2)))
     within = changed - round(LAG_S * RATE_HZ)
-    assert within - 1 <= heard[0] <= within + 1
+    assert within - 1 <= changed_poses[0] <= within + 1
