@@ -31,6 +31,7 @@ def command(_options: argparse.Namespace) -> int:
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.estimator import discover
+    from toolkit.report.prose import width_of_output
     from toolkit.report.terminal import listing_text
     from toolkit.settings import describe
 
@@ -42,7 +43,7 @@ def command(_options: argparse.Namespace) -> int:
         "faults": faults(),
         "settings": {one.key: _setting(one) for one in describe()},
     }
-    print("\n\n".join(listing_text(title, entries) for title, entries in sections.items()))
+    print("\n\n".join(listing_text(title, entries, width_of_output()) for title, entries in sections.items()))
     return 0
 
 
