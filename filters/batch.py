@@ -59,9 +59,8 @@ class Batch:
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         seen = seen_ids(smoothed.frames)
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen})
-        keys = [self._motion.keys(packet.index) for packet in self._packets]
         trajectory, log = with_covariances(
-            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], keys
+            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], self._motion
         )
         return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 

@@ -3,7 +3,7 @@
 GTSAM's own optimizer hands a Python factor a fresh copy of all values at each call, which makes a thousand
 twist factors ten times dearer than sixty thousand stereo factors; and it returns unchanged values without a
 word when an error is not a number. The damping is Levenberg's multiple of the identity, updated by how well
-the linear model foretold the decrease (Madsen, Nielsen & Tingleff 2004, "Methods for non-linear least squares
+the linear model predicted the decrease (Madsen, Nielsen & Tingleff 2004, "Methods for non-linear least squares
 problems", algorithm 3.16): a step that was right lowers it, a wrong one raises it ever faster.
 """
 
@@ -35,7 +35,7 @@ class Solution(NamedTuple):
     converged: bool
 
 
-class _Step(NamedTuple):
+class _DampedStep(NamedTuple):
     values: gtsam.Values
     error: float
     gain: float
@@ -86,7 +86,7 @@ def _tried(
     damped: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
-) -> _Step | None:
+) -> _DampedStep | None:
     """Return where one damped step leads, or None where even the damped system is indeterminate."""
     try:
         delta = damped.optimize(ordering)
@@ -95,9 +95,9 @@ def _tried(
             return None
         raise
     moved = values.retract(delta)
-    foretold = linear.error(values.zeroVectors()) - linear.error(delta)
+    predicted = linear.error(values.zeroVectors()) - linear.error(delta)
     error = graph.error(moved)
-    return _Step(moved, error, (graph.error(values) - error) / max(foretold, np.finfo(float).tiny))
+    return _DampedStep(moved, error, (graph.error(values) - error) / max(predicted, np.finfo(float).tiny))
 
 
 def _keys_by_dimension(values: gtsam.Values) -> dict[int, list[int]]:

@@ -15,18 +15,16 @@ from collections.abc import Iterable
 
 import gtsam
 
-from filters.smoothing.graph_builder import Grown
+from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
-from filters.smoothing.marginals import state_cov
 from toolkit.errors import EstimatorError
-from toolkit.geometry import Array
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
 RELINEARISE_BEYOND = 0.01
 
 
-class LagWindow:
+class FixedLagTree:
     """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
 
     def __init__(self, lag_ns: int) -> None:
@@ -40,19 +38,19 @@ class LagWindow:
         # What the trees before this one marginalised is linear in these variables, where they are linearised.
         self._fixed: set[int] = set()
 
-    def add(self, grown: Grown, t_ns: int) -> Recovery:
+    def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Take in what a packet at a time adds, and solve; return what had to be recovered.
 
         Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
         """
         back = Recovery([], set())
-        if self._by_qr_from_ns is not None and grown.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
+        if self._by_qr_from_ns is not None and extension.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
             self._by_qr_from_ns = None
             back = self.rebuild()
-        self._state_stamps_ns |= dict.fromkeys(grown.state_keys, t_ns)
-        self._landmark_stamps_ns |= dict.fromkeys(map(L, grown.landmark_ids), t_ns)
+        self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
+        self._landmark_stamps_ns |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
         self._oldest_ns = t_ns - self._lag_ns
-        news = self._solved(grown.factors, grown.values)
+        news = self._solved(extension.factors, extension.values)
         return Recovery(back.log + news.log, back.dropped | news.dropped)
 
     def rebuild(self) -> Recovery:
@@ -71,9 +69,9 @@ class LagWindow:
         """Return the latest values of the window, and of what the last packet made leave it."""
         return self._values
 
-    def state_cov(self, keys: list[int], R_world_imu: Array) -> Array:
-        """Return the covariance of one state, in the order and on the side of an Estimate."""
-        return state_cov(self._isam, keys, R_world_imu)
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
+        """Return the joint marginal of some variables of the window."""
+        return self._isam.jointMarginalCovariance(keys)
 
     def _solved(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int] = ()

@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from filters.smoothing.structureless import RobustCamera, Sightings
-from filters.smoothing.window import Evaluated, Prior, System, Window
+from filters.smoothing.smart_factors import RobustCamera, Sightings
+from filters.smoothing.smart_window import Evaluated, MarginalPrior, System, Window
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 
@@ -26,7 +26,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class SolvedWindow:
     """A window at its minimum and the root of the information it was last linearised to, a step short of that."""
 
     window: Window
@@ -43,7 +43,7 @@ class Solution:
         return np.asarray(half.T @ half)
 
 
-def solved(window: Window, camera: RobustCamera) -> Solution:
+def solve_window(window: Window, camera: RobustCamera) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -59,7 +59,7 @@ def solved(window: Window, camera: RobustCamera) -> Solution:
             break
         damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
     try:
-        return Solution(here.window, system.root)
+        return SolvedWindow(here.window, system.root)
     except np.linalg.LinAlgError as refusal:
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
@@ -67,9 +67,9 @@ def solved(window: Window, camera: RobustCamera) -> Solution:
 def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
     """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
     seen = window.sightings
-    spoken = np.unique(seen.point[seen.pose < count])
-    told = replace(_only(window, spoken), motion=window.motion[: count + 1])
-    system, gone = Evaluated.of(told, camera).linearised(), count * window.size
+    leaving_points = np.unique(seen.point[seen.pose < count])
+    leaving = replace(_only(window, leaving_points), motion=window.motion[: count + 1])
+    system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
     root = np.linalg.cholesky(system.information[:gone, :gone])
     across = solve_triangular(root, system.information[:gone, gone:], lower=True)
     information = system.information[gone:, gone:] - across.T @ across
@@ -78,9 +78,9 @@ def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
     for keys in window.keys[:count]:
         for key in keys:
             values.erase(key)
-    left = ~np.isin(seen.point, spoken)
+    left = ~np.isin(seen.point, leaving_points)
     kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
-    prior = Prior(information, vector, values)
+    prior = MarginalPrior(information, vector, values)
     motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
     return Window(window.keys[count:], values, motion, prior, kept, window.points)
 
@@ -92,7 +92,7 @@ def _only(window: Window, points: IntArray) -> Window:
     return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
 
 
-class _Step(NamedTuple):
+class _DescentStep(NamedTuple):
     """Where a step leads, how long it is in standard deviations of all states together, and how it was damped."""
 
     there: Evaluated
@@ -100,18 +100,18 @@ class _Step(NamedTuple):
     damping: float
 
 
-def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _Step:
+def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _DescentStep:
     """Return a step that costs no more, damped as far as that takes, or one of no length."""
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
             there = Evaluated.of(_moved(here.window, system, step), camera)
             if there.error <= here.error:
-                return _Step(there, float(np.sqrt(step @ system.vector)), damping)
+                return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
         except np.linalg.LinAlgError:
             pass
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return _Step(here, 0.0, damping)
+    return _DescentStep(here, 0.0, damping)
 
 
 def _moved(window: Window, system: System, step: Array) -> Window:
