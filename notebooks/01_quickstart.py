@@ -19,9 +19,9 @@
 # %%
 import numpy as np
 from recordings import real
+from toolkit.report.interactive import compare, figures, table
 
 from toolkit.datasets import load_sequence
-from toolkit.report.interactive import compare, figures, table
 
 # %matplotlib inline
 

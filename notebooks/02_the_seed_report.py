@@ -26,13 +26,13 @@ import numpy as np
 import planted
 from matplotlib.axes import Axes
 from recordings import real
+from toolkit.report.comparison import Comparison
+from toolkit.report.interactive import compare, table
 
 from toolkit.audit import Audit, audit, faults
 from toolkit.audit.parts.vision import camera_motion
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
-from toolkit.report.comparison import Comparison
-from toolkit.report.interactive import compare, table
 from toolkit.report.terminal import audit_text
 from toolkit.sequence import Sequence
 

@@ -15,6 +15,7 @@ class Leaf(Struct, frozen=True, kw_only=True):
 
     count: Annotated[int, Meta(ge=0)]
     values: tuple[float | None, ...] = ()
+    side: Annotated[Literal["left", "right"], Meta(description="of the stem")] | None = None
 
     def __post_init__(self) -> None:
         if len(self.values) > self.count:
@@ -28,6 +29,7 @@ class Tree(Struct, frozen=True, kw_only=True):
     leaves: dict[str, Leaf] = {}
     rows: tuple[dict[str, dict[str, float]], ...] = ()
     way: Literal["up", "down"] = "up"
+    ends: Annotated[dict[Literal["here", "nowhere"], int], Meta(description="by place")] = {}
     note: str | UnsetType = UNSET
 
 
@@ -75,7 +77,9 @@ def test_a_record_that_breaks_its_rule_cannot_be_made() -> None:
         ('"rows": [{"x": {"y": 1e999}}]', "rows[0].x.y: expected number, got NaN or infinity"),
         ('"rows": [{"x": {"y": -Infinity}}]', "rows[0].x.y: expected number, got NaN or infinity"),
         ('"rows": {}', "rows: expected list, got object"),
-        ('"way": "left\\n - at `$.x`"', "way: cannot be 'left"),
+        ('"way": "left\\n - at `$.x`"', "way: cannot be 'left\\n - at `$.x`', only down, up"),
+        ('"leaves": {"a": {"count": 1, "side": "top"}}', "leaves.a.side: cannot be 'top', only left, right"),
+        ('"ends": {"here": 1, "there": 2}', "ends: cannot be 'there', only here, nowhere"),
     ],
 )
 def test_the_place_is_named_with_every_key(body: str, expected: str) -> None:

@@ -85,3 +85,9 @@ def test_what_differs_from_the_defaults_is_kept_alone_and_reads_back() -> None:
     assert settings.changes_of(DEFAULTS) == {}
     changes = {"window": {"lag_s": 3.0}, "seeds": 4, "estimators": {"mine": {"gain": 0.5}}}
     assert settings.changes_of(settings_of(changes, "here")) == changes
+
+
+def test_the_page_documents_every_setting_as_it_is() -> None:
+    page = (Path(__file__).parents[1] / "docs/settings.md").read_text(encoding="utf-8")
+    for one in describe():
+        assert f"| `{one.key}` | {one.unit} | {one.default} | {one.range} | {one.meaning} |" in page

@@ -8,10 +8,12 @@ and the place in it. Fields a record does not know are passed over, for a later 
 import json
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 import msgspec
+from msgspec import inspect
 
 from toolkit.errors import DataError, VislamError
 
@@ -31,7 +33,8 @@ _KINDS = {
 # object whose keys are data, which it does not name.
 _STEP = re.compile(r"\.(?P<field>\w+)|\[(?P<index>\d+)\]|\[(?P<entry>\.\.\.)\]")
 _NOT_JSON = (ValueError, RecursionError)
-_PLACED = re.compile(r"(?P<what>.*) - at (key in )?`\$(?P<path>.*)`", re.DOTALL)
+_NO_CHOICE = "Invalid enum value"
+_PLACED = re.compile(r"(?P<what>.*) - at (`key` in )?`\$(?P<path>[^`]*)`", re.DOTALL)
 
 
 def to_text(record: msgspec.Struct) -> str:
@@ -127,8 +130,10 @@ def _schema_of(document: object) -> object:
 def _in_words(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:
     """Say what is wrong and where, with the keys that msgspec leaves out of its paths."""
     what, path = _parts(why)
-    steps = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in _place(path, document, record))
-    return f"{steps.removeprefix('.') or 'the document'}: {_plain(what)}"
+    steps = _place(path, document, record)
+    place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps).removeprefix(".")
+    only = f", only {', '.join(_choices(record, steps))}" if what.startswith(_NO_CHOICE) else ""
+    return f"{place or 'the document'}: {_plain(what)}{only}"
 
 
 def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
@@ -140,13 +145,44 @@ def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
 def _plain(what: str) -> str:
     """Return msgspec's words with JSON's names of the types."""
     named = re.sub(r"`([\w| ]+)`", lambda kinds: _kinds(kinds[1].split(" | ")), what)
-    for theirs, ours in (("Object missing required field", "lacks"), ("Invalid enum value", "cannot be")):
+    for theirs, ours in (("Object missing required field", "lacks"), (_NO_CHOICE, "cannot be")):
         named = named.replace(theirs, ours)
     return " ".join((named[:1].lower() + named[1:]).split())
 
 
 def _kinds(kinds: list[str]) -> str:
     return " or ".join(dict.fromkeys(_KINDS.get(kind, kind) for kind in kinds if kind != "int" or "float" not in kinds))
+
+
+def _choices(record: type[msgspec.Struct], steps: tuple[str | int, ...]) -> Iterator[str]:
+    """Yield what the value at a place of a record, or the keys of the object there, may be."""
+    kinds: list[inspect.Type] = [inspect.type_info(record)]
+    for step in steps:
+        kinds = [inner for kind in kinds for inner in _inside(kind, step)]
+    for kind in kinds:
+        literal = kind.key_type if isinstance(kind, inspect.DictType) else kind
+        if isinstance(literal, inspect.LiteralType):
+            yield from map(str, literal.values)
+
+
+def _inside(kind: inspect.Type, step: str | int) -> Iterator[inspect.Type]:
+    """Yield the types that one step into a value of a type may lead to."""
+    if isinstance(kind, inspect.StructType):
+        yield from (one for field in kind.fields if field.encode_name == step for one in _each(field.type))
+    elif isinstance(kind, inspect.DictType):
+        yield from _each(kind.value_type)
+    elif isinstance(kind, inspect.VarTupleType):
+        yield from _each(kind.item_type)
+
+
+def _each(kind: inspect.Type) -> Iterator[inspect.Type]:
+    """Yield a type without its description, and of several each."""
+    if isinstance(kind, inspect.Metadata):
+        yield from _each(kind.type)
+    elif isinstance(kind, inspect.UnionType):
+        yield from (one for part in kind.types for one in _each(part))
+    else:
+        yield kind
 
 
 def _place(path: str, document: object, record: type[msgspec.Struct]) -> tuple[str | int, ...]:

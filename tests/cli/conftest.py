@@ -9,34 +9,34 @@ import pytest
 
 from toolkit.audit import Audit
 from toolkit.cli import main
-from toolkit.report import session
-from toolkit.sequence import Truth
+from toolkit.experiment import recording
+from toolkit.experiment.recording import Recording
 from toolkit.simulation import SCENARIOS
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
 
-_load_audited = session.load_audited
+_audited_recording = recording.audited_recording
 
 
 @cache
 def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], seed: int) -> Audit:
     """Return a simulated recording audited; a test that puts another audit in gets what that one says."""
-    return _load_audited(source, None, keep, seed)
+    return _audited_recording(Recording(source, seed, keep=keep))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def audited_once() -> Iterator[None]:
     """Simulate and audit each built-in recording once for all tests: most of them run ten frames of the same one."""
 
-    def remembered(source: str, truth: Truth | None, keep: frozenset[str], seed: int) -> Audit:
-        if truth is None and source in SCENARIOS:
-            return _audited(session.audit, source, keep, seed)
-        return _load_audited(source, truth, keep, seed)
+    def remembered(asked: Recording) -> Audit:
+        if asked.truth is None and asked.duration_s is None and asked.source in SCENARIOS:
+            return _audited(recording.audit, asked.source, asked.keep, asked.seed)
+        return _audited_recording(asked)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(session, "load_audited", remembered)
+        patch.setattr(recording, "audited_recording", remembered)
         yield
 
 

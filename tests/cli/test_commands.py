@@ -8,13 +8,14 @@ import pytest
 
 from toolkit import audit
 from toolkit.audit import Audit, Finding
-from toolkit.report import session
+from toolkit.experiment import recording
 from toolkit.report.records import read_metrics
+from toolkit.report.run_directory import unique_names
 
 Vislam = Callable[..., int]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
-DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10")
+DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
 
 def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:
@@ -74,7 +75,7 @@ def test_check_data_fails_on_a_fault_that_stays(
     status: int,
 ) -> None:
     finding = Finding("time-gap", 2, repaired, "two frames are 3 s apart", blocking)
-    monkeypatch.setattr(session, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
+    monkeypatch.setattr(recording, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
     assert vislam("check-data", "drive") == status
     told = capsys.readouterr().out
     assert "time-gap" in told
@@ -90,7 +91,7 @@ def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch)
         kept.append(keep)
         return Audit(sequence, ())
 
-    monkeypatch.setattr(session, "audit", listening)
+    monkeypatch.setattr(recording, "audit", listening)
     vislam("check-data", "drive")
     vislam("check-data", "drive", "--no-repair")
     vislam("check-data", "drive", "--keep", f"{first},{second}")
@@ -98,7 +99,7 @@ def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_directory_names_are_plain_and_differ() -> None:
-    assert session.unique_names(["drive", "a/b c", "drive", "..", "drive"]) == [
+    assert unique_names(["drive", "a/b c", "drive", "..", "drive"]) == [
         "drive",
         "a_b_c",
         "drive-2",

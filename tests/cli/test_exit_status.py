@@ -13,7 +13,7 @@ from toolkit import runner
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
-QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10")
+QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from toolkit.report.records import read_metrics, read_report
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 WithoutPixels = Callable[[], AbstractContextManager[None]]
-QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20")
+QUICK = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "20", "--workers", "1")
 EVO = {
     "tum": evo.read_tum_trajectory_file,
     "kitti": evo.read_kitti_poses_file,
@@ -79,7 +79,8 @@ def test_an_export_scores_as_what_it_is_an_export_of(again: Path, name: str) -> 
 
 def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> None:
     report = (again / "report.md").read_text()
-    assert "| by euroc | final | ok | 20 | 100.0 |" in report
+    assert "| by euroc | final | ok |" in re.sub(" +", " ", report)
+    assert "scored: coverage 100.0 %, pairs 20." in report
     assert "ekf.euroc (EuRoC, 20 poses), not run here" in report
     for file in ("trajectories/by_euroc_final.tum", "figures/top_by_euroc.png"):
         assert (again / file).is_file()

@@ -1,21 +1,28 @@
 """What is said about many seeds: spreads over the runs that are ok, the NEES of all against the band of as many."""
 
-import copy
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from toolkit.report.metrics_json import to_text
 
 from toolkit.datasets import is_drawn_from_a_seed
+from toolkit.documents import parse, to_text
+from toolkit.errors import DataError
+from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.statistics import mean_nees, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
-from toolkit.report import seeds_json
 from toolkit.report.figures import over_seeds as figures
+from toolkit.report.records import Seeds
 from toolkit.report.report_md import report_text
+from toolkit.report.scores_json import seeds_document
 from toolkit.report.terminal import comparison_text
+
+Document = dict[str, Any]
 
 
 def test_spread_is_numpys():
@@ -56,7 +63,7 @@ def test_the_band_is_for_the_runs_that_are_there():
     assert averaged.in_band_percent == 100.0
 
 
-def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
+def test_a_seed_that_diverged_is_counted_and_in_no_mean(over: Comparison) -> None:
     astray = over.rows[2]
     assert (astray.estimator, astray.counts) == ("astray", {"ok": 3, "diverged": 1, "failed": 0})
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
@@ -64,7 +71,7 @@ def test_a_seed_that_diverged_is_counted_and_in_no_mean(over):
     assert not over.all_ok
 
 
-def test_an_estimator_without_any_answer_keeps_a_line(over):
+def test_an_estimator_without_any_answer_keeps_a_line(over: Comparison) -> None:
     assert [(g.estimator, g.output) for g in over.rows] == [
         ("honest", "causal"),
         ("honest", "final"),
@@ -76,12 +83,13 @@ def test_an_estimator_without_any_answer_keeps_a_line(over):
 
 
 @pytest.fixture
-def document(over):
-    return json.loads(to_text(seeds_json.build(over)))
+def document(over: Comparison) -> Document:
+    read: Document = json.loads(to_text(seeds_document(over)))
+    return read
 
 
-def test_seeds_json_obeys_its_schema(document):
-    assert seeds_json.violations(document) == []
+def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> None:
+    assert parse(to_text(seeds_document(over)), Seeds) == seeds_document(over)
     assert list(document["runs"][0]["metrics"]) == list(describe())
     assert document["runs"][2]["status"] == ["ok", "diverged", "ok", "ok"]
     assert document["runs"][0]["over_seeds"]["nees_pose_band"] == list(nees_band(6, 4))
@@ -89,30 +97,28 @@ def test_seeds_json_obeys_its_schema(document):
 
 
 @pytest.mark.parametrize(
-    "spoil",
+    ("spoil", "told"),
     [
-        lambda d: d.update(schema="vislam.seeds/2"),
-        lambda d: d.pop("runs"),
-        lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"),
-        lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(),
-        lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"),
-        lambda d: d["runs"][0]["counts"].update(ok=9),
-        lambda d: d["runs"][0]["status"].__setitem__(0, "fine"),
-        lambda d: d["runs"][3]["notes"].clear(),
+        (lambda d: d.update(schema="vislam.seeds/2"), "its schema is 'vislam.seeds/2'"),
+        (lambda d: d.pop("runs"), "lacks runs"),
+        (lambda d: d["runs"][0]["metrics"].pop("ate_se3_m"), "metrics.ate_se3_m is missing"),
+        (lambda d: d["runs"][0]["metrics"]["ate_none_m"]["values"].pop(), "metrics.ate_none_m.values"),
+        (lambda d: d["runs"][0]["metrics"]["ate_none_m"].update(mean="4"), "ate_none_m.mean: expected number or null"),
+        (lambda d: d["runs"][0]["counts"].update(ok=9), "counts does not count status"),
+        (lambda d: d["runs"][0]["status"].__setitem__(0, "fine"), "runs[0].status[0]: cannot be 'fine'"),
+        (lambda d: d["runs"][3]["notes"].clear(), "has no value, and notes does not say why"),
+        (lambda d: d["hashes"].pop(), "hashes does not have an entry a seed"),
     ],
 )
-def test_the_validator_notices(document, spoil):
-    spoiled = copy.deepcopy(document)
-    spoil(spoiled)
-    assert seeds_json.violations(spoiled)
+def test_a_broken_document_is_refused_with_the_place(
+    document: Document, spoil: Callable[[Document], object], told: str
+) -> None:
+    spoil(document)
+    with pytest.raises(DataError, match=re.escape(told)):
+        parse(json.dumps(document), Seeds)
 
 
-@pytest.mark.parametrize("document", [None, [], {"runs": [3], "seeds": [1]}])
-def test_the_validator_survives_anything(document):
-    assert seeds_json.violations(document)
-
-
-def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
+def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) -> None:
     for text in (comparison_text(over), report_text(over, {})):
         assert "astray diverged under seed 4: left the road" in text
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
@@ -120,7 +126,7 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over):
     assert max(map(len, comparison_text(over).splitlines())) <= 100
 
 
-def test_both_figures_are_drawn(over, tmp_path):
+def test_both_figures_are_drawn(over: Comparison, tmp_path: Path) -> None:
     drawn = list(figures.draw(over))
     assert [figure.name for figure in drawn] == ["errors_over_seeds", "nees_over_seeds"]
     for figure in drawn:

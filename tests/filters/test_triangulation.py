@@ -51,6 +51,24 @@ def test_noisy_sightings_give_the_least_squares_points():
         assert (point - best.x) @ np.linalg.solve(spread, point - best.x) < 0.01**2
 
 
+def test_a_track_is_solved_as_if_alone_whatever_the_others_are():
+    """A step that helps one track and harms another is taken by the one only."""
+    _, poses, uvs_px, seen = scene(6)
+    rng = np.random.default_rng(1)
+    uvs_px[::2] += 60.0 * rng.standard_normal(uvs_px[::2].shape)  # mismatched: many a step is in vain
+
+    def cost(track, point):
+        own = [transform(se3_inverse(pose), point[None]) for pose in poses[seen[track]]]
+        residuals = uvs_px[track, seen[track]] - stereo.project(np.concatenate(own), RIG)
+        return float(np.einsum("ni,ij,nj->", residuals, np.linalg.inv(RIG.cov_uv_px2), residuals))
+
+    together, _ = triangulate(uvs_px, seen, poses, RIG)
+    for track, point in enumerate(together):
+        alone, _ = triangulate(uvs_px[[track]], seen[[track]], poses, RIG)
+        # Together it may go on while others are unsettled, and end lower.
+        assert cost(track, point) <= cost(track, alone[0]) * (1.0 + 1e-9)
+
+
 def test_a_point_behind_a_pose_or_without_disparity_is_not_relied_on():
     _, poses, uvs_px, seen = scene(5)
     behind = poses.copy()

@@ -55,7 +55,10 @@ def _run(document):
         (lambda d: d.update(sequences=[3]), r"sequences\[0\]: expected object"),
         (lambda d: d["bounds"].pop("speed_ratio"), "speed_ratio"),
         (lambda d: d["bounds"].update(speed_ratio=0.9), "speed_ratio"),
-        (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"), "smaller"),
+        (
+            lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(worse="smaller"),
+            "'smaller', only away from 1, larger",
+        ),
         (lambda d: d["bounds"]["simulated"]["ate_se3_m"].update(margin_percent="1"), "margin_percent"),
         (lambda d: d["sequences"][0].update(seeds=[0, 0]), "seeds"),
         (lambda d: d["sequences"][0].update(runs={}), r"sequences\[0\].runs: expected object of length >= 1"),

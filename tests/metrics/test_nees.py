@@ -149,6 +149,16 @@ def test_missing_nees_has_its_reason(sequence, make_run):
     assert "not positive definite" in refused(sequence, indefinite)
 
 
+def test_a_pose_whose_covariance_is_not_fully_known_takes_no_part(sequence, make_run):
+    run = drawn(sequence, make_run)
+    cov = run.causal.cov.copy()
+    cov[::2, 5, 5] = np.nan
+    found = nees_over_time(Evaluation(replace(run, causal=replace(run.causal, cov=cov)), "causal", sequence))
+    whole = nees_over_time(Evaluation(run, "causal", sequence))
+    np.testing.assert_array_equal(found.t_ns, whole.t_ns[1::2])
+    np.testing.assert_array_equal(found.pose, whole.pose[1::2])
+
+
 def test_the_pose_is_the_first_block_of_a_larger_covariance(sequence, make_run):
     run = drawn(sequence, make_run)
     larger = np.tile(np.eye(15), (POSES, 1, 1))

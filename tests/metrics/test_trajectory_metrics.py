@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from toolkit.geometry import about_z, se3, se3_exp
+from toolkit.geometry import about_z, se3, se3_exp, transform
 from toolkit.metrics import score_run
 from toolkit.metrics._shared.alignment import fit_se3, fit_sim3, fit_yaw, place_yaw
 from toolkit.metrics._shared.scores import Unavailable
@@ -97,6 +97,10 @@ def test_placing_by_heading_recovers_a_pure_heading():
 def test_a_fit_needs_three_pairs():
     with pytest.raises(Unavailable, match="needs 3"):
         fit_se3(np.zeros((2, 3)), np.zeros((2, 3)))
+    corners = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 3.0]])
+    T_other_here = se3_exp(np.array([0.4, -1.1, 2.0, 3.0, -5.0, 7.0]))
+    fit = fit_se3(transform(T_other_here, corners), corners)
+    np.testing.assert_allclose(fit.rotation, T_other_here[:3, :3], atol=1e-14)  # an SVD of numbers near one
 
 
 def test_scale_has_no_fit_where_the_estimate_stands_still():
@@ -155,6 +159,14 @@ def test_short_paths_have_no_long_segments(make_sequence, drive, score):
     for key in ("kitti_t_percent", "kitti_r_deg_per_m", "rpe_100m_percent"):
         assert scores.values[key] is None
         assert "100 m" in scores.notes[key]
+
+
+@pytest.mark.parametrize(("step_m", "scored"), [(54.0, True), (56.0, False)])
+def test_a_pair_that_is_more_than_a_tenth_longer_than_100_m_is_left_out(make_sequence, score, step_m, scored):
+    """Two steps are the first beyond 100 m: 108 or 112."""
+    poses = se3(np.eye(3), np.outer(np.arange(30.0), [step_m, 0.0, 0.0]))
+    sequence = make_sequence(poses, track_count=3)
+    assert (score(sequence, poses).values["rpe_100m_percent"] is not None) == scored
 
 
 def test_end_drift_is_the_last_error_over_the_path(make_sequence, score):

@@ -11,20 +11,25 @@ import pytest
 
 from toolkit.audit import Finding
 from toolkit.estimate import Landmarks, Run, Timings, Trajectory
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, about_z, interpolate_poses, se3
-from toolkit.metrics import Scores, describe, score_run
+from toolkit.metrics import Scores
 from toolkit.models.stereo import triangulate_world
-from toolkit.report.comparison import Comparison, Row, outputs_of
-from toolkit.report.run_directory import write_run
+from toolkit.report.run_directory import MadeBy, write_run
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, simulate
 
+Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
+
+SEED = 3
 FINDING = Finding("stale-frames", 91, True, "91 of 1106 frames repeat the one before; their tracks end there", False)
 
 
 @pytest.fixture(scope="session")
 def sequence() -> Sequence:
-    return simulate(replace(DRIVE, duration_s=12.0), seed=3)
+    return simulate(replace(DRIVE, duration_s=12.0), seed=SEED)
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +55,7 @@ def without_truth(sequence: Sequence) -> Comparison:
 def run_directory(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run directory of the comparison; it is shared and must not be changed."""
     target = tmp_path_factory.mktemp("runs") / "made-up"
-    write_run(comparison, target, command="vislam compare made-up --seed 3", seed=3)
+    write_run(comparison, target, MadeBy("vislam compare made-up --seed 3", Configuration()))
     return target
 
 
@@ -70,16 +75,37 @@ def run_called(run_directory: Path, tmp_path: Path) -> Callable[[str], Path]:
     return copied
 
 
+@pytest.fixture(scope="session")
+def comparison_of() -> Callable[[Sequence, tuple[Run, ...]], Comparison]:
+    """Return a function that scores runs over a sequence and lays them side by side."""
+    return compared
+
+
+@pytest.fixture(scope="session")
+def rescored() -> Rescored:
+    """Return a function that gives every output of a comparison other scores, made from its row."""
+
+    def changed(comparison: Comparison, score: Callable[[Row], Scores]) -> Comparison:
+        scores = {(row.estimator, row.output): score(row) for row in comparison.rows}
+        outcomes = tuple(
+            replace(
+                outcome,
+                outputs={
+                    output: replace(scored, scores=scores[outcome.estimator, output])
+                    for output, scored in outcome.outputs.items()
+                },
+            )
+            for outcome in comparison.outcomes
+        )
+        return replace(comparison, outcomes=outcomes)
+
+    return changed
+
+
 def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:
     assert sequence.prior is not None
-    rows = tuple(Row(run, output, _scores(run, output, sequence)) for run in runs for output in outputs_of(run))
-    return Comparison(sequence, (FINDING,), sequence.prior, runs, rows)
-
-
-def _scores(run: Run, output: str, sequence: Sequence) -> Scores:
-    if run.status == "failed":
-        return Scores(dict.fromkeys(describe()), dict.fromkeys(describe(), "the run gave no trajectory"))
-    return score_run(run, output, sequence)
+    outcomes = tuple(outcome_of(run, sequence, SEED) for run in runs)
+    return Comparison("made-up", sequence, (FINDING,), sequence.prior, (SEED,), outcomes)
 
 
 def _run(name: str, sequence: Sequence, turn_rad: float, growth: float = 1.0) -> Run:

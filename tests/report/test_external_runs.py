@@ -11,9 +11,9 @@ from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Run, Trajectory
+from toolkit.experiment.references import external_runs, reference_runs
 from toolkit.geometry import Array, interpolate_poses, quaternion_from_rotation, rotation_from_quaternion, se3, se3_exp
 from toolkit.metrics import score_run
-from toolkit.report.references import external_runs, reference_runs
 from toolkit.sequence import Sequence, TwistSamples
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 

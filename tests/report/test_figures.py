@@ -1,17 +1,20 @@
 """Figures show the data: the same colours everywhere, equal scale from above, no point squashing the rest."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from toolkit.estimate import Landmarks
+from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, se3
-from toolkit.report.comparison import Comparison, Row
 from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
 from toolkit.report.figures.alignment import errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import colour_of, width_of
+
+ComparisonOf = Callable[..., Comparison]
 
 
 def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparison) -> None:
@@ -22,12 +25,12 @@ def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparis
         assert "[m]" in figure.axes[0].get_xlabel()
 
 
-def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison) -> None:
+def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, comparison_of: ComparisonOf) -> None:
     late = comparison.runs[2]
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
     spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
-    (figure, _) = (figure for _, _, figure in top_view.draw(replace(comparison, runs=(spoiled,))))
+    (figure, _) = (figure for _, _, figure in top_view.draw(comparison_of(comparison.sequence, (spoiled,))))
     low, high = figure.axes[0].get_xlim()
     assert high - low < 500.0
 
@@ -55,24 +58,25 @@ def test_equal_lines_do_not_hide_each_other(comparison: Comparison) -> None:
     assert all(above < below for below, above in itertools.pairwise(widths))
 
 
-def test_estimators_that_agree_to_rounding_look_so(without_truth: Comparison) -> None:
+def test_estimators_that_agree_to_rounding_look_so(without_truth: Comparison, comparison_of: ComparisonOf) -> None:
     late = without_truth.runs[1]
     assert late.final is not None
     rounded = replace(late.final, T_world_imu=late.final.T_world_imu * (1.0 + 1e-15))
     twins = (replace(late, estimator="twin", final=rounded), late)
-    rows = tuple(Row(run, "final", without_truth.rows[-1].scores) for run in twins)
-    (drawn,) = errors_over_time.draw(replace(without_truth, runs=twins, rows=rows))
+    (drawn,) = errors_over_time.draw(comparison_of(without_truth.sequence, twins))
     position, heading = drawn.figure.axes
     assert position.get_ylim()[1] >= 1e-3
     assert heading.get_ylim()[1] >= 1e-2
 
 
-def test_one_slow_step_at_the_end_does_not_bend_the_running_median(comparison: Comparison) -> None:
+def test_one_slow_step_at_the_end_does_not_bend_the_running_median(
+    comparison: Comparison, comparison_of: ComparisonOf
+) -> None:
     steady = comparison.runs[0]
     step_s = np.full(steady.timings.step_s.size, 1e-3)
     step_s[[0, -1]] = 1.0
     slow = replace(steady, timings=replace(steady.timings, step_s=step_s))
-    (drawn,) = frame_times.draw(replace(comparison, runs=(slow,)))
+    (drawn,) = frame_times.draw(comparison_of(comparison.sequence, (slow,)))
     dots, median = drawn.figure.axes[0].get_lines()
     assert np.max(dots.get_ydata()) == pytest.approx(1e3)
     assert np.max(median.get_ydata()) == pytest.approx(1.0)
@@ -91,6 +95,6 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
 
 @pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
-    broken = replace(comparison, runs=comparison.runs[3:], rows=comparison.rows[-1:])
+    broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)
     assert list(draw(broken)) == []

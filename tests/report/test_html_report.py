@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from toolkit.report.comparison import Comparison
 
 from toolkit.errors import DataError, OutputError
+from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.configuration import Configuration
 from toolkit.report.html import write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.page import SCRIPTS, json_in_html, page_text
 from toolkit.report.html.payload import payload_of
 from toolkit.report.html.run_files import read_run
 from toolkit.report.html.thinning import evenly, running_median, with_peaks
-from toolkit.report.run_directory import write_run
+from toolkit.report.run_directory import MadeBy, write_run
 
 Json = dict[str, Any]
 HOSTILE = "</script><script>window.broken = 1</script><!-- <img src=x onerror=alert(1)> {{ script }} \u2028"
@@ -36,7 +37,7 @@ def page(run_directory: Path) -> str:
 
 
 def written(comparison: Comparison, target: Path) -> Path:
-    write_run(comparison, target, command="vislam compare", seed=0)
+    write_run(comparison, target, MadeBy("vislam compare", Configuration()))
     return target
 
 

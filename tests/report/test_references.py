@@ -1,38 +1,31 @@
 """What another system made of a recording stands in the table as its own line, and nothing of it was run here."""
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from toolkit.report.comparison import Comparison
-from toolkit.report.references import reference_runs
 
 from toolkit.datasets import load_references, load_sequence
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
+from toolkit.experiment import Comparison, Plan, run
+from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.references import reference_runs
+from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.metrics import cost, score_run
-from toolkit.progress import SILENT
 from toolkit.report.figures import errors_over_time, frame_times
 from toolkit.report.records import read_metrics
-from toolkit.report.run_directory import Request, compare_all
+from toolkit.report.run_directory import MadeBy, write_run
 from toolkit.report.terminal import comparison_text
-from toolkit.runner import Progress
 from toolkit.sequence import Sequence
 from toolkit.simulation import FLIGHT, simulate
 
 NAME = "openvins (est.txt)"
 OFFSET_M = 0.25
-
-
-@contextmanager
-def quietly(_label: str) -> Iterator[Progress]:
-    with nullcontext():
-        yield SILENT
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +77,9 @@ def write_csv(path: Path, head: str, rows: Array) -> None:
 
 def compared(export: Path, max_frames: int | None = None) -> tuple[Comparison, Path]:
     out = export.parent / "run"
-    request = Request((str(export),), ("dead-reckoning",), out, max_frames=max_frames)
-    ((comparison, directory),) = compare_all(request, quietly)
-    return comparison, directory
+    (comparison,) = run(Plan((str(export),), ("dead-reckoning",), max_frames=max_frames))
+    write_run(comparison, out, MadeBy("vislam compare", Configuration()))
+    return comparison, out
 
 
 def entry(directory: Path) -> dict[str, dict[str, object]]:
@@ -191,8 +184,8 @@ def test_without_truth_the_others_are_not_measured_against_it(without_truth: Com
     steady = without_truth.runs[0]
     assert steady.causal is not None
     (read,) = reference_runs({NAME: Trajectory(steady.causal.t_ns, steady.causal.T_world_imu)}, without_truth.sequence)
-    row = replace(without_truth.rows[0], run=read)
-    mixed = replace(without_truth, runs=(*without_truth.runs, read), rows=(*without_truth.rows, row))
+    other = outcome_of(read, without_truth.sequence, seed=without_truth.seeds[0])
+    mixed = replace(without_truth, outcomes=(*without_truth.outcomes, other))
     (drawn,) = errors_over_time.draw(mixed)
     assert "difference from late final" in drawn.figure.axes[0].get_title(loc="left")
     (times,) = frame_times.draw(mixed)

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import to_builtins
-from toolkit.report.comparison import Comparison, Row
 
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
-from toolkit.metrics import score_run
+from toolkit.experiment.comparison import Comparison
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document
 
@@ -25,13 +24,11 @@ def build(comparison: Comparison) -> Document:
 
 
 @pytest.fixture(scope="module")
-def scored(run_estimator: Callable[..., Run]) -> Comparison:
+def scored(run_estimator: Callable[..., Run], comparison_of: Callable[..., Comparison]) -> Comparison:
     """A filter that states covariances and innovations, and one that does not, on a short simulated drive."""
     sequence = load_sequence("drive").truncated(40)
     runs = tuple(run_estimator(name, sequence) for name in ("ekf", "dead-reckoning"))
-    rows = tuple(Row(run, "causal", score_run(run, "causal", sequence)) for run in runs)
-    assert sequence.prior is not None
-    return Comparison(sequence, (), sequence.prior, runs, rows)
+    return comparison_of(sequence, runs)
 
 
 def of(document: Document, estimator: str, output: str = "causal") -> Document:

@@ -4,12 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
-from toolkit.report.comparison import Comparison
 
 from toolkit.errors import OutputError
+from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.configuration import Configuration
 from toolkit.report import run_directory
 from toolkit.report.records import read_manifest, read_metrics
-from toolkit.report.run_directory import check_run_directory, write_run
+from toolkit.report.run_directory import MadeBy, check_run_directory, write_run
 from toolkit.report.scores_json import metrics_document
 
 # Where it does not matter what is in a figure's file.
@@ -17,7 +18,7 @@ unrendered = pytest.mark.usefixtures("unrendered")
 
 
 def write(comparison: Comparison, target: Path) -> None:
-    write_run(comparison, target, command="vislam compare", seed=0)
+    write_run(comparison, target, MadeBy("vislam compare", Configuration()))
 
 
 def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
@@ -43,7 +44,10 @@ def test_the_manifest_says_how_to_repeat_the_run(comparison: Comparison, tmp_pat
     assert manifest["command"] == "vislam compare"
     assert manifest["sequence"]["hash"] == comparison.sequence.content_hash()
     assert all(manifest["versions"][name] for name in ("toolkit", "python", "numpy", "gtsam", "opencv", "scipy"))
-    assert manifest.keys() >= {"git_revision", "seeds", "threads", "cpu", "os", "date", "start"}
+    assert manifest.keys() >= {"git_revision", "seeds", "threads", "cpu", "os", "date", "start", "settings"}
+    assert manifest["seeds"] == {"sequence": 3}
+    assert manifest["compare"]["sequences"] == ["made-up"]
+    assert manifest["compare"]["estimators"] == ["steady", "astray", "late", "broken"]
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
@@ -53,7 +57,7 @@ def test_a_failure_while_writing_leaves_nothing(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(run_directory, "write_figures", fail)
+    monkeypatch.setattr(run_directory, "drawn", fail)
     with pytest.raises((KeyboardInterrupt, OutputError)):
         write(comparison, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
@@ -69,7 +73,7 @@ def test_a_failure_while_writing_keeps_the_earlier_run(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_directory, "write_figures", fail)
+    monkeypatch.setattr(run_directory, "drawn", fail)
     with pytest.raises(KeyboardInterrupt):
         write(comparison, tmp_path / "run")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -1,16 +1,18 @@
 """metrics.json holds every score there is, and says why one is missing."""
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from toolkit.report.comparison import Comparison
 
 from toolkit.documents import parse, to_text
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, describe
 from toolkit.report.records.metrics import PROMISED_KEYS, Metrics
 from toolkit.report.scores_json import metrics_document
+
+Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +55,8 @@ def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], w
     assert blind.sequence.path_m is None
 
 
-def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison) -> None:
+def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:
     scores = Scores(dict.fromkeys(describe(), float("nan")), {})
-    broken = replace(comparison, rows=(replace(comparison.rows[0], scores=scores),))
-    built = metrics_document(broken)
+    built = metrics_document(rescored(comparison, lambda _: scores))
     assert parse(to_text(built), Metrics) == built
     assert built.runs[0].metrics["ate_se3_m"] is None

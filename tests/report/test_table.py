@@ -1,18 +1,21 @@
 """The table says everything a reader needs, in 100 characters, in text and in Markdown."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from toolkit.report.comparison import Comparison, Row
 
 from toolkit.errors import VislamError
 from toolkit.estimator import discover
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, known_metrics
 from toolkit.report.report_md import report_text
 from toolkit.report.table import Table, as_markdown, as_text, change_lines, comparison_table, heading, shown_metrics
 from toolkit.report.terminal import comparison_text
+
+Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 
 
 def test_every_output_of_every_run_has_a_line_or_shares_one(comparison: Comparison) -> None:
@@ -22,12 +25,12 @@ def test_every_output_of_every_run_has_a_line_or_shares_one(comparison: Comparis
         assert lines.count([row.estimator, label, row.status]) == 1
 
 
-def test_outputs_that_differ_have_lines_of_their_own(comparison: Comparison) -> None:
+def test_outputs_that_differ_have_lines_of_their_own(
+    comparison: Comparison, comparison_of: Callable[..., Comparison]
+) -> None:
     run = next(run for run in comparison.runs if run.final_is_causal)
     moved = replace(run.final, T_world_imu=run.final.T_world_imu + np.eye(4, k=3)[None])
-    parted = replace(run, final=moved)
-    rows = tuple(replace(row, run=parted) if row.run is run else row for row in comparison.rows)
-    table = comparison_table(replace(comparison, rows=rows))
+    table = comparison_table(comparison_of(comparison.sequence, (replace(run, final=moved),)))
     assert [cells[1] for cells in table.rows if cells[0] == run.estimator] == ["causal", "final"]
 
 
@@ -38,10 +41,11 @@ def test_text_and_markdown_have_the_same_cells(comparison: Comparison) -> None:
     assert in_markdown == in_text == [list(row) for row in table.rows]
 
 
-def shared_by_all(comparison: Comparison, **values: float) -> Comparison:
-    """Return the comparison with the same values of some metrics in every row."""
-    rows = (replace(row, scores=Scores(row.scores.values | values, {})) for row in comparison.rows)
-    return replace(comparison, rows=tuple(rows))
+@pytest.fixture
+def shared_by_all(comparison: Comparison, rescored: Rescored) -> Callable[..., Comparison]:
+    """Return a function that gives every output that there is the same values of some metrics."""
+    answered = replace(comparison, outcomes=tuple(outcome for outcome in comparison.outcomes if outcome.outputs))
+    return lambda **values: rescored(answered, lambda row: Scores(row.scores.values | values, {}))
 
 
 def test_alignments_are_named(comparison: Comparison) -> None:
@@ -56,17 +60,20 @@ def test_pairs_and_coverage_are_columns_where_rows_differ_or_lack_them(compariso
     assert "scored:" not in comparison_text(comparison)
 
 
-def test_pairs_and_coverage_that_all_rows_share_stand_above_the_table(comparison: Comparison) -> None:
-    same = shared_by_all(comparison, pairs=120.0, coverage_percent=97.5)
+def test_pairs_and_coverage_that_all_rows_share_stand_above_the_table(shared_by_all: Callable[..., Comparison]) -> None:
+    same = shared_by_all(pairs=120.0, coverage_percent=97.5)
     assert comparison_text(same).splitlines()[1] == "scored: coverage 97.5 %, pairs 120"
     assert "pairs" not in as_text(comparison_table(same))
 
 
-def test_pairs_that_differ_are_told_with_columns_that_leave_them_out(comparison: Comparison) -> None:
-    same = shared_by_all(comparison, pairs=120.0, coverage_percent=100.0)
-    first = same.rows[0]
-    fewer = replace(first, scores=Scores(first.scores.values | {"pairs": 90.0}, {}))
-    text = comparison_text(replace(same, rows=(fewer, *same.rows[1:])), ("ate_se3_m",))
+def test_pairs_that_differ_are_told_with_columns_that_leave_them_out(
+    shared_by_all: Callable[..., Comparison], rescored: Rescored
+) -> None:
+    same = shared_by_all(pairs=120.0, coverage_percent=100.0)
+    fewer = rescored(
+        same, lambda row: Scores(row.scores.values | ({"pairs": 90.0} if row.estimator == "steady" else {}), {})
+    )
+    text = comparison_text(fewer, ("ate_se3_m",))
     assert text.splitlines()[1] == "scored: coverage 100.0 %, pairs 90 to 120"
 
 
@@ -118,11 +125,10 @@ def test_a_table_without_rows_keeps_its_headings() -> None:
     [(0.123, "0.12"), (15.8, "15.80"), (123.456, "123.5"), (26509.65, "26510"), (3.2e11, "3e+11"), (None, "-")],
 )
 def test_large_numbers_lose_decimals_before_they_take_space(
-    comparison: Comparison, value: float | None, cell: str
+    comparison: Comparison, rescored: Rescored, value: float | None, cell: str
 ) -> None:
-    row = comparison.rows[0]
-    scores = Scores(row.scores.values | {"ate_yaw_m": value, "ate_se3_m": 1.0}, {})
-    table = comparison_table(replace(comparison, rows=(replace(row, scores=scores),)))
+    changed = {"ate_yaw_m": value, "ate_se3_m": 1.0}
+    table = comparison_table(rescored(comparison, lambda row: Scores(row.scores.values | changed, {})))
     cells = dict(zip(table.headings, table.rows[0], strict=True))
     assert cells.get(("ATE", "yaw", "m"), "-") == cell
 
@@ -169,14 +175,15 @@ def test_a_recording_without_image_features_says_so(comparison: Comparison) -> N
         assert "can only integrate the measured motion" in text
 
 
-def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(comparison: Comparison) -> None:
-    def remarked(row: Row) -> Row:
+def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    def remarked(row: Row) -> Scores:
         values = dict(row.scores.values) | {"ate_yaw_m": 1.0, "reproj_median_px": 1.0, "reproj_rmse_px": 1.0}
         notes = {"ate_yaw_m": "tilted", "reproj_median_px": "half of them", "reproj_rmse_px": "half of them"}
-        return replace(row, scores=Scores(values, notes))
+        return Scores(values, notes)
 
-    rows = tuple(remarked(row) for row in comparison.rows[:2])
-    told = replace(comparison, runs=comparison.runs[:1], rows=rows)
+    told = rescored(replace(comparison, outcomes=comparison.outcomes[:1]), remarked)
     assert "ate_yaw_m: tilted" in comparison_text(told)
     assert "half of them" not in comparison_text(told)
     report = report_text(told, {})

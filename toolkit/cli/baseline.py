@@ -113,11 +113,11 @@ def command_to_keep(words: list[str]) -> str:
 def _cases(options: argparse.Namespace) -> list[Case]:
     """Return the cases the command line asks for."""
     from toolkit.datasets import is_drawn_from_a_seed
-    from toolkit.estimator import find_all
+    from toolkit.estimator import defaults, find_all
     from toolkit.gate.baseline import Case
     from toolkit.gate.measuring import located
 
-    estimators = tuple(find_all(options.estimators))
+    estimators = tuple(find_all(options.estimators or defaults()))
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
     cases = []
     for given in options.sequences:

@@ -53,6 +53,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, write_check
     from toolkit.report.gate_text import gate_text
+    from toolkit.report.prose import width_of_output
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
     for path in files.values():
@@ -63,5 +64,5 @@ def command(options: argparse.Namespace) -> int:
     how = How(options.workers or usable_cpus(), speed=not options.skip_speed)
     checked = check(baseline, str(options.baseline), how, of_this_process())
     write_check(checked, files)
-    print(gate_text(checked))
+    print(gate_text(checked, width_of_output()))
     return 0 if checked.passed else 1

@@ -32,9 +32,10 @@ def command(options: argparse.Namespace) -> int:
     """Print the audit and return 1 where a fault stays that must not."""
     from toolkit.audit import faults
     from toolkit.experiment.recording import Recording, audited_recording
+    from toolkit.report.prose import width_of_output
     from toolkit.report.terminal import audit_text
 
     keep = kept_faults(options, faults())
     audited = audited_recording(Recording(options.sequence, options.seed, options.truth, keep))
-    print(audit_text(audited))
+    print(audit_text(audited, width_of_output()))
     return 1 if any(finding.blocking for finding in audited.findings) else 0

@@ -80,6 +80,7 @@ def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
     from toolkit.experiment import comparisons, prepared_cases
     from toolkit.progress import of_this_process, print_above
+    from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
     from toolkit.report.table import columns_asked
     from toolkit.report.terminal import comparison_text
@@ -92,7 +93,7 @@ def command(options: argparse.Namespace) -> int:
     made_by = MadeBy(shlex.join(options.command_line), asked)
     all_ok = True
     for comparison, directory in zip(comparisons(plan, cases, progress_for), directories, strict=True):
-        print_above(comparison_text(comparison, columns))
+        print_above(comparison_text(comparison, columns, width_of_output()))
         with progress_for(f"{comparison.name}: figures and report"):
             write_run(comparison, directory, made_by)
         print_above(f"\nresults: {directory}\n")

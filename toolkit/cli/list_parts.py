@@ -1,4 +1,4 @@
-"""``vislam list``: every estimator, sequence, format, metric and fault there is."""
+"""``vislam list``: every estimator, sequence, format, metric, fault and setting there is."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from toolkit.cli.arguments import epilog
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
+    from toolkit.estimator import EstimatorEntry
+    from toolkit.settings import Described
 
 
 def add_to(subcommands: Subcommands) -> None:
     """Add the subcommand."""
     parser = subcommands.add_parser(
         "list",
-        help="list estimators, built-in sequences, formats, metrics and faults",
+        help="list estimators, built-in sequences, formats, metrics, faults and settings",
         description="List what can be named on the command line: estimators, built-in sequences, the formats that "
-        "are recognised, metrics, and the faults the audit knows.",
+        "are recognised, metrics, the faults the audit knows, and settings.",
         epilog=epilog("vislam list"),
     )
     parser.set_defaults(command=command)
@@ -29,17 +31,29 @@ def command(_options: argparse.Namespace) -> int:
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.estimator import discover
+    from toolkit.report.prose import width_of_output
     from toolkit.report.terminal import listing_text
+    from toolkit.settings import describe
 
     sections = {
-        "estimators": {name: entry.summary() for name, entry in discover().items()},
+        "estimators": {name: _estimator(entry) for name, entry in discover().items()},
         "built-in sequences": dict.fromkeys(datasets.built_in_names(), ""),
         "formats": datasets.formats() | _marked(datasets.unavailable()),
         "metrics": metrics.describe() | _marked(metrics.unavailable()),
         "faults": faults(),
+        "settings": {one.key: _setting(one) for one in describe()},
     }
-    print("\n\n".join(listing_text(title, entries) for title, entries in sections.items()))
+    print("\n\n".join(listing_text(title, entries, width_of_output()) for title, entries in sections.items()))
     return 0
+
+
+def _estimator(entry: EstimatorEntry) -> str:
+    return f"{entry.summary()} (default)" if entry.is_default() else entry.summary()
+
+
+def _setting(one: Described) -> str:
+    facts = (one.unit, f"default {one.default}", one.range)
+    return f"{one.meaning} [{', '.join(filter(None, facts))}]"
 
 
 def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:

@@ -15,7 +15,7 @@ from toolkit.settings import Settings, SettingsError, as_values, read_toml, sett
 COMPARE = "compare"
 
 
-class Request(Struct, frozen=True, forbid_unknown_fields=True):
+class Request(Struct, frozen=True):
     """What to compare, named as the arguments of the command line; paths are from the folder one is in."""
 
     sequences: tuple[str, ...] | None = None

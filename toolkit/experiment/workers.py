@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -144,6 +145,8 @@ class _Pool(Generic[T, R]):
 
 @contextmanager
 def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
+    # Started with the first process, Python's own tracker would let interrupts through to it again.
+    resource_tracker.ensure_running()
     executor = ProcessPoolExecutor(workers, initializer=_begin, env=_ONE_THREAD)
     try:
         yield executor

@@ -92,9 +92,13 @@ class BaselineRecord(Struct, frozen=True, kw_only=True):
     false_alarm_rate: Annotated[float, Meta(description="of all statistical tests of a check together", gt=0, lt=1)]
     bounds: BoundsRecord
     sequences: Annotated[tuple[CaseRecord, ...], Meta(min_length=1)]
-    settings: Annotated[
-        dict[str, Any], Meta(description="those of every run that are no defaults; a default that changes is measured")
-    ] = {}
+    settings: (
+        Annotated[
+            dict[str, Any],
+            Meta(description="those of every run that are no defaults; a default that changes is measured"),
+        ]
+        | UnsetType
+    ) = UNSET
 
 
 def load_baseline(path: Path) -> Baseline:
@@ -141,7 +145,7 @@ def document(baseline: Baseline) -> BaselineRecord:
         releases=dict(baseline.releases),
         false_alarm_rate=baseline.false_alarm_rate,
         bounds=_bounds_record(baseline.bounds),
-        settings=changes_of(baseline.settings),
+        settings=changes_of(baseline.settings) or UNSET,
         sequences=tuple(_case_record(case, measured) for case, measured in baseline.cases),
     )
 
@@ -154,7 +158,7 @@ def from_document(record: BaselineRecord) -> Baseline:
         _bounds(record.bounds),
         record.false_alarm_rate,
         {name: str(value) for name, value in record.made_by.items()},
-        settings_of(record.settings, "the baseline's settings"),
+        settings_of({} if record.settings is UNSET else record.settings, "the baseline's settings"),
     )
 
 

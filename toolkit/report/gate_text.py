@@ -1,14 +1,13 @@
 """A check of the gate for people: the verdict in one line, a table of everything, what failed and why, what to know."""
 
-import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from toolkit.gate.bounded import SHOWN
 from toolkit.gate.verdict import Check, Verdict
 from toolkit.metrics import known_metrics
+from toolkit.report.prose import WIDTH, Width, section
 from toolkit.report.table import Table, as_markdown, as_text, number
 
-_WIDTH = 100
 _MISSING = "-"
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
 _NUMBERS = (
@@ -109,11 +108,11 @@ def note_lines(check: Check) -> Iterator[str]:
     yield f"{releases}; {check.seconds:.0f} s"
 
 
-def gate_text(check: Check) -> str:
+def gate_text(check: Check, width: Width = WIDTH) -> str:
     """Return a check as plain text: the table of everything, the notes, and last what it comes to."""
     lines = [as_text(gate_table(check)), ""]
-    lines += _section("notes", note_lines(check))
-    lines += _section("fails", failure_lines(check))
+    lines += section("notes", note_lines(check), width)
+    lines += section("fails", failure_lines(check), width)
     return "\n".join([*lines, "", headline(check)])
 
 
@@ -131,9 +130,3 @@ def gate_markdown(check: Check) -> str:
 
 def _sentence(text: str) -> str:
     return text[0].upper() + text[1:] + "."
-
-
-def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
-    for i, entry in enumerate(entries):
-        label = f"{title}:" if i == 0 else ""
-        yield textwrap.fill(entry, _WIDTH, initial_indent=f"{label:<7}", subsequent_indent=" " * 9)

@@ -6,38 +6,11 @@ from msgspec import Meta, Struct
 
 from toolkit.estimate import Output, Status
 
-# The keys every document of the contract has, whatever metrics were added since: those of its first version. A metric
-# that is added later is not entered here, for documents written before it do not have it.
-PROMISED_KEYS = (
-    "ate_none_m",
-    "ate_se3_m",
-    "ate_yaw_m",
-    "ate_sim3_m",
-    "ate_se3_deg",
-    "rpe_1s_m",
-    "rpe_1s_deg",
-    "rpe_100m_percent",
-    "kitti_t_percent",
-    "kitti_r_deg_per_m",
-    "end_drift_percent",
-    "reproj_median_px",
-    "reproj_rmse_px",
-    "heldout_reproj_median_px",
-    "heldout_reproj_rmse_px",
-    "nis_mean",
-    "nees_pose_mean",
-    "nees_ori_mean",
-    "nees_pos_mean",
-    "nees_pose_in_band_percent",
-    "coverage_percent",
-    "pairs",
-    "frame_ms_mean",
-    "frame_ms_p95",
-    "frame_ms_max",
-    "total_s",
-    "cpu_s",
-    "peak_rss_mb",
-)
+# The keys every document of the contract has, whatever metrics were added since: those of its first version, as the
+# metric files say.
+from toolkit.metrics import contract_keys
+
+PROMISED_KEYS = contract_keys()
 ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
 
 MotionKind = Literal["twist", "imu"]

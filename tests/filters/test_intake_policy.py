@@ -1,0 +1,86 @@
+"""What an estimator takes in: how near a point must be to become a landmark, and how long the past stays open."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.geometry import se3_inverse, transform
+from toolkit.models import stereo
+from toolkit.sequence import Observations, Sequence, is_held_out
+from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
+from toolkit.simulation.scenarios import noise_free
+
+LAG_S, RATE_HZ = 2.0, 10.0
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return simulate(noise_free(replace(DRIVE, duration_s=0.6)), 0)
+
+
+def with_points(sequence: Sequence, points: np.ndarray) -> tuple[Sequence, list[int]]:
+    """Add exact sightings of points (N, 3) in the world from every frame; return their tracks too."""
+    seen, poses = sequence.observations, sequence.truth.T_world_imu
+    free = np.arange(10**6, 10**6 + 100)
+    ids = free[~is_held_out(free)][: len(points)]
+    T_cam_world = se3_inverse(poses @ sequence.rig.T_imu_cam)
+    uv_px = np.concatenate([stereo.project(transform(T, points), sequence.rig) for T in T_cam_world])
+    frame = np.concatenate([seen.frame, np.repeat(np.arange(len(poses)), len(points))])
+    track = np.concatenate([seen.track_id, np.tile(ids, len(poses))])
+    everything = Observations.sorted(frame, track, np.concatenate([seen.uv_px, uv_px]))
+    return replace(sequence, observations=everything), ids.tolist()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "mapping",
+        "seed-ekf",
+        "ekf",
+        "ekf-slam",
+        "iekf",
+        "riekf",
+        "msckf",
+        "msckf-slam",
+        "fixed-lag",
+        "isam2",
+        "smart",
+        "batch",
+    ],
+)
+def test_a_landmark_has_a_disparity_of_a_pixel_or_more(exact, run_estimator, name):
+    """With less, a pixel of noise is worth more than the depth itself. The car drives 6 m: 1.2 px stays below 1.3."""
+    rig = exact.rig
+    ahead = np.array([[0.0, 0.0, rig.fx_px * rig.baseline_m / disparity_px] for disparity_px in (0.8, 1.2)])
+    sequence, (far, near) = with_points(exact, transform(exact.truth.T_world_imu[0] @ rig.T_imu_cam, ahead))
+    known = run_estimator(name, sequence).landmarks.track_ids
+    assert near in known
+    assert far not in known
+
+
+@pytest.mark.parametrize(("scenario", "poses"), [(DRIVE, 6), (DRIVE_IMU, 13)], ids=["twist", "imu"])
+@pytest.mark.parametrize("name", ["msckf", "msckf-fej"])
+def test_a_track_corrects_the_window_once_it_spans_it(run_estimator, name, scenario, poses):
+    """Twists tie the poses of half a second well enough, an IMU those of 1.2 s; a pose adds three rows to a track."""
+    sequence = simulate(noise_free(replace(scenario, duration_s=1.5)), 0)
+    seen = sequence.observations
+    at_first = seen.track_id[seen.frame == 0]
+    longest = max(at_first[~is_held_out(at_first)], key=lambda i: int((seen.track_id == i).sum()))
+    alone = replace(sequence, observations=seen.select(seen.track_id == longest))
+    dof = run_estimator(name, alone).info["nis_dof"]
+    assert int(np.flatnonzero(dof > 0)[0]) == poses - 1
+    assert dof.max() == 3 * poses - 3
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "smart"])
+def test_a_state_is_open_to_what_is_seen_within_the_lag(run_estimator, name):
+    """All sightings of a frame are moved by 2 px: the pose 1.9 s before it changes, that 2.2 s before does not."""
+    sequence = simulate(replace(DRIVE, duration_s=LAG_S + 1.0), 0)
+    seen, changed = sequence.observations, 28
+    moved = seen.uv_px + np.where(seen.frame == changed, 1.0, 0.0)[:, None] * np.array([2.0, 2.0, 0.0])
+    as_is = run_estimator(name, sequence).final.T_world_imu
+    otherwise = run_estimator(name, replace(sequence, observations=replace(seen, uv_px=moved))).final.T_world_imu
+    changed_poses = np.flatnonzero((as_is != otherwise).any(axis=(1, 2)))
+    within = changed - round(LAG_S * RATE_HZ)
+    assert within - 1 <= changed_poses[0] <= within + 1

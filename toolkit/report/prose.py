@@ -1,0 +1,29 @@
+"""Lines of prose for a terminal: wrapped to a width, or whole where they go into a file or a pipe."""
+
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator
+
+# Of tables and of prose beside them.
+WIDTH = 100
+Width = int | None
+_LABEL = 7
+
+
+def width_of_output() -> Width:
+    """Return the width of prose on standard output: None where nobody but a program may read the lines."""
+    return WIDTH if sys.stdout.isatty() else None
+
+
+def filled(text: str, width: Width, first: str = "", further: str = "  ") -> str:
+    """Return a text in lines no wider than ``width``, behind what its first line and the others begin with."""
+    if width is None:
+        return first + text
+    return textwrap.fill(text, width, initial_indent=first, subsequent_indent=further)
+
+
+def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
+    """Yield entries under a title that stands before the first."""
+    for i, entry in enumerate(entries):
+        label = f"{title}:" if i == 0 else ""
+        yield filled(entry, width, f"{label:<{_LABEL}}", " " * (_LABEL + 2))
