@@ -37,7 +37,7 @@ class Isam2:
     """Adds a packet to the tree and reads the newest state; reads all of them in the end."""
 
     def __init__(self, setup: Setup) -> None:
-        self._rig = setup.rig
+        self._rig, self._progress = setup.rig, setup.progress
         self._builder = GraphBuilder(setup)
         self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m)
         self._stamps_ns: list[int] = []
@@ -58,7 +58,7 @@ class Isam2:
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
         graph, motion = self._tree.graph(), self._builder.motion
-        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping())
+        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping(), self._progress)
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(

@@ -23,7 +23,7 @@ _LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
 FAR_STEP = float(chdtri(6, 1e-6))
 # Mismatches and poor noise figures make some steps far in healthy runs too: up to one in seven where frames are stale
-# and tracks slip, by estimators that end within 2 m of each other after 1.3 km. A sixth of all is no accident.
+# and tracks go wrong, by estimators that end within 2 m of each other after 1.3 km. A sixth of all is no accident.
 MOST_FAR_STEPS = 1.0 / 6.0
 # The gate passes 95 % of sound measurements, and still 65 % where tracks go wrong all the time. A filter whose
 # covariance does not cover its error rejects nearly all measurements, and from then on: so much must pass in the whole

@@ -3,8 +3,8 @@
 With the landmarks eliminated first and the states in the order of time, each state is a linear function of a few
 later ones plus noise: ``x = -R^-1 S x_S + n``. So the joint covariance of a short stretch of states, carried from
 the end to the beginning, yields every state's (Golub & Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery
-from a square root information matrix for data association"). GTSAM's Marginals asks its Bayes tree anew for each
-state, which takes a hundred times as long.
+from a square root information matrix for data association"). GTSAM's Marginals traverses its Bayes tree anew for
+each state, which takes a hundred times as long.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from toolkit.models.motion import MotionModel
 def with_covariances(
     trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Return the trajectory with the covariance of every state, or as it is and a line that says why."""
+    """Return the trajectory with the covariance of every state, or as it is and the reason."""
     try:
         covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
     except RuntimeError as refusal:

@@ -35,10 +35,10 @@ class GraphBuilder:
     """Turns packets into what they add to a graph; remembers which landmarks the graph has."""
 
     def __init__(self, setup: Setup) -> None:
-        self._setup = setup
-        self._outliers = setup.settings.outliers
-        huber = gtsam.noiseModel.mEstimator.Huber.Create(self._outliers.smoother_huber)
+        self._rig, outliers = setup.rig, setup.settings.outliers
+        huber = gtsam.noiseModel.mEstimator.Huber.Create(outliers.smoother_huber)
         self._stereo = StereoFactors(setup.rig, huber)
+        self._outlier_check = OutlierCheck(setup.rig, outliers.gate_probability)
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -47,8 +47,8 @@ class GraphBuilder:
         """Return what a packet adds, the new state being predicted from the latest known."""
         extension = GraphExtension()
         expected = self._add_state(packet, extension)
-        check = OutlierCheck(self._setup.rig, self._outliers.gate_probability)
-        self._add_sightings(check.without_outliers(packet.frame, self._points, expected), packet.index, extension)
+        sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
+        self._add_sightings(sound, packet.index, extension)
         return extension
 
     def update(self, newest: Estimate, points: Mapping[int, Array]) -> None:
@@ -83,7 +83,7 @@ class GraphBuilder:
         known = np.array([i in self._points for i in frame.track_ids.tolist()], dtype=bool)
         used = frame.select(known | near)
         new = frame.select(~known & near)
-        points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._setup.rig)
+        points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._rig)
         for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
             extension.values.insert(L(track_id), point)
         for factor in self._stereo.of(used, k):

@@ -1,7 +1,7 @@
-"""iSAM2 that goes on where GTSAM's stops: it drops the landmark, or solves by QR, and says so.
+"""iSAM2 that recovers where GTSAM's throws: it drops the landmark, or solves by QR, and returns what it did.
 
 Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation.
-Landmarks are eliminated first and states in the order of time, the newest last: new sightings then reach few
+Landmarks are eliminated first and states in the order of time, the newest last: new sightings then change few
 cliques, and the marginal of the newest state stands in the root.
 """
 

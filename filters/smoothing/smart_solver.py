@@ -20,8 +20,8 @@ MOST_ITERATIONS = 5
 # Newton's method doubles its digits: after a step of so few sigmas of all states together the next is of a tenth of
 # one, and is taken with the next frame. Where a step gains hardly anything, the rest gain nothing.
 LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
-# Only for a step that fails: a millionth of what the sightings say of one pose, given the rest, is more than is known
-# of position and heading in the world, and would hold them where they were.
+# Only for a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than there
+# is on position and heading in the world, and would hold them where they were.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
 
 

@@ -28,7 +28,7 @@ class MarginalPrior:
 
     @classmethod
     def nothing(cls) -> "MarginalPrior":
-        """Return the prior that says nothing."""
+        """Return a prior without information."""
         return cls(np.zeros((0, 0)), np.zeros(0), gtsam.Values())
 
 
