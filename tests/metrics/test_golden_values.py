@@ -189,7 +189,6 @@ GOLDEN: dict[tuple[str, bool], dict[str, float]] = {
 def test_every_metric_has_the_value_written_down(drifting, motion, known_start):
     sequence, run = drifting(motion, known_start)
     expected = GOLDEN[motion, known_start]
-    assert set(expected) == set(describe()) - {metric.key for metric in cost.METRICS}
     values = score_run(run, "causal", sequence).values
     for key, value in expected.items():
         # The held-out points come from an iteration, which stops a little elsewhere where LAPACK rounds otherwise.
