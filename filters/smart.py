@@ -16,7 +16,7 @@ import numpy as np
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera, Sightings
 from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
-from filters.smoothing.smart_window import MarginalPrior, TrackedWindow, Window
+from filters.smoothing.smart_window import MarginalPrior, SmartWindow, TrackedWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -131,7 +131,7 @@ class Smart:
 
 def _nothing() -> TrackedWindow:
     none = np.empty(0, dtype=np.int64)
-    window = Window(
+    window = SmartWindow(
         (), gtsam.Values(), (), MarginalPrior.nothing(), Sightings(none, none, np.empty((0, 3))), np.empty((0, 3))
     )
     return TrackedWindow(window, none)

@@ -42,7 +42,7 @@ class PullStep(NamedTuple):
     length: float
 
 
-class Iterated(NamedTuple):
+class IterationResult(NamedTuple):
     """The best correction that was found, and whether it is the most probable one."""
 
     best: Iterate
@@ -108,19 +108,19 @@ class Measurement:
         return rows.H[self.rows].reshape(-1, rows.H.shape[2]), rows.residuals[self.rows].reshape(-1)
 
 
-def most_probable(measurement: Measurement) -> Iterated:
+def most_probable(measurement: Measurement) -> IterationResult:
     """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
     part = joint_landmarks.columns(measurement.prediction)
     now = measurement.after(np.zeros(part.stop - part.start))
     for _ in range(MOST_STEPS):
         step = measurement.step(now)
         if step.length < NEGLIGIBLE_STEP:
-            return Iterated(measurement.after(now.pull + step.pull), converged=True)
+            return IterationResult(measurement.after(now.pull + step.pull), converged=True)
         lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
         if lower is None:
-            return Iterated(now, converged=False)
+            return IterationResult(now, converged=False)
         now = lower
-    return Iterated(now, converged=False)
+    return IterationResult(now, converged=False)
 
 
 def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:

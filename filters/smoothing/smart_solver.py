@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
 from filters.smoothing.smart_factors import RobustCamera, Sightings
-from filters.smoothing.smart_window import Evaluated, MarginalPrior, System, Window
+from filters.smoothing.smart_window import Evaluated, MarginalPrior, SmartWindow, System
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 
@@ -29,7 +29,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
 class SolvedWindow:
     """A window at its minimum and the root of the information it was last linearised to, a step short of that."""
 
-    window: Window
+    window: SmartWindow
     root: Array
 
     def cov(self, i: int) -> Array:
@@ -43,7 +43,7 @@ class SolvedWindow:
         return np.asarray(half.T @ half)
 
 
-def solve_window(window: Window, camera: RobustCamera) -> SolvedWindow:
+def solve_window(window: SmartWindow, camera: RobustCamera) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -64,7 +64,7 @@ def solve_window(window: Window, camera: RobustCamera) -> SolvedWindow:
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
 
-def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
+def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> SmartWindow:
     """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
     seen = window.sightings
     leaving_points = np.unique(seen.point[seen.pose < count])
@@ -82,10 +82,10 @@ def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
     kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
     prior = MarginalPrior(information, vector, values)
     motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
-    return Window(window.keys[count:], values, motion, prior, kept, window.points)
+    return SmartWindow(window.keys[count:], values, motion, prior, kept, window.points)
 
 
-def _only(window: Window, points: IntArray) -> Window:
+def _only(window: SmartWindow, points: IntArray) -> SmartWindow:
     """Return the window with some points (M,), by their ascending rows, and their sightings."""
     seen = window.sightings.of_points(points)
     rows = np.searchsorted(points, seen.point).astype(np.int64)
@@ -114,7 +114,7 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
     return _DescentStep(here, 0.0, damping)
 
 
-def _moved(window: Window, system: System, step: Array) -> Window:
+def _moved(window: SmartWindow, system: System, step: Array) -> SmartWindow:
     """Return the window a step (D,) of its states on, its landmarks with them."""
     delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
     for key in window.all_keys:

@@ -33,7 +33,7 @@ class MarginalPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class SmartWindow:
     """States in the order of time, their keys (each [pose, velocity, bias] or [pose, bias]) and what holds them.
 
     ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
@@ -66,7 +66,7 @@ class Window:
 class TrackedWindow:
     """A window and the track ids (M,) of its points."""
 
-    window: Window
+    window: SmartWindow
     track_ids: IntArray
 
     def points_by_id(self) -> dict[int, Array]:
@@ -136,13 +136,13 @@ class System:
 class Evaluated:
     """A window and what it costs where it is: half the squared errors, Huber's losses, the prior's."""
 
-    window: Window
+    window: SmartWindow
     motion: gtsam.GaussianFactorGraph
     off_prior: Array
     vision: Vision
 
     @classmethod
-    def of(cls, window: Window, camera: RobustCamera) -> "Evaluated":
+    def of(cls, window: SmartWindow, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
         return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
@@ -188,7 +188,7 @@ def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFa
     return whole
 
 
-def _off_prior(window: Window) -> Array:
+def _off_prior(window: SmartWindow) -> Array:
     """Return how far (D,) the prior's states are from the values it is about."""
     about = window.prior.about
     held = [key for key in window.all_keys if about.exists(key)]

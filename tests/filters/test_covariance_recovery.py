@@ -17,15 +17,15 @@ SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, dura
 
 @pytest.mark.parametrize("scenario", SHORT)
 def test_every_state_has_gtsams_marginal(scenario, run_estimator, monkeypatch):
-    asked = []
+    calls = []
 
     def spy(linear, landmark_keys, motion, poses):
-        asked.append((linear, motion, poses))
+        calls.append((linear, motion, poses))
         return state_covs(linear, landmark_keys, motion, poses)
 
     monkeypatch.setattr(covariance_recovery, "state_covs", spy)
     run = run_estimator("batch", simulate(SHORT[scenario], 3))
-    (linear, motion, poses) = asked[0]
+    (linear, motion, poses) = calls[0]
     tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
     for k in range(0, len(poses), 5):
         expected = state_cov(motion, tree, k, poses[k, :3, :3])

@@ -1,4 +1,4 @@
-"""The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew says what the old one said."""
+"""The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew has the same estimates."""
 
 from dataclasses import replace
 
@@ -26,13 +26,13 @@ def setup_of(sequence: Sequence) -> Setup:
 
 
 def answers(sequence: Sequence, rebuilt_at: int | None = None) -> list[Estimate]:
-    """Return what fixed-lag says at each frame, its tree built anew before one of them."""
-    estimator, said = FixedLag(setup_of(sequence), 0.5), []
+    """Return fixed-lag's estimate at each frame, its tree built anew before one of them."""
+    estimator, estimates = FixedLag(setup_of(sequence), 0.5), []
     for packet in sequence.packets():
         if packet.index == rebuilt_at:
             assert estimator._tree.rebuild().log == []
-        said.append(estimator.step(packet))
-    return said
+        estimates.append(estimator.step(packet))
+    return estimates
 
 
 def position_of(window: FixedLagTree, k: int) -> Array:

@@ -93,7 +93,7 @@ def test_a_cached_factor_is_renewed_once_its_states_have_moved(values, far, expe
 
 
 def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` say nothing."""
+    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` are behind it."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(X(0), gtsam.Pose3())
     values.insert(V(0), np.zeros(3))
@@ -216,13 +216,13 @@ def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     may still move by is a hundredth of a sigma.
     """
     sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0), 1)
-    estimator, said = isam2_of(sequence), []
+    estimator, estimates = isam2_of(sequence), []
     for packet in sequence.packets():
-        said.append(estimator.step(packet))
+        estimates.append(estimator.step(packet))
     graph, before = estimator._tree.graph(), estimator._tree.isam.calculateBestEstimate()
     finished = estimator.finish()
     assert finished.converged
-    final, sigma = finished.trajectory, np.sqrt(np.diagonal(said[-1].cov)[:6])
+    final, sigma = finished.trajectory, np.sqrt(np.diagonal(estimates[-1].cov)[:6])
     best = solve(graph, before, Stopping(1e-12)).values
     optimum = np.array([best.atPose3(X(k)).matrix() for k in range(len(final))])
     off = se3_log(se3_inverse(optimum) @ final.T_world_imu)

@@ -202,7 +202,7 @@ def gauge(joint: JointBelief, turns: Array) -> Array:
 
 
 def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
-    """Return the prior, half a metre and six degrees looser along the gauge: what it said of it was all there was."""
+    """Return the prior, half a metre and six degrees looser along the gauge: the prior alone knew of it."""
     directions = np.zeros((15, 3 + turns.shape[1]))
     rows = np.arange(15) if core.layout is IMU_LAYOUT else np.r_[0:6, 12:15]
     directions[rows] = gauge(JointBelief(core), turns)
@@ -254,7 +254,7 @@ def test_the_plain_error_at_latest_estimates_does_gain_it(scenario, correct) -> 
 
 
 def test_the_world_a_filter_starts_in_makes_no_difference() -> None:
-    """Started 700 m away and turned by two radians, it says the same of the relative motion and of its covariance."""
+    """Started 700 m away and turned by two radians, its relative motion and covariance are the same."""
     sequence = recording(DRIVE)
     T_other_world = se3(se3_exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))[:3, :3], np.array([500.0, -490.0, 3.0]))
     assert sequence.prior is not None

@@ -147,7 +147,7 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
     none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
-    window = smart.Window(keys, values, (), smart.MarginalPrior.nothing(), none, np.empty((0, 3)))
+    window = smart.SmartWindow(keys, values, (), smart.MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):
         np.testing.assert_allclose(SolvedWindow(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])

@@ -1,4 +1,4 @@
-"""Where the decoupled filter becomes sure of a wrong pose, it says so, and no other rung goes with it."""
+"""Where the gate of the decoupled filter collapses its run is diverged, and no other rung is."""
 
 from dataclasses import replace
 

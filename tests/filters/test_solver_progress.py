@@ -10,7 +10,7 @@ from toolkit.simulation import DRIVE, simulate
 
 
 class Recorded:
-    """Keeps what it hears."""
+    """Keeps every report."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[int, int, str]] = []
