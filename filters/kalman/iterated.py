@@ -58,7 +58,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """
     if not len(joint.landmark_ids):
         return
-    seen = joint_landmarks.predicted_sightings(joint, frame, at, rig)
+    seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
     accepted = joint_landmarks.accepted(joint, seen, gate)
     measurement = Measurement(joint, frame, at, rig, accepted)
     if not measurement.rows.any():
@@ -84,7 +84,7 @@ class Measurement:
     def after(self, pull: Array) -> Iterate:
         """Return the correction of a pull (k,)."""
         delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
-        seen = joint_landmarks.predicted_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[joint_landmarks.columns(self.prediction)] @ pull
         in_front = (seen.depth_m[self.rows] > 0.0).all()
         cost = float(prior + np.square(seen.residuals[self.rows]).sum()) if in_front else np.inf

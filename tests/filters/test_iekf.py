@@ -96,9 +96,9 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
         moved = joint.displaced(delta + np.r_[change[:6], np.zeros(part.start - 6), change])
-        return measurement.stacked(joint_landmarks.predicted_sightings(moved, frame, AT, rig))[1]
+        return measurement.stacked(joint_landmarks.linearise_sightings(moved, frame, AT, rig))[1]
 
-    seen = joint_landmarks.predicted_sightings(joint.displaced(delta), frame, AT, rig)
+    seen = joint_landmarks.linearise_sightings(joint.displaced(delta), frame, AT, rig)
     H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
     H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
     expected = -numerical(residuals, part.stop - part.start)

@@ -109,7 +109,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     convert, before = to_invariant(joint), group_element(joint)
     P = convert @ joint.cov @ convert.T
     joint.clone(0)
-    seen = joint_landmarks.predicted_sightings(joint, frame, AT, rig)
+    seen = joint_landmarks.linearise_sightings(joint, frame, AT, rig)
     stacked = joint_landmarks.stacked(joint, seen)
     H_plain = np.zeros((stacked.residuals.size, convert.shape[0]))
     H_wide, d = stacked.H.reshape(stacked.residuals.size, -1), joint.core.layout.size
@@ -169,7 +169,7 @@ def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(sc
         moved = joint.displaced(drawn)
         here = gauge(moved, turns=np.eye(3))
         assert np.abs(here - constant).max() > 0.01, "in the plain error they are others"
-        H = joint_landmarks.stacked(moved, joint_landmarks.predicted_sightings(moved, frame, AT, rig)).H
+        H = joint_landmarks.stacked(moved, joint_landmarks.linearise_sightings(moved, frame, AT, rig)).H
         part = joint_landmarks.columns(moved)
         # Jacobians of hundreds of pixels a radian or metre, directions of tens of metres.
         assert np.abs(H @ here[part]).max() < 1e-9
