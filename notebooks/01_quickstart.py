@@ -19,9 +19,8 @@
 # %%
 import numpy as np
 from recordings import real
-from toolkit.report.interactive import compare, figures, table
 
-from toolkit.datasets import load_sequence
+import toolkit
 
 # %matplotlib inline
 
@@ -39,7 +38,7 @@ print("with ground truth" if truth else "without ground truth: it is not on this
 # Everything that comes in is a `Sequence`: the calibration, the samples of the IMU, and what the cameras saw.
 
 # %%
-sequence = load_sequence("kitti00")
+sequence = toolkit.load_sequence("kitti00")
 print(f"{sequence.frame_count} frames in {sequence.duration_s:.1f} s")
 print(f"{sequence.motion.t_ns.size} IMU samples")
 print(f"{len(sequence.observations)} stereo sightings of {np.unique(sequence.observations.track_id).size} points")
@@ -67,10 +66,10 @@ print(f"columns {left_px:.1f} and {right_px:.1f} px, row {row_px:.1f} px: the po
 # - `batch` is a smoother: it waits for the end, then looks for the trajectory that agrees best with everything.
 
 # %%
-comparison = compare("kitti00", ["dead-reckoning", "ekf", "batch"], truth=truth)
+result = toolkit.compare("kitti00", ["dead-reckoning", "ekf", "batch"], truth=truth)
 
 # %%
-figures(comparison)["top_all"]
+result.figures["top_all"]
 
 # %% [markdown]
 # Grey dots are the landmarks that the smoother found: house fronts, parked cars, trees. Dead reckoning turns too
@@ -79,7 +78,7 @@ figures(comparison)["top_all"]
 # ## How good are they?
 
 # %%
-table(comparison, "ATE SE(3)", "reproj held-out", "NIS mean")
+result.table("ATE SE(3)", "reproj held-out", "NIS mean")
 
 # %% [markdown]
 # How to read a row:
@@ -100,14 +99,14 @@ table(comparison, "ATE SE(3)", "reproj held-out", "NIS mean")
 # errors mean what they say. Every seed draws another noise; this is seed 0.
 
 # %%
-simulated = compare("drive", ["dead-reckoning", "ekf", "batch"])
-table(simulated, "ATE SE(3)", "reproj held-out", "NIS mean")
+simulated = toolkit.compare("drive", ["dead-reckoning", "ekf", "batch"])
+simulated.table("ATE SE(3)", "reproj held-out", "NIS mean")
 
 # %%
-figures(simulated)["errors_over_time"]
+simulated.figures["errors_over_time"]
 
 # %%
-error_m = {row.estimator: row.scores.values["ate_se3_m"] for row in simulated.rows}
+error_m = {name: values["ate_se3_m"] for (name, _), values in simulated.metrics.items()}
 print(f"the filter's error is {error_m['ekf'] / error_m['dead-reckoning']:.0%} of dead reckoning's,")
 print(f"the smoother's is {error_m['batch'] / error_m['ekf']:.0%} of the filter's")
 

@@ -26,9 +26,8 @@ import numpy as np
 import planted
 from matplotlib.axes import Axes
 from recordings import real
-from toolkit.report.comparison import Comparison
-from toolkit.report.interactive import compare, table
 
+from toolkit import Result, compare
 from toolkit.audit import Audit, audit, faults
 from toolkit.audit.parts.vision import camera_motion
 from toolkit.datasets import load_sequence
@@ -97,8 +96,8 @@ def show_from_above(axes: Axes, run: Run, title: str) -> None:
 
 def runs_of(estimator: str) -> Iterator[tuple[str, Run]]:
     """Yield the run of an estimator on each recording, as the report had it."""
-    for number, comparison in as_given.items():
-        yield number, next(run for run in comparison.runs if run.estimator == estimator)
+    for number, result in as_given.items():
+        yield number, result.runs[estimator]
 
 
 def show_figures(estimator: str, titles: tuple[str, str]) -> None:
@@ -106,7 +105,7 @@ def show_figures(estimator: str, titles: tuple[str, str]) -> None:
     _, panels = plt.subplots(1, 2, figsize=(10, 4.6))
     for axes, title, (number, run) in zip(panels, titles, runs_of(estimator), strict=True):
         show_from_above(axes, run, title)
-        if not len(as_given[number].sequence.observations):
+        if not len(recordings[number].observations):
             axes.set_xlabel("x [m]\n(no image features in this file: dead reckoning is all there is)")
 
 
@@ -135,9 +134,9 @@ show_figures("seed-ekf", ("Figure 5: SLAM, Dataset 10", "Figure 6: SLAM, Dataset
 
 
 # %%
-def moved_m(comparison: Comparison) -> np.ndarray:
+def moved_m(result: Result) -> np.ndarray:
     """Return how far the report's filter moves the dead-reckoned positions along x and y, root mean square."""
-    at = {run.estimator: run.final.positions[:, :2] for run in comparison.runs}
+    at = {name: run.final.positions[:, :2] for name, run in result.runs.items()}
     return np.sqrt(np.mean((at["seed-ekf"] - at["dead-reckoning"]) ** 2, axis=0))
 
 
@@ -151,10 +150,10 @@ print(f"Dataset 03: the filter moves positions by {x_m:.1f} m along x and {y_m:.
 # all three. Whoever has the better poses predicts better where the cameras saw those points.
 
 # %%
-table(as_given["03"], "reproj own", "reproj held-out")
+as_given["03"].table("reproj own", "reproj held-out")
 
 # %%
-print(*next(run for run in as_given["03"].runs if run.estimator == "seed-ekf").log, sep="\n")
+print(*as_given["03"].runs["seed-ekf"].log, sep="\n")
 
 # %% [markdown]
 # `diverged` means that the answer contradicts the measured motion in too many steps. Something is wrong. The equations
@@ -245,13 +244,13 @@ print(f"{bias * repaired.duration_s:.0f} degrees of heading over the whole recor
 
 # %%
 after = compare(given, ["dead-reckoning", "seed-ekf", "ekf", "batch"])
-table(after, "reproj own", "reproj held-out", "NIS mean")
+after.table("reproj own", "reproj held-out", "NIS mean")
 
 # %%
 colours = {"dead-reckoning": "#D55E00", "seed-ekf": "#CC79A7", "ekf": "#0072B2", "batch": "#009E73"}
 _, panels = plt.subplots(1, 2, figsize=(10, 5), sharex=True, sharey=True)
-for axes, comparison, title in zip(panels, (as_given["03"], after), ("as given", "repaired"), strict=True):
-    for run in comparison.runs:
+for axes, result, title in zip(panels, (as_given["03"], after), ("as given", "repaired"), strict=True):
+    for run in result.runs.values():
         if run.estimator in colours:
             width = 3.0 if run.estimator == "ekf" else 1.3  # the smoother's line lies on the filter's
             axes.plot(*run.final.positions[:, :2].T, color=colours[run.estimator], linewidth=width, label=run.estimator)
@@ -260,9 +259,9 @@ for axes, comparison, title in zip(panels, (as_given["03"], after), ("as given",
 
 # %%
 held_out_px = {
-    (title, row.estimator): row.scores.values["heldout_reproj_median_px"]
-    for title, comparison in (("given", as_given["03"]), ("repaired", after))
-    for row in comparison.rows
+    (title, name): values["heldout_reproj_median_px"]
+    for title, result in (("given", as_given["03"]), ("repaired", after))
+    for (name, _), values in result.metrics.items()
 }
 print("error on the hidden tracks:")
 print(f"  the report's filter, as given      {held_out_px['given', 'seed-ekf']:.2f} px")
@@ -292,9 +291,7 @@ harm = {
 # %%
 _, axes = plt.subplots(figsize=(10, 3.4))
 for i, (name, colour) in enumerate(colours.items()):
-    ate_m = [
-        next(row.scores.values["ate_se3_m"] for row in result.rows if row.estimator == name) for result in harm.values()
-    ]
+    ate_m = [result.metrics[name, "final"]["ate_se3_m"] for result in harm.values()]
     axes.bar(np.arange(len(harm)) + 0.2 * (i - 1.5), ate_m, width=0.2, color=colour, label=name)
 axes.set_xticks(range(len(harm)), harm)
 axes.set(yscale="log", ylabel="position error, ATE [m]", title="One fault at a time")

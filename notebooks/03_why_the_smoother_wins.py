@@ -23,12 +23,10 @@ from itertools import pairwise
 import matplotlib.pyplot as plt
 import numpy as np
 from recordings import real
-from toolkit.report.comparison import Row
-from toolkit.report.interactive import compare, compare_over_seeds, figures, table
-from toolkit.report.seeds_table import consistency_lines
 
-from toolkit.datasets import load_sequence
+from toolkit import Result, compare, load_sequence
 from toolkit.estimator import ladder
+from toolkit.report.messages import consistency_lines
 from toolkit.sequence import Sequence
 
 # %matplotlib inline
@@ -64,13 +62,13 @@ def thinned(sequence: Sequence, one_in: int) -> Sequence:
 recording, truth = real("ucsd/0027.npz"), real("ucsd/gt/0027.tum")
 if recording and truth:
     print(f"this ran on the real drive 0027, its first {MAX_FRAMES['0027']} frames, with ground truth")
-    drive = compare(str(recording), ["ladder"], truth=truth, max_frames=MAX_FRAMES["0027"])
+    drive = compare(str(recording), "ladder", truth=truth, max_frames=MAX_FRAMES["0027"])
 else:
     print("0027 is not here: this ran on the built-in kitti00, one track in ten, without ground truth")
-    drive = compare(thinned(load_sequence("kitti00"), 10), ["ladder"], max_frames=MAX_FRAMES["kitti00"])
+    drive = compare(thinned(load_sequence("kitti00"), 10), "ladder", max_frames=MAX_FRAMES["kitti00"])
 
 # %%
-table(drive, "ATE SE(3)", "reproj held-out", "NIS mean")
+drive.table("ATE SE(3)", "reproj held-out", "NIS mean")
 
 # %% [markdown]
 # The same as a picture: every rung's last word, one bar each. Hidden tracks judge without truth; where there is truth,
@@ -78,29 +76,30 @@ table(drive, "ATE SE(3)", "reproj held-out", "NIS mean")
 
 
 # %%
-def last_words(rows: tuple[Row, ...]) -> dict[str, Row]:
-    """Return what each estimator said in the end."""
-    return {row.estimator: row for row in rows}  # causal comes before final, so final stays
+def last_words(result: Result, key: str) -> dict[str, float | None]:
+    """Return a metric of what each estimator said in the end."""
+    return {name: values[key] for (name, _), values in result.metrics.items()}  # final comes last, so it stays
 
 
-def show_bars(rows: dict[str, Row], metrics: dict[str, str]) -> None:
+def show_bars(result: Result, metrics: dict[str, str]) -> None:
     """Draw a panel a metric that has values, the lowest rung on top."""
-    known = {key: words for key, words in metrics.items() if any(row.scores.values[key] for row in rows.values())}
+    known = {key: words for key, words in metrics.items() if any(last_words(result, key).values())}
     _, panels = plt.subplots(1, len(known), figsize=(10, 4), sharey=True, squeeze=False)
     for axes, (key, words) in zip(panels[0], known.items(), strict=True):
-        axes.barh(list(rows), [row.scores.values[key] or np.nan for row in rows.values()], color="#0072B2")
+        values = last_words(result, key)
+        axes.barh(list(values), [value or np.nan for value in values.values()], color="#0072B2")
         axes.set(xlabel=words)
     panels[0, 0].invert_yaxis()
     plt.show()
 
 
 show_bars(
-    last_words(drive.rows),
+    drive,
     {"ate_se3_m": "position error, ATE [m]", "heldout_reproj_median_px": "error on hidden tracks [px]"},
 )
 
 # %%
-score = {name: row.scores.values["heldout_reproj_median_px"] for name, row in last_words(drive.rows).items()}
+score = last_words(drive, "heldout_reproj_median_px")
 lowest, highest = rungs[0].name, rungs[-1].name
 print(f"error on hidden tracks: {lowest} {score[lowest]:.2f} px, {highest} {score[highest]:.2f} px")
 print(f"the least of all has {min(score, key=score.get)}")
@@ -124,14 +123,14 @@ print(f"the least of all has {min(score, key=score.get)}")
 
 # %%
 SEEDS, FRAMES = 8, 25
-over = compare_over_seeds("flight", ["ladder"], SEEDS, max_frames=FRAMES)
-table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose")
+over = compare("flight", "ladder", seeds=SEEDS, max_frames=FRAMES)
+over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
-figures(over)["nees_over_seeds"]
+over.figures["nees_over_seeds"]
 
 # %%
-print(*consistency_lines(over), sep="\n")
+print(*consistency_lines(over.comparison), sep="\n")
 
 # %% [markdown]
 # Three steps of the ladder can be seen here.
@@ -149,10 +148,10 @@ print(*consistency_lines(over), sep="\n")
 # better.
 
 # %%
-groups = {group.estimator: group for group in over.groups}  # the final one stays
+rows = {row.estimator: row for row in over.comparison.rows}  # the final one stays
 _, axes = plt.subplots(figsize=(8, 4))
-for name, group in groups.items():
-    spread = group.spread("ate_none_m")
+for name, row in rows.items():
+    spread = row.spread("ate_none_m")
     if spread is not None:
         quartiles = 1000 * spread.lower_quartile, 1000 * spread.upper_quartile
         axes.plot(quartiles, (name, name), color="#0072B2", alpha=0.3, linewidth=7, solid_capstyle="butt")
@@ -164,7 +163,7 @@ axes.invert_yaxis()
 plt.show()
 
 # %%
-error_m = {name: spread.mean for name, group in groups.items() if (spread := group.spread("ate_none_m"))}
+error_m = {name: spread.mean for name, row in rows.items() if (spread := row.spread("ate_none_m"))}
 for before, rung in pairwise(rungs):
     if before.name in error_m and rung.name in error_m:
         ratio = error_m[rung.name] / error_m[before.name]
@@ -180,13 +179,9 @@ for before, rung in pairwise(rungs):
 # its *final* answer has seen what came after. Those rungs that give both show how much that is worth.
 
 # %%
-for estimator in over.estimators:
-    causal, final = (
-        next((g for g in over.groups if g.estimator == estimator and g.output == output), None)
-        for output in ("causal", "final")
-    )
-    if causal and final and not np.array_equal(causal.position_m, final.position_m):
-        now, later = (group.spread("ate_none_m").mean for group in (causal, final))
+for (estimator, output), values in over.metrics.items():
+    now, later = values["ate_none_m"], over.metrics[estimator, "final"]["ate_none_m"]
+    if output == "causal" and now != later:
         print(f"{estimator:{width}}  causal {1000 * now:.1f} mm, final {1000 * later:.1f} mm")
 
 # %% [markdown]
@@ -195,8 +190,8 @@ for estimator in over.estimators:
 # Time per frame on the drive above, the finish included, to one digit: it depends on the machine.
 
 # %%
-for run in drive.runs:
-    ms = 1000 * run.timings.total_s / drive.sequence.frame_count
+for run in drive.runs.values():
+    ms = 1000 * run.timings.total_s / drive.comparison.sequence.frame_count
     print(f"{run.estimator:{width}}  {float(f'{ms:.0e}'):g} ms")
 
 # %% [markdown]

@@ -22,9 +22,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from IPython import get_ipython
-from toolkit.report.interactive import compare, compare_over_seeds, figures, table
 
-from toolkit.datasets import load_sequence
+from toolkit import compare, load_sequence
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Trajectory
 from toolkit.estimator import Setup, find
 from toolkit.gate.baseline import Case
@@ -117,11 +116,11 @@ print(f"{mine.status}: position error {scores.values['ate_se3_m']:.2f} m over {d
 # Beside the others, on the same packets. `own=` takes estimators that live in a notebook.
 
 # %%
-comparison = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build})
-table(comparison, "ATE SE(3)", "RPE 100 m", "reproj held-out")
+result = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build})
+result.table("ATE SE(3)", "RPE 100 m", "reproj held-out")
 
 # %%
-figures(comparison)["errors_over_time"]
+result.figures["errors_over_time"]
 
 # %% [markdown]
 # It uses each point for two frames only, and forgets it. Whatever the error of one step is, the next step starts from
@@ -167,14 +166,14 @@ print("two-view:", find("two-view").summary())
 # estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
-over = compare_over_seeds("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=40)
-table(over, "ATE none", "NEES rot", "NEES pos", "NEES pose")
+over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=40)
+over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
-figures(over)["nees_over_seeds"]
+over.figures["nees_over_seeds"]
 
 # %%
-nees = {group.estimator: group.spread("nees_pose_mean").mean for group in over.groups}
+nees = {name: values["nees_pose_mean"] for (name, _), values in over.metrics.items()}
 print(f"two-view states an error of which the true one is {np.sqrt(nees['two-view']):.1f} times as large,")
 print(f"ekf one of which it is {np.sqrt(nees['ekf']):.1f} times as large")
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import load_sequence
+from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
-from toolkit.report.trajectory_files import write_tum
 
 PROJECT = Path(__file__).parents[2]
 PAGES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")), PROJECT / "data/README.md")
@@ -104,7 +104,8 @@ def _write_own_drive(directory: Path) -> None:
         imu_T_cam=rig.T_imu_cam,
     )
     assert sequence.truth is not None
-    write_tum(Trajectory(sequence.truth.t_ns, sequence.truth.T_world_imu), directory / "my_drive.tum")
+    truth = Trajectory(sequence.truth.t_ns, sequence.truth.T_world_imu)
+    (directory / "my_drive.tum").write_text(tum.text(truth), encoding="utf-8")
 
 
 def _name(page: Path) -> str:
