@@ -1,8 +1,9 @@
 """Full smoother: Levenberg-Marquardt over all poses and landmarks at once, answering at the end (GTSAM).
 
 What it approximates: nothing but the noise; every measurement is relinearised at every iteration (Dellaert &
-Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from what msckf-fej says and the landmarks
-mapped along that, for a start that has run off, dead-reckoned or too sure of itself, ends in poor minima.
+Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from the trajectory of msckf-fej and the
+landmarks mapped along it, for a start that has diverged, dead-reckoned or with too small a covariance, ends in poor
+minima.
 """
 
 import gtsam
@@ -30,10 +31,10 @@ def build(setup: Setup) -> Estimator:
 
 
 class Batch:
-    """Remembers every packet and solves for all of them in the end."""
+    """Keeps every packet and solves for all of them in the end."""
 
     def __init__(self, setup: Setup) -> None:
-        self._rig, self._outliers = setup.rig, setup.settings.outliers
+        self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
         self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates())
@@ -42,7 +43,7 @@ class Batch:
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> None:
-        """Remember the packet and carry the causal pass on; there is no answer before the end."""
+        """Keep the packet and carry the causal pass on; there is no answer before the end."""
         self._packets.append(packet)
         self._estimates.append(self._causal_pass.step(packet))
         self._map.add(packet.frame, self._estimates[-1].T_world_imu)
@@ -50,18 +51,18 @@ class Batch:
     def finish(self) -> Finished:
         """Solve for every state and landmark, and for the covariance of every state."""
         known = self._map.landmarks()
-        shown = [packet.frame for packet in self._packets]
-        track_ids = worth_smoothing(shown, known)
-        frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in shown]
+        all_frames = [packet.frame for packet in self._packets]
+        track_ids = worth_smoothing(all_frames, known)
+        frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
         start = self._start(known, track_ids)
-        smoothed = solve_robustly(self._motion_factors(), frames, self._rig, start, self._outliers)
+        factors = self._motion_factors()
+        smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._progress)
         values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         seen = seen_ids(smoothed.frames)
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen})
-        keys = [self._motion.keys(packet.index) for packet in self._packets]
         trajectory, log = with_covariances(
-            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], keys
+            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], self._motion
         )
         return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 

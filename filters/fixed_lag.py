@@ -10,23 +10,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from filters.smoothing.graph_builder import Growth
+from filters.smoothing.fixed_lag_tree import FixedLagTree
+from filters.smoothing.graph_builder import GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
-from filters.smoothing.lag_window import LagWindow
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.factors import L
+from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 90, "+ relinearisation"
-LAG_S = 2.0
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return FixedLag(setup, LAG_S)
+    return FixedLag(setup, setup.settings.window.lag_s)
 
 
 class FixedLag:
@@ -35,8 +35,8 @@ class FixedLag:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
         self._rig = setup.rig
-        self._window = LagWindow(self._lag_ns)
-        self._growth = Growth(setup)
+        self._tree = FixedLagTree(self._lag_ns)
+        self._builder = GraphBuilder(setup)
         self._first_in_window = 0
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
@@ -44,13 +44,13 @@ class FixedLag:
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
-        grown, t_ns = self._growth.by(packet), packet.frame.t_ns
+        """Take in one packet and return the state at its frame."""
+        extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
         while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
             self._complete(self._first_in_window)
             self._first_in_window += 1
-        recovery = self._window.add(grown, t_ns)
-        self._last_seen_ns.update(dict.fromkeys(grown.landmark_ids, t_ns))
+        recovery = self._tree.add(extension, t_ns)
+        self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
         self._note(packet, recovery)
         self._read(packet)
         self._drop_landmarks_behind(packet)
@@ -65,20 +65,20 @@ class FixedLag:
     def _complete(self, k: int) -> None:
         """Give a state of the window the covariance it has there."""
         state = self._states[k]
-        cov = self._window.state_cov(self._growth.motion.keys(k), state.T_world_imu[:3, :3])
+        cov = state_cov(self._builder.motion, self._tree, k, state.T_world_imu[:3, :3])
         self._states[k] = replace(state, cov=cov)
 
     def _read(self, packet: Packet) -> None:
         """Take over every state and landmark of the window; what leaves it stays as last read."""
-        values = self._window.values()
-        motion, window = self._growth.motion, range(self._first_in_window, packet.index + 1)
+        values = self._tree.values()
+        motion, window = self._builder.motion, range(self._first_in_window, packet.index + 1)
         stamps_ns = [s.t_ns for s in self._states[self._first_in_window :]] + [packet.frame.t_ns]
         self._states[self._first_in_window :] = [motion.read(values, k, stamps_ns[k - window[0]]) for k in window]
         self._complete(packet.index)
         self._forget({i for i, t_ns in self._last_seen_ns.items() if t_ns < packet.frame.t_ns - self._lag_ns})
-        in_window = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
-        self._points |= in_window
-        self._growth.solved(self._states[-1], in_window)
+        in_tree = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
+        self._points |= in_tree
+        self._builder.update(self._states[-1], in_tree)
 
     def _drop_landmarks_behind(self, packet: Packet) -> None:
         """Drop what is no longer in front of the camera that sees it, before it is linearised there."""
@@ -88,7 +88,7 @@ class FixedLag:
         behind = {seen[row] for row in rows}
         if behind:
             log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
-            recovery = self._window.drop(behind)
+            recovery = self._tree.drop(behind)
             self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
@@ -100,6 +100,6 @@ class FixedLag:
 
     def _forget(self, landmark_ids: set[int]) -> None:
         """Let landmarks go that are not in the window any more."""
-        self._growth.forget(landmark_ids)
+        self._builder.forget(landmark_ids)
         for i in landmark_ids:
             self._last_seen_ns.pop(i, None)

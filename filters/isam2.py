@@ -1,10 +1,11 @@
-"""Incremental full smoother: every state and landmark kept, re-solved only where news reaches (iSAM2, GTSAM).
+"""Incremental full smoother: every state and landmark kept, re-solved only where new factors reach (iSAM2, GTSAM).
 
 What it approximates, frame by frame: a variable is relinearised once it has moved by a threshold, not at every
-iteration; what none of the last 30 frames concerns is not relinearised at all; and each frame makes one Gauss-Newton
-step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal answer is the
-newest state. For its final answer everything is linearised anew until the error stalls: that is the optimum of all it
-took in. A landmark that falls behind the camera, or makes the system indeterminate, is dropped and the log says so.
+iteration; what none of the last 30 frames has factors on is not relinearised at all; and each frame makes one
+Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal
+answer is the newest state. For its final answer everything is linearised anew until the error stalls: that is the
+optimum of all it took in. A landmark that falls behind the camera, or makes the system indeterminate, is dropped and
+the log says so.
 """
 
 from dataclasses import replace
@@ -13,15 +14,15 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.covariance_recovery import with_covariances
-from filters.smoothing.graph_builder import Grown, Growth
-from filters.smoothing.incremental import IncrementalTree
+from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera
+from filters.smoothing.isam2_tree import Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from filters.smoothing.marginals import state_cov
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.factors import L
+from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
 RUNG, CHANGE = 110, "+ every state and landmark kept"
@@ -36,42 +37,43 @@ class Isam2:
     """Adds a packet to the tree and reads the newest state; reads all of them in the end."""
 
     def __init__(self, setup: Setup) -> None:
-        self._rig = setup.rig
-        self._growth = Growth(setup)
-        self._tree = IncrementalTree(6 if setup.motion_kind == "imu" else 3, setup.rig.baseline_m)
+        self._rig, self._progress = setup.rig, setup.progress
+        self._builder = GraphBuilder(setup)
+        self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m)
         self._stamps_ns: list[int] = []
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
-        grown = self._growth.by(packet)
+        """Take in one packet and return the state at its frame."""
+        extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
-        self._note(packet, self._tree.add(grown.factors, grown.values, grown.state_keys))
-        estimate = self._newest(grown, packet)
-        seen = [i for i in grown.landmark_ids if self._tree.has(L(i))]
+        self._note(packet, self._tree.add(extension.factors, extension.values, extension.state_keys))
+        estimate = self._newest(extension, packet)
+        seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
         points = self._tree.points(map(L, seen))
-        self._growth.solved(estimate, dict(zip(seen, points, strict=True)))
+        self._builder.update(estimate, dict(zip(seen, points, strict=True)))
         self._drop_landmarks_behind(seen, points, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
-        graph, motion = self._tree.graph(), self._growth.motion
-        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping())
+        graph, motion = self._tree.graph(), self._builder.motion
+        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping(), self._progress)
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
-        keys = [motion.keys(k) for k in range(len(states))]
-        trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), self._tree.landmarks(), keys)
+        trajectory, log = with_covariances(
+            Trajectory.of(states), graph.linearize(values), self._tree.landmarks(), motion
+        )
         return Finished(trajectory, Landmarks.of(points), converged, (*self._log, *log))
 
-    def _newest(self, grown: Grown, packet: Packet) -> Estimate:
-        values = self._tree.read(grown.state_keys)
-        estimate = self._growth.motion.read(values, packet.index, packet.frame.t_ns)
-        cov = state_cov(self._tree.isam, self._growth.motion.keys(packet.index), estimate.T_world_imu[:3, :3])
+    def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:
+        values = self._tree.read(extension.state_keys)
+        estimate = self._builder.motion.read(values, packet.index, packet.frame.t_ns)
+        cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
     def _drop_landmarks_behind(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
-        """Drop what is no longer in front of the camera that sees it: its sightings would say nothing at all."""
+        """Drop what is no longer in front of the camera that sees it: its sightings would have no gradient."""
         behind = {seen[row] for row in np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))}
         if behind:
             log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
@@ -81,4 +83,4 @@ class Isam2:
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Keep the log of a recovery; a landmark that was dropped begins anew with its next sighting."""
         self._log += [f"frame {packet.index}: {line}" for line in recovery.log]
-        self._growth.forget(recovery.dropped)
+        self._builder.forget(recovery.dropped)

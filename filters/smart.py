@@ -1,6 +1,6 @@
 """Fixed-lag smoother over the last two seconds whose landmarks are eliminated: smart stereo factors.
 
-What it approximates: a track says all it knows about the poses that saw it, at every iteration anew, and its landmark
+What it approximates: a track is a factor on the poses that saw it, linearised anew at every iteration, and its landmark
 is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
 marginalised with it as they were linearised then; one that lives on starts anew, so no landmark is remembered beyond
 the window. Its causal answer is the newest state, its final answer each state as it left the window, with the
@@ -14,10 +14,9 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
-from filters.smoothing.structureless import RobustCamera, Sightings
-from filters.smoothing.window import Prior, Window
-from filters.smoothing.window_solver import Solution, solved, without_oldest
-from filters.smoothing.window_tracks import Tracked
+from filters.smoothing.smart_factors import RobustCamera, Sightings
+from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
+from filters.smoothing.smart_window import MarginalPrior, SmartWindow, TrackedWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -45,21 +44,21 @@ class Smart:
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
         self._tracked = _nothing()
-        self._solution = Solution(self._tracked.window, np.empty((0, 0)))
+        self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
-        """Take in one packet and say where the IMU is."""
-        tracked = self._grown(packet)
+        """Take in one packet and return the state at its frame."""
+        tracked = self._extended(packet)
         try:
-            self._solution = solved(tracked.window, self._camera)
+            self._solution = solve_window(tracked.window, self._camera)
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
             self._complete_all()
-            tracked = self._begun(packet)
-            self._solution = solved(tracked.window, self._camera)
+            tracked = self._started(packet)
+            self._solution = solve_window(tracked.window, self._camera)
         self._tracked = replace(tracked, window=self._solution.window)
         self._read(packet)
         self._shorten(packet)
@@ -70,10 +69,10 @@ class Smart:
         self._complete_all()
         return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
 
-    def _grown(self, packet: Packet) -> Tracked:
+    def _extended(self, packet: Packet) -> TrackedWindow:
         """Return the window with the packet's state, predicted, and its sightings."""
         if packet.motion is None:
-            return self._begun(packet)
+            return self._started(packet)
         increment = self._motion.integrate(packet.motion, self._belief.bias)
         prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
         expected = relative_to_its_map(self._belief).predicted(prediction)
@@ -81,12 +80,14 @@ class Smart:
         self._belief = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
-    def _begun(self, packet: Packet) -> Tracked:
+    def _started(self, packet: Packet) -> TrackedWindow:
         """Return a window that begins here, held at the state as predicted."""
         hold = self._motion.hold(self._belief, packet.index)
         return self._with_state(_nothing(), packet.index, packet.frame, hold)
 
-    def _with_state(self, tracked: Tracked, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph) -> Tracked:
+    def _with_state(
+        self, tracked: TrackedWindow, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph
+    ) -> TrackedWindow:
         window, estimate = tracked.window, self._belief.estimate(frame.t_ns)
         new = gtsam.Values()
         self._motion.insert(new, estimate, k)
@@ -128,7 +129,9 @@ class Smart:
             self._tracked = replace(self._tracked, window=window).compacted()
 
 
-def _nothing() -> Tracked:
+def _nothing() -> TrackedWindow:
     none = np.empty(0, dtype=np.int64)
-    window = Window((), gtsam.Values(), (), Prior.nothing(), Sightings(none, none, np.empty((0, 3))), np.empty((0, 3)))
-    return Tracked(window, none)
+    window = SmartWindow(
+        (), gtsam.Values(), (), MarginalPrior.nothing(), Sightings(none, none, np.empty((0, 3))), np.empty((0, 3))
+    )
+    return TrackedWindow(window, none)

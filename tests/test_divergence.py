@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
-from toolkit.divergence import MOST_FAR_STEPS, contradiction, deafness
+from toolkit.divergence import MOST_FAR_STEPS, contradiction, gate_collapse
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
@@ -103,23 +103,23 @@ def test_on_03_the_reports_filter_is_seen_to_diverge(name, status, real: Callabl
     assert run.status == status, run.log
 
 
-def heard(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, Array]:
+def gated(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, Array]:
     tested_of = np.full(100, float(tested))
     return {"gate_tested": tested_of, "gate_accepted": tested_of * np.repeat([share, share_in_the_end], [75, 25])}
 
 
-def test_a_filter_that_rejects_nearly_all_it_sees_has_lost_its_way():
-    assert deafness(heard(0.06, 0.06)).startswith("6 % of all it saw passed its own gate")
+def test_a_filter_that_rejects_nearly_all_measurements_has_diverged():
+    assert gate_collapse(gated(0.06, 0.06)).startswith("6 % of its measurements passed its own gate")
 
 
-def test_a_filter_that_went_deaf_in_the_end_has_lost_its_way():
-    assert deafness(heard(0.95, 0.1)).startswith("10 % of what it saw in the end")
+def test_a_filter_whose_gate_collapsed_in_the_last_quarter_has_diverged():
+    assert gate_collapse(gated(0.95, 0.1)).startswith("10 % of its last quarter's")
 
 
-def test_a_filter_on_a_rough_recording_has_not():
-    assert deafness(heard(0.65, 0.5)) is None
+def test_a_filter_on_a_rough_recording_has_not_diverged():
+    assert gate_collapse(gated(0.65, 0.5)) is None
 
 
 def test_a_few_rejections_are_no_sign():
-    assert deafness(heard(0.0, 0.0, tested=1)) is None
-    assert deafness({}) is None
+    assert gate_collapse(gated(0.0, 0.0, tested=1)) is None
+    assert gate_collapse({}) is None

@@ -1,9 +1,9 @@
-"""Says when a run has lost its way, without truth: its trajectory contradicts the measured motion, or it hears nothing.
+"""Says whether a run has diverged, without truth: it contradicts the measured motion, or its gate has collapsed.
 
 The correction a consistent filter makes at a frame has the covariance it takes away: what it had before, less what
 it has after. In a steady state that is what the motion noise adds in a frame; a filter that learns its heading or a
 bias after a long drive may take away, and so jump by, much more, if its own covariances say so. Steps far outside
-that are rare in a filter that works and common in one that has lost its way.
+that are rare in a filter that works and common in one that has diverged.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,15 +18,16 @@ from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import Motion, Sequence
 
-# A windowed filter puts corrections off and then makes several frames' worth at once: five times the motion noise.
+# A windowed filter corrects by several frames' tracks at once: five times the motion noise of one frame.
 _LUMP_FRAMES = 5
 # A step beyond this squared distance happens once in a million consistent steps.
 FAR_STEP = float(chdtri(6, 1e-6))
 # Mismatches and poor noise figures make some steps far in healthy runs too: up to one in seven where frames are stale
-# and tracks slip, by estimators that end within 2 m of each other after 1.3 km. A sixth of all is no accident.
+# and tracks go wrong, by estimators that end within 2 m of each other after 1.3 km. A sixth of all is no accident.
 MOST_FAR_STEPS = 1.0 / 6.0
-# The gate passes 95 % of sound measurements, and still 65 % where tracks slip all the time. A filter that is sure of
-# a wrong pose hears next to nothing, and from then on: so much must pass in the whole run and in its last quarter.
+# The gate passes 95 % of sound measurements, and still 65 % where tracks go wrong all the time. A filter whose
+# covariance does not cover its error rejects nearly all measurements, and from then on: so much must pass in the whole
+# run and in its last quarter.
 LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
 # What a correction may do beyond the noise of the motion where it corrects a velocity and biases as well:
 # rad/s of turn rate and m/s of velocity.
@@ -47,17 +48,20 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     )
 
 
-def deafness(info: Mapping[str, Array]) -> str | None:
-    """Return why an estimator with these diagnostics of N frames has lost its way, or None."""
+def gate_collapse(info: Mapping[str, Array]) -> str | None:
+    """Return why an estimator with these diagnostics of N frames has diverged, or None.
+
+    Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error.
+    """
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])
-    for part, words in ((slice(None), "all it saw"), (slice(3 * tested.size // 4, None), "what it saw in the end")):
-        heard, asked = accepted[part].sum(), tested[part].sum()
-        if asked >= _FEWEST_TESTED and heard < LEAST_ACCEPTED * asked:
+    for part, words in ((slice(None), "its measurements"), (slice(3 * tested.size // 4, None), "its last quarter's")):
+        passed, count = accepted[part].sum(), tested[part].sum()
+        if count >= _FEWEST_TESTED and passed < LEAST_ACCEPTED * count:
             return (
-                f"{100.0 * heard / asked:.0f} % of {words} passed its own gate: it is sure of a wrong pose "
-                f"(at least {100.0 * LEAST_ACCEPTED:.0f} % pass in a run that works)"
+                f"{100.0 * passed / count:.0f} % of {words} passed its own gate: its covariance does not cover its "
+                f"error (at least {100.0 * LEAST_ACCEPTED:.0f} % pass in a run that works)"
             )
     return None
 

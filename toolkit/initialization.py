@@ -20,7 +20,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuMotion, ImuNoise, Packet, Prior, Sequence, StereoFrame, StereoRig
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
-# What the gauge is held to (rad, m), and what is thought of biases before any measurement (m/s^2, rad/s).
+# What the gauge is held to (rad, m), and the biases' before any measurement (m/s^2, rad/s).
 GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02
 # Without enough vision: unknown speed (m/s), and the tilt (rad) an acceleration of 1 m/s^2 feigns.
 _BLIND_VELOCITY_SIGMA, _BLIND_TILT_SIGMA = 10.0, 0.1
@@ -104,7 +104,7 @@ def _attitudes(motions: list[ImuMotion]) -> list[Array]:
 
 
 def _blind(attitude: Array, why: str) -> Prior:
-    """Return what the specific force alone says, and in its source why vision says nothing."""
+    """Return the start from the specific force alone, and in its source why vision was not used."""
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
@@ -172,7 +172,7 @@ def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: li
 
 
 def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:
-    """Pin heading and position, leave roll and pitch free, and say what is thought of the biases."""
+    """Pin heading and position, leave roll and pitch free, and add the priors of the biases."""
     tilt_free = attitude.T @ np.diag([1.0, 1.0, GAUGE_SIGMA**2]) @ attitude
     cov = np.block([[tilt_free, np.zeros((3, 3))], [np.zeros((3, 3)), GAUGE_SIGMA**2 * np.eye(3)]])
     pose = gtsam.Pose3(se3(attitude, np.zeros(3)))

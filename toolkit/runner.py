@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from toolkit.divergence import contradiction, deafness
+from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
@@ -117,7 +117,7 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
     run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said))
-    reasons = [contradiction(trajectory, sequence) for trajectory in _to_judge(run)] + [deafness(run.info)]
+    reasons = [contradiction(trajectory, sequence) for trajectory in _to_judge(run)] + [gate_collapse(run.info)]
     for reason in dict.fromkeys(reasons):
         if reason is not None:
             status = "diverged"

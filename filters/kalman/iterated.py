@@ -42,7 +42,7 @@ class PullStep(NamedTuple):
     length: float
 
 
-class Iterated(NamedTuple):
+class IterationResult(NamedTuple):
     """The best correction that was found, and whether it is the most probable one."""
 
     best: Iterate
@@ -58,7 +58,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """
     if not len(joint.landmark_ids):
         return
-    seen = joint_landmarks.predicted_sightings(joint, frame, at, rig)
+    seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
     accepted = joint_landmarks.accepted(joint, seen, gate)
     measurement = Measurement(joint, frame, at, rig, accepted)
     if not measurement.rows.any():
@@ -84,7 +84,7 @@ class Measurement:
     def after(self, pull: Array) -> Iterate:
         """Return the correction of a pull (k,)."""
         delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
-        seen = joint_landmarks.predicted_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[joint_landmarks.columns(self.prediction)] @ pull
         in_front = (seen.depth_m[self.rows] > 0.0).all()
         cost = float(prior + np.square(seen.residuals[self.rows]).sum()) if in_front else np.inf
@@ -108,19 +108,19 @@ class Measurement:
         return rows.H[self.rows].reshape(-1, rows.H.shape[2]), rows.residuals[self.rows].reshape(-1)
 
 
-def most_probable(measurement: Measurement) -> Iterated:
+def most_probable(measurement: Measurement) -> IterationResult:
     """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
     part = joint_landmarks.columns(measurement.prediction)
     now = measurement.after(np.zeros(part.stop - part.start))
     for _ in range(MOST_STEPS):
         step = measurement.step(now)
         if step.length < NEGLIGIBLE_STEP:
-            return Iterated(measurement.after(now.pull + step.pull), converged=True)
+            return IterationResult(measurement.after(now.pull + step.pull), converged=True)
         lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
         if lower is None:
-            return Iterated(now, converged=False)
+            return IterationResult(now, converged=False)
         now = lower
-    return Iterated(now, converged=False)
+    return IterationResult(now, converged=False)
 
 
 def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:

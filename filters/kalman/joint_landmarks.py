@@ -45,7 +45,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     if not len(joint.landmark_ids):
         return
-    seen = predicted_sightings(joint, frame, at, rig)
+    seen = linearise_sightings(joint, frame, at, rig)
     passed = accepted(joint, seen, gate)
     if passed.any():
         rows = stacked(joint, seen)
@@ -53,7 +53,7 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
         joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
 
 
-def predicted_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
+def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
     """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
     rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]

@@ -1,7 +1,7 @@
 """Where a windowed filter evaluates its Jacobians: at the latest estimates or at the first ones.
 
-At the latest, the same landmark or pose enters different Jacobians at different values, and the filter believes
-it learns its heading from that, which nothing measures. At the first estimates the unobservable directions stay
+At the latest, the same landmark or pose enters different Jacobians at different values; together they reduce the
+variance of the heading, which nothing measures. At the first estimates the unobservable directions stay
 so (Huang, Mourikis & Roumeliotis 2010; Li & Mourikis 2013, "High-precision, consistent EKF-based visual-inertial
 odometry", section 4).
 """

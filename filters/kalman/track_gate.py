@@ -22,7 +22,7 @@ from toolkit.sequence import StereoRig
 
 
 class AcceptedTracks(NamedTuple):
-    """F tracks that passed: ids (F,), who saw them (F, W), points (F, 3), and their constraints on the window."""
+    """F tracks that passed: ids (F,), by which poses (F, W), points (F, 3), and their constraints on the window."""
 
     track_ids: IntArray
     seen: BoolArray

@@ -21,7 +21,7 @@ _RELATIVE_DECREASE = 1e-4
 class _Views(NamedTuple):
     """N sightings (N, 3) px, ordered by track, and how each sees the world: ``p_cam = R p_world + t``.
 
-    ``track`` (N,) tells whose point each sees, ``first`` (F,) where each track's sightings begin.
+    ``track`` (N,) is the row of the point each sees, ``first`` (F,) where each track's sightings begin.
     """
 
     uvs_px: Array

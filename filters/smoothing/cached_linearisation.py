@@ -1,7 +1,7 @@
-"""Python factors in an incremental graph: linearised here, held as linear containers, renewed as their states move.
+"""Python factors in an incremental graph: linearised here, kept as linear containers, renewed as their states move.
 
 GTSAM's Python binding hands a CustomFactor a copy of *all* values at each call, which grows with the graph until it
-is most of the time. Such a factor is therefore linearised at the values of its own keys, and the graph holds that
+is most of the time. Such a factor is therefore linearised at the values of its own keys, and the graph has that
 linearisation, which follows its states to first order (LinearContainerFactor). Once a state has moved further than
 a threshold it is replaced by a new one at the states' values: what iSAM2 does to every other factor (Kaess et al.
 2012, algorithm 5), with the same residual and the same noise.
@@ -17,11 +17,11 @@ import numpy as np
 Read = Callable[[list[int]], gtsam.Values]
 
 # The first order errs by half the square of this times the step's length: far below the step's noise.
-MOVED = 0.01
+RENEW_BEYOND = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class CachedLinearisation:
     """A Python factor and the values (of its keys) it was last linearised at."""
 
     factor: gtsam.CustomFactor
@@ -39,24 +39,26 @@ class Held:
     def moved(self, values: gtsam.Values) -> bool:
         """Say whether a state is no longer where the factor was linearised."""
         delta = self.linearised_at.localCoordinates(values)
-        return any(np.abs(delta.at(key)).max() > MOVED for key in self.keys)
+        return any(np.abs(delta.at(key)).max() > RENEW_BEYOND for key in self.keys)
 
 
-def held_of(factors: gtsam.NonlinearFactorGraph, read: Read) -> dict[int, Held]:
+def cached_linearisations(factors: gtsam.NonlinearFactorGraph, read: Read) -> dict[int, CachedLinearisation]:
     """Linearise the Python factors of a graph at the values ``read`` gives; return them by their place in it."""
     places = ((i, factors.at(i)) for i in range(factors.size()))
-    return {i: Held(f, read(f.keys())) for i, f in places if isinstance(f, gtsam.CustomFactor)}
+    return {i: CachedLinearisation(f, read(f.keys())) for i, f in places if isinstance(f, gtsam.CustomFactor)}
 
 
-def contained(factors: gtsam.NonlinearFactorGraph, held: dict[int, Held]) -> gtsam.NonlinearFactorGraph:
-    """Return a copy of the graph with the held factors' linearisations in their places."""
+def with_linearisations(
+    factors: gtsam.NonlinearFactorGraph, cached: dict[int, CachedLinearisation]
+) -> gtsam.NonlinearFactorGraph:
+    """Return a copy of the graph with linearisations in their factors' places."""
     graph = gtsam.NonlinearFactorGraph(factors)
-    for place, factor in held.items():
+    for place, factor in cached.items():
         graph.replace(place, factor.container())
     return graph
 
 
-def renewed(held: Iterable[tuple[int, Held]], read: Read) -> dict[int, Held]:
+def renewed(cached: Iterable[tuple[int, CachedLinearisation]], read: Read) -> dict[int, CachedLinearisation]:
     """Return, by slot, new linearisations of those factors whose states have moved."""
-    now = ((slot, old, read(old.factor.keys())) for slot, old in held)
-    return {slot: Held(old.factor, values) for slot, old, values in now if old.moved(values)}
+    now = ((slot, old, read(old.factor.keys())) for slot, old in cached)
+    return {slot: CachedLinearisation(old.factor, values) for slot, old, values in now if old.moved(values)}

@@ -3,8 +3,8 @@
 With the landmarks eliminated first and the states in the order of time, each state is a linear function of a few
 later ones plus noise: ``x = -R^-1 S x_S + n``. So the joint covariance of a short stretch of states, carried from
 the end to the beginning, yields every state's (Golub & Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery
-from a square root information matrix for data association"). GTSAM's Marginals asks its Bayes tree anew for each
-state, which takes a hundred times as long.
+from a square root information matrix for data association"). GTSAM's Marginals traverses its Bayes tree anew for
+each state, which takes a hundred times as long.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,20 +14,17 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.indeterminate import variable_named
-from filters.smoothing.marginals import in_estimate_order
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray
+from toolkit.models.motion import MotionModel
 
 
 def with_covariances(
-    trajectory: Trajectory,
-    linear: gtsam.GaussianFactorGraph,
-    landmark_keys: Sequence[int],
-    states: Sequence[Sequence[int]],
+    trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Return the trajectory with the covariance of every state, or as it is and a line that says why."""
+    """Return the trajectory with the covariance of every state, or as it is and the reason."""
     try:
-        covs = state_covs(linear, landmark_keys, states, trajectory.T_world_imu)
+        covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
     except RuntimeError as refusal:
         name = gtsam.Symbol(variable_named(refusal)).string()
         return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)
@@ -35,18 +32,18 @@ def with_covariances(
 
 
 def state_covs(
-    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]], poses: Array
+    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel, poses: Array
 ) -> Array:
-    """Return the covariance (K, d, d) of each state, in the order and on the side of an Estimate.
+    """Return the covariance (K, d, d) of the states 0 to K - 1, in the order and on the side of an Estimate.
 
-    ``states`` names the keys of each state, in the order of time, as pose, (velocity,) bias; ``poses`` (K, 4, 4)
-    are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them.
+    ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them.
     """
+    states = [motion.keys(k) for k in range(len(poses))]
     _, reduced = linear.eliminatePartialSequential(_ordering(landmark_keys))
     in_time = [key for keys in states for key in keys]
     net = reduced.eliminateSequential(_ordering(in_time))
     covs = list(_recovered([net.at(i) for i in range(net.size())], states))[::-1]
-    return np.stack([in_estimate_order(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
+    return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
 
 
 def _ordering(keys: Sequence[int]) -> gtsam.Ordering:

@@ -1,9 +1,9 @@
 """Levenberg-Marquardt on GTSAM's linearisation and elimination, with every solve checked.
 
 GTSAM's own optimizer hands a Python factor a fresh copy of all values at each call, which makes a thousand
-twist factors ten times dearer than sixty thousand stereo factors; and it returns unchanged values without a
-word when an error is not a number. The damping is Levenberg's multiple of the identity, updated by how well
-the linear model foretold the decrease (Madsen, Nielsen & Tingleff 2004, "Methods for non-linear least squares
+twist factors take ten times as long as sixty thousand stereo factors; and it returns unchanged values without a
+message when an error is not a number. The damping is Levenberg's multiple of the identity, updated by how well
+the linear model predicted the decrease (Madsen, Nielsen & Tingleff 2004, "Methods for non-linear least squares
 problems", algorithm 3.16): a step that was right lowers it, a wrong one raises it ever faster.
 """
 
@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from toolkit.errors import EstimatorError
+from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e8
 
@@ -35,14 +36,20 @@ class Solution(NamedTuple):
     converged: bool
 
 
-class _Step(NamedTuple):
+class _DampedStep(NamedTuple):
     values: gtsam.Values
     error: float
     gain: float
 
 
-def solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, stopping: Stopping) -> Solution:
-    """Minimise the error of a graph from a start.
+def solve(
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    stopping: Stopping,
+    progress: Progress = SILENT,
+    stage: str = "solving",
+) -> Solution:
+    """Minimise the error of a graph from a start; ``progress`` hears of every iteration, under the stage's name.
 
     Raises EstimatorError where the error at the start is not finite: some measurement or initial value is NaN.
     """
@@ -52,14 +59,15 @@ def solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, stopping: Stop
     if not np.isfinite(error):
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
     for iteration in range(1, stopping.max_iterations + 1):
+        progress.advance(iteration - 1, stopping.max_iterations, stage)
         linear = graph.linearize(values)
-        growth, step = 2.0, None
+        factor, step = 2.0, None
         while step is None:
             damped = _damped(linear, keys, damping)
             step = _tried(graph, linear, damped, ordering, values)
             if step is None or not step.error <= error:
                 solvable, step = step is not None, None
-                damping, growth = damping * growth, growth * 2.0
+                damping, factor = damping * factor, factor * 2.0
                 if damping > _MOST_DAMPING:
                     # No step, however short, lowers the error: a minimum, if the system could be solved at all.
                     return Solution(values, error, iteration, converged=solvable)
@@ -86,7 +94,7 @@ def _tried(
     damped: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
-) -> _Step | None:
+) -> _DampedStep | None:
     """Return where one damped step leads, or None where even the damped system is indeterminate."""
     try:
         delta = damped.optimize(ordering)
@@ -95,9 +103,9 @@ def _tried(
             return None
         raise
     moved = values.retract(delta)
-    foretold = linear.error(values.zeroVectors()) - linear.error(delta)
+    predicted = linear.error(values.zeroVectors()) - linear.error(delta)
     error = graph.error(moved)
-    return _Step(moved, error, (graph.error(values) - error) / max(foretold, np.finfo(float).tiny))
+    return _DampedStep(moved, error, (graph.error(values) - error) / max(predicted, np.finfo(float).tiny))
 
 
 def _keys_by_dimension(values: gtsam.Values) -> dict[int, list[int]]:

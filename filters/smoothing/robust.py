@@ -18,6 +18,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, X, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
+from toolkit.progress import Progress
 from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.settings import Outliers
 
@@ -41,6 +42,7 @@ def solve_robustly(
     rig: StereoRig,
     start: gtsam.Values,
     outliers: Outliers,
+    progress: Progress,
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
@@ -48,17 +50,18 @@ def solve_robustly(
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
     """
     loss, values = gtsam.noiseModel.mEstimator, start
-    for robust, stopping in (
-        (loss.Huber.Create(outliers.batch_huber), _HUBER_STOPPING),
-        (loss.Cauchy.Create(outliers.batch_cauchy), _CAUCHY_STOPPING),
+    for robust, stopping, stage in (
+        (loss.Huber.Create(outliers.batch_huber), _HUBER_STOPPING, "solving with Huber's loss"),
+        (loss.Cauchy.Create(outliers.batch_cauchy), _CAUCHY_STOPPING, "solving with Cauchy's loss"),
     ):
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
-        values = solve(graph, _only_seen(values, frames), stopping).values
+        values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
         frames = _without_those_behind(frames, values, rig)
     bound = chi2_bound(3, 1.0 - outliers.batch_cut_probability)
     frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
     graph = _with_sightings(motion, frames, StereoFactors(rig))
-    return Smoothed(solve(graph, _only_seen(values, frames), _LAST_STOPPING), graph, frames)
+    last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
+    return Smoothed(last, graph, frames)
 
 
 def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:

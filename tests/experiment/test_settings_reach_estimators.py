@@ -9,6 +9,7 @@ from toolkit import discovery, runner
 from toolkit.errors import EstimatorError
 from toolkit.estimator import ENTRY_POINT_GROUP, find
 from toolkit.experiment import Plan, prepared_cases, run
+from toolkit.experiment.workers import Workers
 from toolkit.settings import settings_of
 
 _ESTIMATOR = '''
@@ -79,7 +80,7 @@ def test_an_option_nobody_reads_is_refused_before_anything_runs(
 ) -> None:
     monkeypatch.setattr(runner, "run", None)
     with pytest.raises(EstimatorError, match=told):
-        prepared_cases(plan({"estimators": options}, tunable, "plain"))
+        prepared_cases(plan({"estimators": options}, tunable, "plain"), Workers(1))
 
 
 def test_options_are_read_without_importing(tunable: str) -> None:

@@ -191,12 +191,12 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp
     program = textwrap.dedent("""
         import sys
         from toolkit.cli import main
-        from toolkit.experiment import pipeline
-        results_of = pipeline.results_of
+        from toolkit.experiment.workers import Workers
+        results = Workers.results
         def told(*given):
             print("starting", flush=True)
-            yield from results_of(*given)
-        pipeline.results_of = told
+            yield from results(*given)
+        Workers.results = told
         words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--out", "run"]
         sys.exit(main(["compare", "drive", *words]))
     """)

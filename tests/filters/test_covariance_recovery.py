@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters import fixed_lag
 from filters.smoothing import covariance_recovery
 from filters.smoothing.covariance_recovery import state_covs
-from filters.smoothing.marginals import state_cov
+from toolkit.models.motion import state_cov
+from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=1.5)}
@@ -17,18 +17,18 @@ SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, dura
 
 @pytest.mark.parametrize("scenario", SHORT)
 def test_every_state_has_gtsams_marginal(scenario, run_estimator, monkeypatch):
-    asked = []
+    calls = []
 
-    def spy(linear, landmark_keys, states, poses):
-        asked.append((linear, states, poses))
-        return state_covs(linear, landmark_keys, states, poses)
+    def spy(linear, landmark_keys, motion, poses):
+        calls.append((linear, motion, poses))
+        return state_covs(linear, landmark_keys, motion, poses)
 
     monkeypatch.setattr(covariance_recovery, "state_covs", spy)
     run = run_estimator("batch", simulate(SHORT[scenario], 3))
-    (linear, states, poses) = asked[0]
+    (linear, motion, poses) = calls[0]
     tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
-    for k in range(0, len(states), 5):
-        expected = state_cov(tree, states[k], poses[k, :3, :3])
+    for k in range(0, len(poses), 5):
+        expected = state_cov(motion, tree, k, poses[k, :3, :3])
         sigmas = np.sqrt(np.diag(expected))
         np.testing.assert_allclose(
             run.final.cov[k] / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-6
@@ -42,5 +42,5 @@ def test_the_newest_state_of_a_window_that_never_leaves_has_the_batchs_covarianc
     newest = run_estimator("fixed-lag", sequence).causal.cov[-1]
     smoothed = run_estimator("batch", sequence).final.cov[-1]
     sigma_ratio = np.sqrt(np.diag(newest)[:6] / np.diag(smoothed)[:6])
-    assert fixed_lag.LAG_S > 1.5
+    assert DEFAULTS.window.lag_s > 1.5
     np.testing.assert_allclose(sigma_ratio, 1.0, atol=0.25)

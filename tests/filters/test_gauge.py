@@ -70,7 +70,7 @@ class Watched:
 
 
 class Answers(NamedTuple):
-    """What a filter said at every step: means (K, 4, 4), covariances (K, d, d), and the gauge (K, d, 4) it kept."""
+    """A filter's answers at every step: means (K, 4, 4), covariances (K, d, d), and the gauge (K, d, 4) it kept."""
 
     poses: Array
     covs: Array

@@ -96,9 +96,9 @@ def test_jacobians_after_a_move_are_those_of_the_residuals_to_the_move(scenario,
     def residuals(change: Array) -> Array:
         """The clone is the pose: they move together."""
         moved = joint.displaced(delta + np.r_[change[:6], np.zeros(part.start - 6), change])
-        return measurement.stacked(joint_landmarks.predicted_sightings(moved, frame, AT, rig))[1]
+        return measurement.stacked(joint_landmarks.linearise_sightings(moved, frame, AT, rig))[1]
 
-    seen = joint_landmarks.predicted_sightings(joint.displaced(delta), frame, AT, rig)
+    seen = joint_landmarks.linearise_sightings(joint.displaced(delta), frame, AT, rig)
     H_pose, H_point = joint.pulled_back(delta, seen.H_pose, seen.H_point)
     H, _ = measurement.stacked(seen._replace(H_pose=H_pose, H_point=H_point))
     expected = -numerical(residuals, part.stop - part.start)
@@ -277,11 +277,11 @@ def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(sc
     ekf = JointEkf(setup, AT, anchored(sequence.rig), iterated.correct)
     for packet in sequence.packets():
         frame = packet.frame
-        said = ekf.step(replace(packet, frame=replace(frame, uvs_px=rng.permutation(frame.uvs_px))))
-        assert np.isfinite(said.T_world_imu).all()
-        sigma = np.sqrt(np.diag(said.cov))
-        assert np.linalg.eigvalsh(said.cov / np.outer(sigma, sigma)).min() > 0.0
-        unconverged += said.info["unconverged"]
+        estimate = ekf.step(replace(packet, frame=replace(frame, uvs_px=rng.permutation(frame.uvs_px))))
+        assert np.isfinite(estimate.T_world_imu).all()
+        sigma = np.sqrt(np.diag(estimate.cov))
+        assert np.linalg.eigvalsh(estimate.cov / np.outer(sigma, sigma)).min() > 0.0
+        unconverged += estimate.info["unconverged"]
     assert unconverged > 0
 
 
@@ -294,9 +294,9 @@ def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
         ekf, errors = JointEkf(setup_of(sequence), AT, belief(sequence.rig), iterated.correct), []
         assert sequence.truth is not None
         for packet in sequence.packets():
-            said = ekf.step(packet)
-            error = se3_log(se3_inverse(said.T_world_imu) @ sequence.truth.T_world_imu[packet.index])
-            errors.append(error @ np.linalg.solve(said.cov[:6, :6], error) / 6)
+            estimate = ekf.step(packet)
+            error = se3_log(se3_inverse(estimate.T_world_imu) @ sequence.truth.T_world_imu[packet.index])
+            errors.append(error @ np.linalg.solve(estimate.cov[:6, :6], error) / 6)
         return float(np.mean(errors))
 
     in_metres = np.mean([nees(lambda _: InvariantBelief, seed) for seed in range(2)])

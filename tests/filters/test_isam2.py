@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 
 from filters.isam2 import Isam2
-from filters.smoothing import cached_linearisation, incremental
-from filters.smoothing.cached_linearisation import MOVED, Held, contained, held_of, renewed
-from filters.smoothing.frozen_variables import Resting
-from filters.smoothing.incremental import FLUID_FRAMES, MOST_RECOVERIES, IncrementalTree
+from filters.smoothing import cached_linearisation, isam2_tree
+from filters.smoothing.cached_linearisation import (
+    RENEW_BEYOND,
+    CachedLinearisation,
+    cached_linearisations,
+    renewed,
+    with_linearisations,
+)
+from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, FrozenVariables, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models import twist
 from toolkit.models.factors import B, L, V, X
+from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence, TwistMotion
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
+MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
 
 
@@ -55,10 +62,12 @@ def normal_equations(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> np.
     return np.column_stack([information, vector])
 
 
-def test_a_held_factor_says_what_the_python_factor_says_where_it_was_linearised(values):
+def test_a_cached_factor_says_what_the_python_factor_says_where_it_was_linearised(values):
     factor = step_factor()
     np.testing.assert_allclose(
-        normal_equations(Held(factor, values).container(), values), normal_equations(factor, values), rtol=1e-9
+        normal_equations(CachedLinearisation(factor, values).container(), values),
+        normal_equations(factor, values),
+        rtol=1e-9,
     )
 
 
@@ -66,25 +75,25 @@ def test_python_factors_only_are_replaced_and_keep_their_place(values):
     graph = gtsam.NonlinearFactorGraph()
     graph.addPriorPose3(X(0), values.atPose3(X(0)), gtsam.noiseModel.Unit.Create(6))
     graph.add(step_factor())
-    held = held_of(graph, values.extract)
+    held = cached_linearisations(graph, values.extract)
     assert list(held) == [1]
-    replaced = contained(graph, held)
+    replaced = with_linearisations(graph, held)
     assert isinstance(replaced.at(0), gtsam.PriorFactorPose3)
     assert isinstance(replaced.at(1), gtsam.LinearContainerFactor)
     assert isinstance(graph.at(1), gtsam.CustomFactor), "the graph given stays as it was"
 
 
 @pytest.mark.parametrize(("far", "expected"), [(0.5, []), (2.0, [7])])
-def test_a_held_factor_is_renewed_once_its_states_have_moved(values, far, expected):
-    pose = values.atPose3(X(1)).retract(np.array([0.0, 0.0, far * MOVED, 0.0, 0.0, 0.0]))
+def test_a_cached_factor_is_renewed_once_its_states_have_moved(values, far, expected):
+    pose = values.atPose3(X(1)).retract(np.array([0.0, 0.0, far * RENEW_BEYOND, 0.0, 0.0, 0.0]))
     now = values_of(values.atPose3(X(0)), pose, values.atVector(B(0)))
-    new = renewed([(7, Held(step_factor(), values))], now.extract)
+    new = renewed([(7, CachedLinearisation(step_factor(), values))], now.extract)
     assert list(new) == expected
     assert all(held.linearised_at.equals(now, 1e-12) for held in new.values())
 
 
 def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` say nothing."""
+    """Return a pose that is held and landmarks seen from it, of which the last ``unseen`` are behind it."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(X(0), gtsam.Pose3())
     values.insert(V(0), np.zeros(3))
@@ -102,7 +111,7 @@ def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFact
 
 
 def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named():
-    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    tree = Isam2Tree(MOTION, baseline_m=0.1)
     log, dropped = tree.add(*pose_and_landmarks(landmarks=4, unseen=2), [X(0), V(0), B(0)])
     assert len(log) == 2
     assert dropped == {2, 3}
@@ -112,19 +121,19 @@ def test_landmarks_that_make_the_system_indeterminate_are_dropped_and_named():
 
 
 def test_after_a_recovery_the_tree_grows_and_drops_as_before():
-    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    tree = Isam2Tree(MOTION, baseline_m=0.1)
     tree.add(*pose_and_landmarks(landmarks=4, unseen=1), [X(0), V(0), B(0)])
     assert tree.drop([L(1)]) == ([], set())
     assert not tree.has(L(1))
     assert sorted(tree.landmarks()) == [L(0), L(2)]
 
 
-def test_a_state_that_nothing_holds_is_held_weakly_and_named():
+def test_a_state_that_nothing_holds_is_cached_weakly_and_named():
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in (0, 1):
         values.insert(X(k), gtsam.Pose3())
     graph.add(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
-    tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+    tree = Isam2Tree(MOTION, baseline_m=0.1)
     log, _ = tree.add(graph, values, [X(1)])
     assert "solved by QR" in log[0]
     assert "held weakly" in log[-1]
@@ -133,7 +142,7 @@ def test_a_state_that_nothing_holds_is_held_weakly_and_named():
 
 def test_a_system_beyond_recovery_ends_with_an_error_and_not_with_an_answer():
     with pytest.raises(EstimatorError, match="stays indeterminate"):
-        tree = IncrementalTree(bias_size=6, baseline_m=0.1)
+        tree = Isam2Tree(MOTION, baseline_m=0.1)
         tree.add(*pose_and_landmarks(landmarks=MOST_RECOVERIES + 2, unseen=MOST_RECOVERIES + 1), [X(0), V(0), B(0)])
 
 
@@ -146,51 +155,51 @@ def test_without_vision_it_solves_by_qr_and_returns_to_cholesky_with_vision(run_
     assert sum("solved by QR" in line for line in run.log) == 1
 
 
-def test_what_none_of_the_last_frames_concerned_rests():
-    resting = Resting(frames=2)
+def test_what_none_of_the_last_frames_had_factors_on_is_frozen():
+    frozen = FrozenVariables(frames=2)
     for keys in ([X(0), L(0), L(1)], [X(1), L(1)], [X(2)]):
-        resting.concerns(keys)
-    assert list(resting.keys) == [L(0), X(0)]
+        frozen.add_frame(keys)
+    assert list(frozen.keys) == [L(0), X(0)]
     for keys in ([X(3), L(2)], [X(4)], [X(5)]):
-        resting.concerns(keys)
-    assert list(resting.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
-    assert resting.all_of([X(3), L(2)])
-    assert not resting.all_of([X(3), X(4)])
+        frozen.add_frame(keys)
+    assert list(frozen.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
+    assert frozen.contain_all([X(3), L(2)])
+    assert not frozen.contain_all([X(3), X(4)])
 
 
-def test_a_state_at_rest_is_linearised_where_it_was_until_the_end(monkeypatch):
+def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     """What a frame may linearise anew is bounded, however far the past moves; in the end all of it is.
 
-    With thresholds that any motion passes: what is not at rest is linearised anew in every frame.
+    With thresholds that any motion passes: what is not frozen is linearised anew in every frame.
     """
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "LANDMARK_THRESHOLD_BASELINES"):
-        monkeypatch.setattr(incremental, name, 1e-9)
+        monkeypatch.setattr(isam2_tree, name, 1e-9)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
     estimator, points = isam2_of(sequence), []
     for packet in sequence.packets():
         estimator.step(packet)
         points.append(gtsam.Values(estimator._tree.isam.getLinearizationPoint()))
-    for k in range(1, len(points) - FLUID_FRAMES - 1):
+    for k in range(1, len(points) - FROZEN_AFTER_FRAMES - 1):
         linearised_at = [values.atPose3(X(k)).matrix() for values in points[k:]]
         moved = [not np.array_equal(now, then) for then, now in pairwise(linearised_at)]
-        # The step to the next frame concerns it, too, and its last turn comes in the frame it goes to rest.
-        assert any(moved[: FLUID_FRAMES + 1])
-        assert not any(moved[FLUID_FRAMES + 1 :])
+        # The step to the next frame concerns it, too, and its last turn comes in the frame it is frozen in.
+        assert any(moved[: FROZEN_AFTER_FRAMES + 1])
+        assert not any(moved[FROZEN_AFTER_FRAMES + 1 :])
     final = estimator.finish().trajectory
     assert not np.allclose(final.T_world_imu[1], points[-1].atPose3(X(1)).matrix(), atol=1e-9)
 
 
-def test_a_python_factor_whose_states_rest_is_renewed_no_more(monkeypatch):
+def test_a_python_factor_whose_states_are_frozen_is_renewed_no_more(monkeypatch):
     """With a threshold that any motion passes: the others are renewed in every frame."""
-    monkeypatch.setattr(cached_linearisation, "MOVED", 0.0)
+    monkeypatch.setattr(cached_linearisation, "RENEW_BEYOND", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=4.0), 0)
-    estimator, before = isam2_of(sequence), dict[tuple[int, ...], Held]()
+    estimator, before = isam2_of(sequence), dict[tuple[int, ...], CachedLinearisation]()
     for packet in sequence.packets():
         estimator.step(packet)
-        now = {held.keys: held for held in estimator._tree._held.values()}
+        now = {held.keys: held for held in estimator._tree._cached.values()}
         kept = {keys for keys, held in before.items() if now[keys] is held}
-        # A frame puts variables to rest before it renews what does not rest.
-        assert kept == {keys for keys in before if estimator._tree._resting.all_of(keys)}
+        # A frame freezes variables before it renews the others.
+        assert kept == {keys for keys in before if estimator._tree._frozen.contain_all(keys)}
         before = now
     assert kept
 
@@ -207,13 +216,13 @@ def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     may still move by is a hundredth of a sigma.
     """
     sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0), 1)
-    estimator, said = isam2_of(sequence), []
+    estimator, estimates = isam2_of(sequence), []
     for packet in sequence.packets():
-        said.append(estimator.step(packet))
+        estimates.append(estimator.step(packet))
     graph, before = estimator._tree.graph(), estimator._tree.isam.calculateBestEstimate()
     finished = estimator.finish()
     assert finished.converged
-    final, sigma = finished.trajectory, np.sqrt(np.diagonal(said[-1].cov)[:6])
+    final, sigma = finished.trajectory, np.sqrt(np.diagonal(estimates[-1].cov)[:6])
     best = solve(graph, before, Stopping(1e-12)).values
     optimum = np.array([best.atPose3(X(k)).matrix() for k in range(len(final))])
     off = se3_log(se3_inverse(optimum) @ final.T_world_imu)

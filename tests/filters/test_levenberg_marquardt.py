@@ -1,4 +1,4 @@
-"""The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is told."""
+"""The checked Levenberg-Marquardt: the minimum is GTSAM's, and every way a solve can go wrong is reported."""
 
 from dataclasses import replace
 from itertools import pairwise

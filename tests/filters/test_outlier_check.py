@@ -1,4 +1,4 @@
-"""What a smoother leaves out before it solves: tracks that slipped, and nothing else."""
+"""What a smoother leaves out before it solves: sightings of another point, and nothing else."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def test_errors_of_twenty_pixels_are_told_from_sound_sightings():
 
 @pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=["drive", "flight"])
 def test_a_wrong_state_blames_no_track(scenario):
-    """A metre beside the truth every sighting disagrees: that speaks against the state."""
+    """A metre beside the truth every sighting disagrees: then the state is wrong."""
     scenario = replace(scenario, duration_s=5.0)
     sequence, points = simulate(scenario, 0), landmarks_of(scenario, 0)
     packet, expected = expected_states(sequence)[2]

@@ -109,7 +109,7 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     convert, before = to_invariant(joint), group_element(joint)
     P = convert @ joint.cov @ convert.T
     joint.clone(0)
-    seen = joint_landmarks.predicted_sightings(joint, frame, AT, rig)
+    seen = joint_landmarks.linearise_sightings(joint, frame, AT, rig)
     stacked = joint_landmarks.stacked(joint, seen)
     H_plain = np.zeros((stacked.residuals.size, convert.shape[0]))
     H_wide, d = stacked.H.reshape(stacked.residuals.size, -1), joint.core.layout.size
@@ -169,7 +169,7 @@ def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(sc
         moved = joint.displaced(drawn)
         here = gauge(moved, turns=np.eye(3))
         assert np.abs(here - constant).max() > 0.01, "in the plain error they are others"
-        H = joint_landmarks.stacked(moved, joint_landmarks.predicted_sightings(moved, frame, AT, rig)).H
+        H = joint_landmarks.stacked(moved, joint_landmarks.linearise_sightings(moved, frame, AT, rig)).H
         part = joint_landmarks.columns(moved)
         # Jacobians of hundreds of pixels a radian or metre, directions of tens of metres.
         assert np.abs(H @ here[part]).max() < 1e-9
@@ -202,7 +202,7 @@ def gauge(joint: JointBelief, turns: Array) -> Array:
 
 
 def loosened(prior: Prior, core: Belief, turns: Array) -> Prior:
-    """Return the prior, half a metre and six degrees looser along the gauge: what it said of it was all there was."""
+    """Return the prior, half a metre and six degrees looser along the gauge: the prior alone knew of it."""
     directions = np.zeros((15, 3 + turns.shape[1]))
     rows = np.arange(15) if core.layout is IMU_LAYOUT else np.r_[0:6, 12:15]
     directions[rows] = gauge(JointBelief(core), turns)
@@ -254,7 +254,7 @@ def test_the_plain_error_at_latest_estimates_does_gain_it(scenario, correct) -> 
 
 
 def test_the_world_a_filter_starts_in_makes_no_difference() -> None:
-    """Started 700 m away and turned by two radians, it says the same of the relative motion and of its covariance."""
+    """Started 700 m away and turned by two radians, its relative motion and covariance are the same."""
     sequence = recording(DRIVE)
     T_other_world = se3(se3_exp(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]))[:3, :3], np.array([500.0, -490.0, 3.0]))
     assert sequence.prior is not None

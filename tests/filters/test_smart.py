@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from filters.smart import Smart
-from filters.smoothing.structureless import RobustCamera, Sightings, Vision
+from filters.smoothing.smart_factors import RobustCamera, Sightings, Vision
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo

@@ -1,4 +1,4 @@
-"""A slipped sighting costs a track that sighting, not its voice."""
+"""A mismatched sighting costs a track that sighting alone, where the margin is wide."""
 
 from dataclasses import replace
 
@@ -45,14 +45,14 @@ def mismatched(sightings: TrackSightings, errors: dict[int, list[int]]) -> Track
     return sightings._replace(uvs_px=uvs_px)
 
 
-def tested(scene, sightings: TrackSightings):
+def gated(scene, sightings: TrackSightings):
     joint, rig, _ = scene
     gate = FrameGate(0.95)
     return TrackGate(joint, AtLatestEstimates(), rig).accepted(sightings, gate), gate
 
 
 def test_sound_tracks_all_pass_as_they_are(scene):
-    accepted, gate = tested(scene, scene[2])
+    accepted, gate = gated(scene, scene[2])
     assert sorted(accepted.track_ids) == list(range(TRACKS))
     assert gate.tested == gate.accepted == TRACKS
     assert (accepted.constraints.dof == 3 * WINDOW - 3).all()
@@ -60,7 +60,7 @@ def test_sound_tracks_all_pass_as_they_are(scene):
 
 @pytest.mark.parametrize("view", [0, 2, WINDOW - 1])
 def test_the_mismatched_sighting_is_the_one_left_out(scene, view):
-    accepted, gate = tested(scene, mismatched(scene[2], {4: [view]}))
+    accepted, gate = gated(scene, mismatched(scene[2], {4: [view]}))
     row = accepted.track_ids.tolist().index(4)
     assert accepted.constraints.dof[row] == 3 * (WINDOW - 1) - 3
     assert not accepted.linearised.H_pose[row, view].any()
@@ -68,7 +68,7 @@ def test_the_mismatched_sighting_is_the_one_left_out(scene, view):
 
 
 def test_two_mismatches_cost_the_track(scene):
-    accepted, gate = tested(scene, mismatched(scene[2], {7: [0, 3]}))
+    accepted, gate = gated(scene, mismatched(scene[2], {7: [0, 3]}))
     assert 7 not in accepted.track_ids
     assert (gate.tested, gate.accepted) == (TRACKS + 1, TRACKS - 1)
 
@@ -88,18 +88,18 @@ def test_the_fall_predicted_is_what_leaving_the_sighting_out_brings(scene):
         return float(constraints.residuals[0] @ gate._precision(constraints)[0] @ constraints.residuals[0])
 
     assert nis(with_it, np.ones((1, WINDOW), dtype=bool)) > 50.0 * nis(alone, without.seen)
-    accepted, _ = tested(scene, bad)
+    accepted, _ = gated(scene, bad)
     assert accepted.points[accepted.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
 
 
 def test_a_track_seen_twice_that_disagrees_is_rejected(scene):
     twice = scene[2]._replace(seen=np.tile(np.arange(WINDOW) < 2, (TRACKS, 1)))
-    accepted, _ = tested(scene, mismatched(twice, {3: [1]}))
+    accepted, _ = gated(scene, mismatched(twice, {3: [1]}))
     assert 3 not in accepted.track_ids
     assert len(accepted.track_ids) == TRACKS - 1
 
 
 def test_no_track_at_all_is_no_test(scene):
-    accepted, gate = tested(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
+    accepted, gate = gated(scene, scene[2].select(np.zeros(TRACKS, dtype=bool)))
     assert len(accepted.points) == 0
     assert gate.tested == 0

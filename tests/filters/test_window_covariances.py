@@ -9,14 +9,13 @@ import pytest
 from filters import smart
 from filters.fixed_lag import FixedLag
 from filters.smart import Smart
+from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
-from filters.smoothing.lag_window import LagWindow
-from filters.smoothing.marginals import state_cov
-from filters.smoothing.structureless import Sightings
-from filters.smoothing.window_solver import Solution, without_oldest
+from filters.smoothing.smart_factors import Sightings
+from filters.smoothing.smart_solver import SolvedWindow, without_oldest
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
-from toolkit.models.motion import motion_model
+from toolkit.models.motion import motion_model, state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -69,18 +68,18 @@ def assert_covs_agree(covs, expected, relative):
 def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(scenario, changed, monkeypatch):
     sequence = changed(simulate(scenario, 3))
     motion, last = motion_model(sequence.noise, sequence.gravity_world), {}
-    add = LagWindow.add
+    add = FixedLagTree.add
 
-    def spied(window, grown, t_ns):
-        recovery, tree = add(window, grown, t_ns), window._isam
+    def spied(window, extension, t_ns):
+        recovery, tree = add(window, extension, t_ns), window._isam
         marginals = gtsam.Marginals(without_gaps(tree.getFactorsUnsafe()), tree.getLinearizationPoint())
         for k, stamp_ns in enumerate(sequence.frames_t_ns.tolist()):
             if t_ns - round(LAG_S * NS_PER_S) <= stamp_ns <= t_ns:
                 R_world_imu = window.values().atPose3(motion.keys(k)[0]).rotation().matrix()
-                last[k] = state_cov(marginals, motion.keys(k), R_world_imu)
+                last[k] = state_cov(motion, marginals, k, R_world_imu)
         return recovery
 
-    monkeypatch.setattr(LagWindow, "add", spied)
+    monkeypatch.setattr(FixedLagTree, "add", spied)
     final = run_through(FixedLag(setup_of(sequence), LAG_S), sequence)
     # Both invert the same normal equations, whose rounding grows with their condition.
     assert_covs_agree(final.cov, np.array([last[k] for k in range(len(final))]), 1e-5)
@@ -90,7 +89,7 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
 @pytest.mark.parametrize("changed", [lambda s: s, with_gap, from_zero], ids=["whole", "gap", "from-zero"])
 def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario, changed, monkeypatch):
     sequence, last = changed(simulate(scenario, 3)), {}
-    taken_in, solved = [], smart.solved
+    taken_in, solved = [], smart.solve_window
 
     def spied(window, rig):
         solution = solved(window, rig)
@@ -101,7 +100,7 @@ def test_smart_states_leave_with_the_inverse_of_the_windows_information(scenario
             last[len(taken_in) - count + i] = inverse[i * d : (i + 1) * d, i * d : (i + 1) * d]
         return solution
 
-    monkeypatch.setattr(smart, "solved", spied)
+    monkeypatch.setattr(smart, "solve_window", spied)
     final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
     expected = np.array([last[k] for k in range(len(final))])
     if sequence.motion_kind == "imu":
@@ -148,14 +147,14 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
     none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
-    window = smart.Window(keys, values, (), smart.Prior.nothing(), none, np.empty((0, 3)))
+    window = smart.SmartWindow(keys, values, (), smart.MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):
-        np.testing.assert_allclose(Solution(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])
+        np.testing.assert_allclose(SolvedWindow(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])
 
 
 def test_a_window_started_afresh_leaves_no_state_without_a_covariance(monkeypatch):
-    sequence, solved, refused = simulate(SCENARIOS[2], 3), smart.solved, []
+    sequence, solved, refused = simulate(SCENARIOS[2], 3), smart.solve_window, []
 
     def refusing_once(window, rig):
         if len(window.keys) == 8 and not refused:
@@ -163,7 +162,7 @@ def test_a_window_started_afresh_leaves_no_state_without_a_covariance(monkeypatc
             raise EstimatorError("nothing determines it")
         return solved(window, rig)
 
-    monkeypatch.setattr(smart, "solved", refusing_once)
+    monkeypatch.setattr(smart, "solve_window", refusing_once)
     estimator = Smart(setup_of(sequence), LAG_S)
     final = run_through(estimator, sequence)
     assert refused

@@ -79,7 +79,7 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
-    from toolkit.experiment import comparisons, prepared_cases
+    from toolkit.experiment import comparisons, prepared_cases, workers_of
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
@@ -88,16 +88,16 @@ def command(options: argparse.Namespace) -> int:
     columns = _columns(options.columns)
     asked = _configuration(options)
     plan, progress_for = _plan(asked, options.workers), of_this_process()
-    cases = prepared_cases(plan, progress_for)
-    directories = directories_for(cases, options.out if options.out is not None else _new_run())
-    made_by = MadeBy(shlex.join(options.command_line), asked)
-    all_ok = True
-    for comparison, directory in zip(comparisons(plan, cases, progress_for), directories, strict=True):
-        print_above(comparison_text(comparison, columns, width_of_output()))
-        with progress_for(f"{comparison.name}: figures and report"):
-            write_run(comparison, directory, made_by)
-        print_above(f"\nresults: {directory}\n")
-        all_ok = all_ok and comparison.all_ok
+    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked), True
+    with workers_of(plan) as workers:
+        cases = prepared_cases(plan, workers, progress_for)
+        directories = directories_for(cases, options.out if options.out is not None else _new_run())
+        for comparison, directory in zip(comparisons(plan, cases, workers, progress_for), directories, strict=True):
+            print_above(comparison_text(comparison, columns, width_of_output()))
+            with progress_for(f"{comparison.name}: figures and report"):
+                write_run(comparison, directory, made_by)
+            print_above(f"\nresults: {directory}\n")
+            all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
 
 

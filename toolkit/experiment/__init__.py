@@ -5,6 +5,6 @@ of it) -> statistics.
 """
 
 from toolkit.experiment.comparison import Comparison, Record, Row
-from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run
+from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run, workers_of
 
-__all__ = ["Comparison", "Plan", "Record", "Row", "comparisons", "prepared_cases", "run"]
+__all__ = ["Comparison", "Plan", "Record", "Row", "comparisons", "prepared_cases", "run", "workers_of"]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from toolkit.datasets import is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
+from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
@@ -14,8 +15,8 @@ from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
-from toolkit.experiment.workers import Lost, results_of, usable_cpus
-from toolkit.progress import ProgressFor, silent
+from toolkit.experiment.workers import Lost, Workers, usable_cpus
+from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings
 
@@ -69,10 +70,18 @@ class Case:
 
 def run(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Comparison, ...]:
     """Run and score every estimator on every source; raises as :func:`prepared_cases` and :func:`comparisons` do."""
-    return tuple(comparisons(plan, prepared_cases(plan, progress_for), progress_for))
+    with workers_of(plan) as workers:
+        return tuple(comparisons(plan, prepared_cases(plan, workers, progress_for), workers, progress_for))
 
 
-def prepared_cases(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
+def workers_of(plan: Plan) -> Workers:
+    """Return the processes that a plan asks for, which begin to import what they will need."""
+    workers = Workers(plan.workers or usable_cpus())
+    workers.warm_up(__name__)
+    return workers
+
+
+def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
@@ -81,20 +90,45 @@ def prepared_cases(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Case
     for entry in find_all(plan.estimators).values():
         entry.check_usable(plan.settings)
     files = {name: read_poses(path) for name, path in plan.trajectories.items()}
-    cases = []
     for source in plan.sources:
         _check_seeds(plan, source)
-        with progress_for(f"{_name(source)}: loading and checking"):
-            prepared = prepare(plan.recording(source, plan.seeds[0]))
-            brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
-            check_names(brought, files)
-            references = reference_runs(brought, prepared.sequence)
-            references += external_runs(files, prepared.whole, prepared.sequence)
-            cases.append(Case(source, prepared, references))
-    return tuple(cases)
+    recordings = [plan.recording(source, plan.seeds[0]) for source in plan.sources]
+    names = ", ".join(_name(source) for source in plan.sources)
+    with progress_for(f"{names}: loading and checking") as progress:
+        prepared = _prepared(recordings, workers, progress)
+        return tuple(_case(plan, source, one, files) for source, one in zip(plan.sources, prepared, strict=True))
 
 
-def comparisons(plan: Plan, cases: Sequence[Case], progress_for: ProgressFor = silent) -> Iterator[Comparison]:
+def _prepared(recordings: Sequence[Recording], workers: Workers, progress: Progress) -> list[Prepared]:
+    """Prepare recordings: several side by side, a single one here, where it is there at once."""
+    if len(recordings) == 1:
+        return [prepare(recordings[0])]
+    with closing(workers.results(recordings, _prepare, progress)) as coming:
+        found = dict(coming)
+    return [_unless_lost(found[place], recording) for place, recording in enumerate(recordings)]
+
+
+def _prepare(recording: Recording, _progress: Progress) -> Prepared:
+    return prepare(recording)
+
+
+def _unless_lost(result: Prepared | Lost, recording: Recording) -> Prepared:
+    if isinstance(result, Lost):
+        raise DataError(f"{_name(recording.source)}: while it was loaded {result.why}; is there memory enough?")
+    return result
+
+
+def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping[str, PosesFile]) -> Case:
+    """Return a prepared source with what other systems estimated from it."""
+    brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
+    check_names(brought, files)
+    references = reference_runs(brought, prepared.sequence)
+    return Case(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
+
+
+def comparisons(
+    plan: Plan, cases: Sequence[Case], workers: Workers, progress_for: ProgressFor = silent
+) -> Iterator[Comparison]:
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
     An estimator that fails is a row that says so. Raises DataError where a recording cannot be had under a seed.
@@ -102,19 +136,18 @@ def comparisons(plan: Plan, cases: Sequence[Case], progress_for: ProgressFor = s
     entries = find_all(plan.estimators)
     units = [unit for case in cases for unit in _units(plan, case, entries)]
     owner = [i for i, case in enumerate(cases) for _ in _units(plan, case, entries)]
-    workers = plan.workers or usable_cpus()
     outcomes: list[list[Outcome]] = [[] for _ in cases]
     missing, shown = [owner.count(i) for i in range(len(cases))], 0
     label = f"{', '.join(dict.fromkeys(case.name for case in cases))}: {len(units)} runs"
-    with progress_for(label) as progress, closing(results_of(units, workers, run_unit, progress)) as coming:
+    with progress_for(label) as progress, closing(workers.results(units, run_unit, progress)) as coming:
         for place, result in coming:
             outcomes[owner[place]].append(_outcome(result, units[place]))
             missing[owner[place]] -= 1
             while shown < len(cases) and not missing[shown]:
-                yield _comparison(plan, cases[shown], outcomes[shown], entries, workers)
+                yield _comparison(plan, cases[shown], outcomes[shown], entries, workers.count)
                 shown += 1
     for case, found in zip(cases[shown:], outcomes[shown:], strict=True):
-        yield _comparison(plan, case, found, entries, workers)
+        yield _comparison(plan, case, found, entries, workers.count)
 
 
 def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:

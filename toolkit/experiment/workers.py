@@ -13,9 +13,9 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from loky import ProcessPoolExecutor
@@ -50,22 +50,60 @@ def usable_cpus() -> int:
 def results_of(
     units: Sequence[T], workers: int, work: Work[T, R], progress: Progress
 ) -> Generator[tuple[int, R | Lost], None, None]:
-    """Yield the place and the result of every unit as each is there.
+    """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
+    with Workers(workers) as pool:
+        yield from pool.results(units, work, progress)
 
-    With one worker the work is done here, in order; with more in so many processes at a time. An error that the work
-    raises ends everything and is raised here. When the iteration ends, for whatever reason, no process is left.
+
+class Workers:
+    """So many processes, started once for several pieces of work; when the context ends none is left.
+
+    With one worker the work is done in this process.
     """
-    if workers == 1 or len(units) < 2:
-        yield from _here(units, work, progress)
-        return
-    with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
-        pool = _Pool(units, workers, work, Path(folder) / "progress")
-        yield from pool.results(progress)
 
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._executor: ProcessPoolExecutor | None = None
 
-def _here(units: Sequence[T], work: Work[T, R], progress: Progress) -> Iterator[tuple[int, R | Lost]]:
-    for place, unit in enumerate(units):
-        yield place, work(unit, _Share(progress, place, len(units)))
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the processes, whatever they are doing."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, kill_workers=True)
+            self._executor = None
+
+    def warm_up(self, module: str) -> None:
+        """Start the processes and have them import a module, while the caller does something else."""
+        if self.count > 1:
+            for _ in range(self.count):
+                self.submit(import_module, module)
+
+    def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
+        """Have a process do some work."""
+        with _interrupts_held_back():
+            if self._executor is None:
+                self._executor = ProcessPoolExecutor(self.count, initializer=_begin, env=_ONE_THREAD)
+            future: Future[R] = self._executor.submit(work, *arguments)
+        return future
+
+    def results(
+        self, units: Sequence[T], work: Work[T, R], progress: Progress
+    ) -> Generator[tuple[int, R | Lost], None, None]:
+        """Yield the place and the result of every unit as each is there.
+
+        An error that the work raises ends everything and is raised here.
+        """
+        if self.count == 1:
+            for place, unit in enumerate(units):
+                yield place, work(unit, _Share(progress, place, len(units)))
+            return
+        with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
+            yield from _Watch(self, units, work, Path(folder) / "progress").results(progress)
 
 
 class _Share:
@@ -89,12 +127,12 @@ def _share_done(stages: int, done: int, total: int) -> int:
     return part if stages == 0 else half + part
 
 
-class _Pool(Generic[T, R]):
-    """So many processes at work on some units."""
+class _Watch(Generic[T, R]):
+    """Some units under way, how far each has come, and which are finished."""
 
-    def __init__(self, units: Sequence[T], workers: int, work: Work[T, R], board: Path) -> None:
-        self._units, self._workers, self._work, self._board = units, workers, work, board
-        self._entries = np.memmap(board, dtype=_ENTRY, mode="w+", shape=(len(units),))
+    def __init__(self, workers: Workers, units: Sequence[T], work: Work[T, R], board: Path) -> None:
+        self._workers, self._units, self._work, self._board = workers, units, work, board
+        self._entries = np.memmap(board, dtype=_ENTRY, mode="w+", shape=(max(len(units), 1),))
         self._finished: set[int] = set()
 
     def results(self, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
@@ -105,53 +143,42 @@ class _Pool(Generic[T, R]):
             try:
                 yield from self._side_by_side(waiting, self._workers, progress)
             except BrokenProcessPool:
+                self._workers.end()
                 suspects = [place for place in waiting if self._entries["begun"][place] and place not in self._finished]
                 for place in suspects:
                     yield from self._alone(place, progress)
 
-    def _side_by_side(self, places: list[int], workers: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
-        with _executor(workers) as executor:
-            pending: dict[Future[R], int] = {self._submitted(executor, place): place for place in places}
-            while pending:
-                done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                for future in done:
-                    place = pending.pop(future)
-                    result = future.result()
-                    self._finished.add(place)
-                    yield place, result
-                progress.advance(self._steps_done(), _STEPS * len(self._units))
+    def _side_by_side(self, places: list[int], workers: Workers, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
+        pending = {self._submitted(workers, place): place for place in places}
+        while pending:
+            done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+            for future in done:
+                place = pending.pop(future)
+                result = future.result()
+                self._finished.add(place)
+                yield place, result
+            progress.advance(self._steps_done(), _STEPS * len(self._units))
 
     def _alone(self, place: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
         """Try a unit once more in a process of its own."""
         try:
-            yield from self._side_by_side([place], 1, progress)
+            with Workers(1) as one:
+                yield from self._side_by_side([place], one, progress)
         except BrokenProcessPool as error:
             self._finished.add(place)
             yield place, Lost(f"its process {_how_it_ended(error)} before it answered")
 
-    def _submitted(self, executor: ProcessPoolExecutor, place: int) -> "Future[R]":
-        with _interrupts_held_back():
-            future: Future[R] = executor.submit(_do, self._work, self._units[place], self._board, place)
+    def _submitted(self, workers: Workers, place: int) -> "Future[R]":
+        future: Future[R] = workers.submit(_do, self._work, self._units[place], self._board, place)
         return future
 
     def _steps_done(self) -> int:
         under_way = [
             _share_done(int(entry["stages"]), int(entry["done"]), int(entry["total"]))
             for place, entry in enumerate(self._entries)
-            if place not in self._finished
+            if place not in self._finished and place < len(self._units)
         ]
         return _STEPS * len(self._finished) + sum(under_way)
-
-
-@contextmanager
-def _executor(workers: int) -> Iterator[ProcessPoolExecutor]:
-    # Started with the first process, Python's own tracker would let interrupts through to it again.
-    resource_tracker.ensure_running()
-    executor = ProcessPoolExecutor(workers, initializer=_begin, env=_ONE_THREAD)
-    try:
-        yield executor
-    finally:
-        executor.shutdown(wait=True, kill_workers=True)
 
 
 def _begin() -> None:

@@ -39,8 +39,7 @@ class StereoFactors:
 def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam.NonlinearFactorGraph:
     """Return the factor that holds several variables jointly at their values.
 
-    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces and ``blocks`` says where each key's stand in it:
-    what the errors have in common says as much as their variances.
+    ``cov`` (d, d) is that of their errors in GTSAM's tangent spaces and ``blocks`` says where each key's stand in it.
     """
     root_information = np.linalg.inv(np.linalg.cholesky(cov))
     terms = [(key, root_information[:, block]) for key, block in blocks.items()]
@@ -51,7 +50,7 @@ def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam
 
 
 class EliminatedGraph(Protocol):
-    """What knows its marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
+    """What has marginals: gtsam's ISAM2, GaussianBayesTree or Marginals."""
 
     def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
         """Return the joint marginal of some variables."""

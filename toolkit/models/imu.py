@@ -5,14 +5,16 @@ makes its ``CombinedImuFactor`` of the very same object, so both see the same re
 (Forster et al. 2017, eqs. 26-38). The state is pose, velocity and both biases.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, skew, so3_exp
-from toolkit.models.factors import B, V, X, joint_prior
+from toolkit.models.factors import B, V, X, joint_prior, kind_of
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction
 from toolkit.sequence import ImuMotion, ImuNoise, Motion, Prior
 from toolkit.settings import Window
@@ -115,6 +117,7 @@ class ImuModel:
     """Pose, velocity and both biases, moved by specific force and turn rate."""
 
     layout = IMU_LAYOUT
+    variable_sizes: Mapping[str, int] = {"x": 6, "v": 3, "b": 6}
 
     def __init__(self, noise: ImuNoise, gravity_world: Array) -> None:
         self._params = preintegration_params(noise, gravity_world)
@@ -137,6 +140,18 @@ class ImuModel:
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose, velocity in the world (3,) and biases."""
         return [X(k), V(k), B(k)]
+
+    def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
+        """Return the latest values of some variables of a tree."""
+        readers: Mapping[str, Callable[[int], Any]] = {
+            "x": tree.calculateEstimatePose3,
+            "v": tree.calculateEstimateVector,
+            "b": tree.calculateEstimateConstantBias,
+        }
+        values = gtsam.Values()
+        for key in keys:
+            values.insert(key, readers[kind_of(key)](key))
+        return values
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""

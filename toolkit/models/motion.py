@@ -5,12 +5,14 @@ increment (mean, F, Q), a smoother makes its factors of the same one. There is o
 :mod:`toolkit.models.twist` and :mod:`toolkit.models.imu`.
 """
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import gtsam
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array
+from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
@@ -54,6 +56,13 @@ class MotionModel(Protocol):
     def keys(self, k: int) -> list[int]:
         """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""
 
+    @property
+    def variable_sizes(self) -> Mapping[str, int]:
+        """Return the dimensions of a state's variables by the kind that their keys name."""
+
+    def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
+        """Return the latest values of some states' variables, without copying all others out of the tree."""
+
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""
 
@@ -76,6 +85,14 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     if isinstance(noise, TwistNoise):
         return TwistModel(noise)
     return ImuModel(noise, gravity_world)
+
+
+def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Array) -> Array:
+    """Return the covariance (d, d) of state k, whose attitude is given, in the order and on the side of an Estimate.
+
+    Raises RuntimeError, as GTSAM does, where the graph does not determine it.
+    """
+    return model.estimate_cov(joint_cov(tree, model.keys(k)), R_world_imu)
 
 
 def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:

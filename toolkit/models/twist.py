@@ -4,6 +4,7 @@ The pose moves by T <- T exp(dt [w - b, v]); everything is in GTSAM's order [rot
 on the right. The state is pose and gyro bias; the velocity is measured, not estimated.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_right_jacobian
-from toolkit.models.factors import B, X, joint_prior
+from toolkit.models.factors import B, X, joint_prior, kind_of
 from toolkit.models.state import POSE, Belief, Layout, Prediction
 from toolkit.sequence import Motion, Prior, TwistMotion, TwistNoise
 from toolkit.settings import Window
@@ -123,6 +124,7 @@ class TwistModel:
     """Pose and gyro bias, moved by a measured twist."""
 
     layout = TWIST_LAYOUT
+    variable_sizes: Mapping[str, int] = {"x": 6, "b": 3}
 
     def __init__(self, noise: TwistNoise) -> None:
         self._noise = noise
@@ -143,6 +145,14 @@ class TwistModel:
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose and gyro bias (3,)."""
         return [X(k), B(k)]
+
+    def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
+        """Return the latest values of some variables of a tree."""
+        values = gtsam.Values()
+        for key in keys:
+            read = tree.calculateEstimatePose3 if kind_of(key) == "x" else tree.calculateEstimateVector
+            values.insert(key, read(key))
+        return values
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""

@@ -4,19 +4,22 @@ Everything is dense: a window has a few hundred unknowns.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
 import numpy as np
 from scipy.linalg import cholesky
 
-from filters.smoothing.structureless import Reduced, RobustCamera, Sightings, Vision
-from toolkit.geometry import Array
+from filters.smoothing.smart_factors import Reduced, RobustCamera, Sightings, Vision, seen_from
+from toolkit.geometry import Array, IntArray
+from toolkit.models import stereo
+from toolkit.models.gating import LEAST_DISPARITY_PX
+from toolkit.sequence import StereoFrame, StereoRig
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class MarginalPrior:
     """Information (D, D) and vector (D,) on the first D unknowns of the window, about values of their states."""
 
     information: Array
@@ -24,13 +27,13 @@ class Prior:
     about: gtsam.Values
 
     @classmethod
-    def nothing(cls) -> "Prior":
-        """Return the prior that says nothing."""
+    def nothing(cls) -> "MarginalPrior":
+        """Return a prior without information."""
         return cls(np.zeros((0, 0)), np.zeros(0), gtsam.Values())
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class SmartWindow:
     """States in the order of time, their keys (each [pose, velocity, bias] or [pose, bias]) and what holds them.
 
     ``motion[i]`` ties state i to the one before it; ``points`` (M, 3) are the landmarks of the sightings.
@@ -39,7 +42,7 @@ class Window:
     keys: tuple[tuple[int, ...], ...]
     values: gtsam.Values
     motion: tuple[gtsam.NonlinearFactorGraph, ...]
-    prior: Prior
+    prior: MarginalPrior
     sightings: Sightings
     points: Array
 
@@ -57,6 +60,54 @@ class Window:
     def size(self) -> int:
         """Return the unknowns of one state."""
         return int(self.values.extract(list(self.keys[0])).dim())
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedWindow:
+    """A window and the track ids (M,) of its points."""
+
+    window: SmartWindow
+    track_ids: IntArray
+
+    def points_by_id(self) -> dict[int, Array]:
+        """Return the point (3,) m of every track."""
+        return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
+
+    def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
+        """Add what the newest state sees: tracks known go on, new ones near enough start where stereo puts them."""
+        known = np.isin(frame.track_ids, self.track_ids)
+        new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
+        used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
+        ids = np.concatenate([self.track_ids, new.track_ids])
+        points = np.concatenate([self.window.points, stereo.triangulate_world(new.uvs_px, T_world_imu, rig)])
+        order = np.argsort(ids)
+        rows, seen = order[np.searchsorted(ids, used.track_ids, sorter=order)], self.window.sightings
+        newest = np.full(rows.size, len(self.window.keys) - 1)
+        sightings = Sightings(
+            np.concatenate([seen.pose, newest]),
+            np.concatenate([seen.point, rows]),
+            np.concatenate([seen.uv_px, used.uvs_px]),
+        )
+        return TrackedWindow(replace(self.window, points=points, sightings=sightings), ids)
+
+    def compacted(self) -> "TrackedWindow":
+        """Let the points go that nothing sees any more."""
+        seen = self.window.sightings
+        kept, rows = np.unique(seen.point, return_inverse=True)
+        sightings = Sightings(seen.pose, rows.astype(np.int64), seen.uv_px)
+        return TrackedWindow(
+            replace(self.window, points=self.window.points[kept], sightings=sightings), self.track_ids[kept]
+        )
+
+    def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
+        """Let the points go that are behind a camera that saw them; return the rest and the ids of those that went."""
+        seen = self.window.sightings
+        in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
+        behind = np.unique(seen.point[~in_front])
+        if not behind.size:
+            return self, self.track_ids[behind]
+        left = seen.of_points(np.setdiff1d(seen.point, behind))
+        return TrackedWindow(replace(self.window, sightings=left), self.track_ids).compacted(), self.track_ids[behind]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +136,13 @@ class System:
 class Evaluated:
     """A window and what it costs where it is: half the squared errors, Huber's losses, the prior's."""
 
-    window: Window
+    window: SmartWindow
     motion: gtsam.GaussianFactorGraph
     off_prior: Array
     vision: Vision
 
     @classmethod
-    def of(cls, window: Window, camera: RobustCamera) -> "Evaluated":
+    def of(cls, window: SmartWindow, camera: RobustCamera) -> "Evaluated":
         """Evaluate a window. Its motion is linearised at once: factors written in Python cost as much to evaluate."""
         vision = Vision.at(window.poses, window.points, window.sightings, camera)
         return cls(window, _together(window.motion).linearize(window.values), _off_prior(window), vision)
@@ -137,7 +188,7 @@ def _together(graphs: Iterable[gtsam.NonlinearFactorGraph]) -> gtsam.NonlinearFa
     return whole
 
 
-def _off_prior(window: Window) -> Array:
+def _off_prior(window: SmartWindow) -> Array:
     """Return how far (D,) the prior's states are from the values it is about."""
     about = window.prior.about
     held = [key for key in window.all_keys if about.exists(key)]

@@ -3,30 +3,28 @@
 GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
 state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
 then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
-root: what the window says in the end of the one and first of the other is nearly free, and the update is no dearer.
+root: the last covariance of the one and the first of the other are nearly free, and the update costs no more.
 
 A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
 frame is dropped. A state that does so the first time is a matter of rounding in the normal equations, as in seconds of
-an accurate IMU alone: the window is then solved by QR, ten times dearer, until vision has been back for as long as it
-reaches. Either way a new tree is built of the factors of the old, and says what the old one said.
+an accurate IMU alone: the window is then solved by QR, ten times as long, until vision has been back for as long as it
+reaches. Either way a new tree is built of the factors of the old, with the same estimates.
 """
 
 from collections.abc import Iterable
 
 import gtsam
 
-from filters.smoothing.graph_builder import Grown
+from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
-from filters.smoothing.marginals import state_cov
 from toolkit.errors import EstimatorError
-from toolkit.geometry import Array
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
 RELINEARISE_BEYOND = 0.01
 
 
-class LagWindow:
+class FixedLagTree:
     """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
 
     def __init__(self, lag_ns: int) -> None:
@@ -40,27 +38,27 @@ class LagWindow:
         # What the trees before this one marginalised is linear in these variables, where they are linearised.
         self._fixed: set[int] = set()
 
-    def add(self, grown: Grown, t_ns: int) -> Recovery:
+    def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Take in what a packet at a time adds, and solve; return what had to be recovered.
 
         Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
         """
         back = Recovery([], set())
-        if self._by_qr_from_ns is not None and grown.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
+        if self._by_qr_from_ns is not None and extension.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
             self._by_qr_from_ns = None
             back = self.rebuild()
-        self._state_stamps_ns |= dict.fromkeys(grown.state_keys, t_ns)
-        self._landmark_stamps_ns |= dict.fromkeys(map(L, grown.landmark_ids), t_ns)
+        self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
+        self._landmark_stamps_ns |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
         self._oldest_ns = t_ns - self._lag_ns
-        news = self._solved(grown.factors, grown.values)
-        return Recovery(back.log + news.log, back.dropped | news.dropped)
+        added = self._solved(extension.factors, extension.values)
+        return Recovery(back.log + added.log, back.dropped | added.dropped)
 
     def rebuild(self) -> Recovery:
-        """Build the tree anew; what it says, now and later, is the same but for rounding."""
+        """Build the tree anew; its estimates, now and later, are the same but for rounding."""
         return self._solved(*self._emptied())
 
     def drop(self, track_ids: Iterable[int]) -> Recovery:
-        """Take landmarks out with their sightings in the window; what older sightings told the others stays told."""
+        """Take landmarks out with their sightings in the window; the others keep what older sightings added."""
         keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
         slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
         slots = [slot for slot in slots if any(_goes_with(key, factors.at(slot)) for key in keys)]
@@ -71,9 +69,9 @@ class LagWindow:
         """Return the latest values of the window, and of what the last packet made leave it."""
         return self._values
 
-    def state_cov(self, keys: list[int], R_world_imu: Array) -> Array:
-        """Return the covariance of one state, in the order and on the side of an Estimate."""
-        return state_cov(self._isam, keys, R_world_imu)
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:  # noqa: N802 - GTSAM's name
+        """Return the joint marginal of some variables of the window."""
+        return self._isam.jointMarginalCovariance(keys)
 
     def _solved(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int] = ()
@@ -134,8 +132,8 @@ class LagWindow:
     def _emptied(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Begin a new tree; return all that was in the old one, to be taken in.
 
-        GTSAM's marginal factors do not know where they were linearised: they go on saying the same only where their
-        variables stay linearised there. The tree that made them sees to that; the next one must be told.
+        GTSAM's marginal factors have no linearisation point: they stay right only while their variables stay linearised
+        where they are. The tree that made them holds those fixed; the next one must be given them.
         """
         factors, values = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
         self._fixed.update(self._isam.getFixedVariables())

@@ -17,7 +17,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
 
-# A sighting from behind the camera says nothing, but must not be the cheaper place to be: it costs a gross mismatch.
+# A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
 _BEHIND_NORM = 100.0
 # Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
 _LEAST_INFORMATION_PER_M2 = 1e-12
@@ -84,7 +84,7 @@ def seen_from(poses: Array, points: Array, sightings: Sightings, rig: StereoRig)
 
 @dataclass(frozen=True, eq=False)
 class Vision:
-    """Sightings evaluated at poses (K, 4, 4) and points (M, 3): what they cost, and on demand what they say."""
+    """Sightings evaluated at poses (K, 4, 4) and points (M, 3): their cost, and on demand their normal equations."""
 
     counts: tuple[int, int]
     sightings: Sightings

@@ -1,7 +1,7 @@
-"""iSAM2 that goes on where GTSAM's stops: it drops the landmark, or solves by QR, and says so.
+"""iSAM2 that recovers where GTSAM's throws: it drops the landmark, or solves by QR, and returns what it did.
 
 Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation.
-Landmarks are eliminated first and states in the order of time, the newest last: new sightings then reach few
+Landmarks are eliminated first and states in the order of time, the newest last: new sightings then change few
 cliques, and the marginal of the newest state stands in the root.
 """
 
@@ -11,40 +11,45 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import Held, contained, held_of, renewed
-from filters.smoothing.frozen_variables import Resting
+from filters.smoothing.cached_linearisation import (
+    CachedLinearisation,
+    cached_linearisations,
+    renewed,
+    with_linearisations,
+)
 from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
+from toolkit.models.motion import MotionModel
 
 # The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
 # states left out of the order make the tree ever denser.
 RECENT_FRAMES = 100
-# What none of so many frames concerns stays linearised where it is, Python factors included: a heading that turns by
-# a hair moves the whole past, and a frame would cost as much as the run is long.
-FLUID_FRAMES = 30
+# What none of the last so many frames has factors on stays linearised where it is, Python factors included: a heading
+# that turns a little moves the whole past, and a frame would cost as much as the run is long.
+FROZEN_AFTER_FRAMES = 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
 # How far variables may stray from where they are linearised: rad, m/s, the biases' units; and for positions and
 # landmarks multiples of the baseline, the length that sets the scale of what stereo sees. Coarser thresholds mix
 # linearisation points: with five times these a flight of two minutes was five times less accurate.
-ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD_MPS, BIAS_THRESHOLD = 0.01, 0.01, 0.01
+ROTATION_THRESHOLD_RAD, OTHER_THRESHOLDS = 0.01, {"v": 0.01, "b": 0.01}
 POSITION_THRESHOLD_BASELINES, LANDMARK_THRESHOLD_BASELINES = 0.1, 0.5
 MOST_RECOVERIES = 20
 
 
-class IncrementalTree:
+class Isam2Tree:
     """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
 
-    def __init__(self, bias_size: int, baseline_m: float) -> None:
-        self._bias_size, self._baseline_m = bias_size, baseline_m
+    def __init__(self, motion: MotionModel, baseline_m: float) -> None:
+        self._motion, self._baseline_m = motion, baseline_m
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
         self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
-        self._resting = Resting(FLUID_FRAMES)
+        self._frozen = FrozenVariables(FROZEN_AFTER_FRAMES)
         self._slot_count = 0
-        self._held: dict[int, Held] = {}
+        self._cached: dict[int, CachedLinearisation] = {}
         self._sightings: dict[int, list[int]] = {}
 
     def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> Recovery:
@@ -55,17 +60,17 @@ class IncrementalTree:
         if self._factorization == "QR":
             self._return_to_cholesky(values)
         self._recent.append(state_keys)
-        self._resting.concerns(factors.keyVector())
-        held = held_of(factors, lambda keys: self._first_values(keys, values))
-        watched = [(slot, factor) for slot, factor in self._held.items() if not self._resting.all_of(factor.keys)]
+        self._frozen.add_frame(factors.keyVector())
+        cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
+        watched = [(slot, factor) for slot, factor in self._cached.items() if not self._frozen.contain_all(factor.keys)]
         moved = renewed(watched, self.read)
-        return self._update(contained(factors, held), values, held, moved)
+        return self._update(with_linearisations(factors, cached), values, cached, moved)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors, of the Python ones themselves and not their linearisations."""
         factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
-        for slot, held in self._held.items():
-            factors.replace(slot, held.factor)
+        for slot, cached in self._cached.items():
+            factors.replace(slot, cached.factor)
         return without_gaps(factors)
 
     def drop(self, landmarks: Iterable[int]) -> Recovery:
@@ -83,22 +88,11 @@ class IncrementalTree:
 
     def read(self, keys: list[int]) -> gtsam.Values:
         """Return the latest values of the keys of states, without copying the others'."""
-        values = gtsam.Values()
-        for key in keys:
-            values.insert(key, self._state_variable(key))
-        return values
+        return self._motion.latest(self.isam, keys)
 
     def points(self, landmarks: Iterable[int]) -> Array:
         """Return the latest points (N, 3) of landmarks in the world."""
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
-
-    def _state_variable(self, key: int) -> gtsam.Pose3 | gtsam.imuBias.ConstantBias | Array:
-        kind = kind_of(key)
-        if kind == "x":
-            return self.isam.calculateEstimatePose3(key)
-        if kind == "b" and self._bias_size == 6:
-            return self.isam.calculateEstimateConstantBias(key)
-        return self.isam.calculateEstimateVector(key)
 
     def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
         values = self.read([key for key in keys if not new.exists(key)])
@@ -109,19 +103,19 @@ class IncrementalTree:
         self,
         factors: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
-        held: dict[int, Held],
-        moved: dict[int, Held],
+        cached: dict[int, CachedLinearisation],
+        moved: dict[int, CachedLinearisation],
         dropped_slots: Iterable[int] = (),
     ) -> Recovery:
-        """Add factors, of which ``held`` stand at their places; replace those moved, by slot; take some out.
+        """Add factors, of which ``cached`` are linearisations, by place; replace those moved, by slot; take some out.
 
         The slots of new factors follow those of the old, in every case: after a refusal they are known too.
         """
         for slot, renewal in moved.items():
-            del self._held[slot]
-            held[factors.size()] = renewal
+            del self._cached[slot]
+            cached[factors.size()] = renewal
             factors.add(renewal.container())
-        self._held |= {self._slot_count + place: factor for place, factor in held.items()}
+        self._cached |= {self._slot_count + place: factor for place, factor in cached.items()}
         for place in range(factors.size()):
             keys: list[int] = factors.at(place).keys()
             for key in keys:
@@ -129,7 +123,7 @@ class IncrementalTree:
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
         self._slot_count += factors.size()
         try:
-            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._resting.keys)
+            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._frozen.keys)
             self._solve_back()
         except RuntimeError as refusal:
             return self._recovered(refusal)
@@ -137,7 +131,7 @@ class IncrementalTree:
 
     def _solve_back(self) -> None:
         """Read a variable, for which GTSAM solves for all: only here does QR refuse what it has eliminated."""
-        self._state_variable(self._recent[-1][0])
+        self.read(self._recent[-1][:1])
 
     def _order(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
         """Return the place of each recent state in the elimination; all else comes first.
@@ -200,20 +194,51 @@ class IncrementalTree:
         for slot in kept:
             compact.add(factors.at(slot))
         self._slot_count = len(kept)
-        self._held = {slot_of[old]: factor for old, factor in self._held.items()}
+        self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(compact))
         self._solve_back()
 
     def _empty_tree(self) -> gtsam.ISAM2:
-        pose = [ROTATION_THRESHOLD_RAD] * 3 + [POSITION_THRESHOLD_BASELINES * self._baseline_m] * 3
         params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
-        thresholds.insert(("x", np.array(pose)))
-        thresholds.insert(("v", np.full(3, VELOCITY_THRESHOLD_MPS)))
-        thresholds.insert(("b", np.full(self._bias_size, BIAS_THRESHOLD)))
+        pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * self._baseline_m], 3)
+        for kind, size in self._motion.variable_sizes.items():
+            thresholds.insert((kind, pose if kind == "x" else np.full(size, OTHER_THRESHOLDS[kind])))
         thresholds.insert(("l", np.full(3, LANDMARK_THRESHOLD_BASELINES * self._baseline_m)))
         params.setRelinearizeThreshold(thresholds)
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)
         return gtsam.ISAM2(params)
+
+
+class FrozenVariables:
+    """Which variables no recent frame has factors on, to be left where they are linearised.
+
+    One that is seen again later stays frozen: its new factors are linearised where it was.
+    """
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._recent: deque[set[int]] = deque()
+        self._last_frame: dict[int, int] = {}
+        self._count = 0
+        self._frozen: set[int] = set()
+        self.keys = gtsam.KeyList()
+
+    def contain_all(self, keys: Iterable[int]) -> bool:
+        """Say whether all of some variables are frozen."""
+        return self._frozen.issuperset(keys)
+
+    def add_frame(self, keys: Iterable[int]) -> None:
+        """Count a frame whose factors are on some variables; freeze those of none of the last frames."""
+        frame = set(keys)
+        self._recent.append(frame)
+        self._last_frame |= dict.fromkeys(frame, self._count)
+        if len(self._recent) > self._frames:
+            oldest = self._count - self._frames
+            for key in sorted(self._recent.popleft()):
+                if self._last_frame[key] == oldest:
+                    self.keys.push_back(key)
+                    self._frozen.add(key)
+        self._count += 1

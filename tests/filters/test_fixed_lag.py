@@ -1,4 +1,4 @@
-"""The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew says what the old one said."""
+"""The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew has the same estimates."""
 
 from dataclasses import replace
 
@@ -6,16 +6,17 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.fixed_lag import LAG_S, FixedLag
+from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
-from filters.smoothing.graph_builder import Grown
-from filters.smoothing.lag_window import LagWindow
+from filters.smoothing.fixed_lag_tree import FixedLagTree
+from filters.smoothing.graph_builder import GraphExtension
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.factors import L, X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
+from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 
@@ -25,28 +26,28 @@ def setup_of(sequence: Sequence) -> Setup:
 
 
 def answers(sequence: Sequence, rebuilt_at: int | None = None) -> list[Estimate]:
-    """Return what fixed-lag says at each frame, its tree built anew before one of them."""
-    estimator, said = FixedLag(setup_of(sequence), 0.5), []
+    """Return fixed-lag's estimate at each frame, its tree built anew before one of them."""
+    estimator, estimates = FixedLag(setup_of(sequence), 0.5), []
     for packet in sequence.packets():
         if packet.index == rebuilt_at:
-            assert estimator._window.rebuild().log == []
-        said.append(estimator.step(packet))
-    return said
+            assert estimator._tree.rebuild().log == []
+        estimates.append(estimator.step(packet))
+    return estimates
 
 
-def position_of(window: LagWindow, k: int) -> Array:
+def position_of(window: FixedLagTree, k: int) -> Array:
     return np.asarray(window.values().atPoint3(X(k)))
 
 
-def chain_link(k: int) -> Grown:
+def chain_link(k: int) -> GraphExtension:
     """Return a position X(k), one step of a metre from the last, and a fix of it that is off by a metre times k."""
-    grown = Grown(state_keys=[X(k)])
-    grown.values.insert(X(k), np.array([1.0 * k, 0.0, 0.0]))
+    extension = GraphExtension(state_keys=[X(k)])
+    extension.values.insert(X(k), np.array([1.0 * k, 0.0, 0.0]))
     unit = gtsam.noiseModel.Unit.Create(3)
     if k:
-        grown.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), unit))
-    grown.factors.addPriorPoint3(X(k), np.array([2.0 * k, 0.0, 0.0]), unit)
-    return grown
+        extension.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), unit))
+    extension.factors.addPriorPoint3(X(k), np.array([2.0 * k, 0.0, 0.0]), unit)
+    return extension
 
 
 def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_every_frame():
@@ -55,13 +56,13 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
     The fixes pull each position away from where it begins, beyond the threshold of relinearisation: a prior that
     followed its variables there would pull the less.
     """
-    window, everything = LagWindow(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
+    window, everything = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     for k in range(8):
-        grown = chain_link(k)
-        everything.push_back(grown.factors)
-        start.insert(grown.values)
-        window.add(grown, k * NS_PER_S)
+        extension = chain_link(k)
+        everything.push_back(extension.factors)
+        start.insert(extension.values)
+        window.add(extension, k * NS_PER_S)
         assert window.rebuild().log == []
         exact = start.retract(everything.linearize(start).optimize())
         # Eight digits are left of sixteen by normal equations of this condition, and more.
@@ -92,13 +93,13 @@ def test_a_point_that_moves_with_the_car_does_not_end_it(tracks, seed, depth_m, 
 def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sightings(monkeypatch):
     """A hold that holds nothing stands for one that is too weak."""
     monkeypatch.setattr(indeterminate, "WEAK_SIGMA", 1e200)
-    window, grown = LagWindow(NS_PER_S), chain_link(0)
-    grown.landmark_ids = [5, 6]
+    window, extension = FixedLagTree(NS_PER_S), chain_link(0)
+    extension.landmark_ids = [5, 6]
     for i, seen in ((5, 1.0), (6, 0.0)):
         information = gtsam.noiseModel.Diagonal.Precisions(np.full(3, seen))
-        grown.values.insert(L(i), np.ones(3))
-        grown.factors.add(gtsam.BetweenFactorPoint3(X(0), L(i), np.ones(3), information))
-    recovery = window.add(grown, 0)
+        extension.values.insert(L(i), np.ones(3))
+        extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(i), np.ones(3), information))
+    recovery = window.add(extension, 0)
     assert [line.split(" ", 3)[0] for line in recovery.log] == ["l6", "l6"]
     assert "is held weakly" in recovery.log[0]
     assert "was dropped" in recovery.log[1]
@@ -109,19 +110,19 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
 
 def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_told_before():
     """The position that saw it has left, so the prior holds the landmark: it is marginalised, not cut out."""
-    window, everything, start = LagWindow(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    window, everything, start = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(5):
-        grown = chain_link(k)
+        extension = chain_link(k)
         sighting = gtsam.BetweenFactorPoint3(X(k), L(5), np.array([7.0 - k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
-        grown.landmark_ids = [5]
+        extension.landmark_ids = [5]
         if k == 0:
-            grown.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
-        everything.push_back(grown.factors)
-        start.insert(grown.values)
-        grown.factors.add(sighting)
+            extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
+        everything.push_back(extension.factors)
+        start.insert(extension.values)
+        extension.factors.add(sighting)
         if k < 2:  # those of the positions that have left by the end
             everything.add(sighting)
-        assert window.add(grown, k * NS_PER_S).log == []
+        assert window.add(extension, k * NS_PER_S).log == []
     assert window.drop([5]).log == []
     assert not window._isam.valueExists(L(5))
     exact = start.retract(everything.linearize(start).optimize())
@@ -148,7 +149,7 @@ def test_a_landmark_first_seen_far_too_far_begins_anew_before_it_is_linearised_b
 
 def log_and_point(sequence: Sequence, track_id: int) -> tuple[tuple[str, ...], Array]:
     """Return the log of fixed-lag and one of its landmarks (3,) m."""
-    estimator = FixedLag(setup_of(sequence), LAG_S)
+    estimator = FixedLag(setup_of(sequence), DEFAULTS.window.lag_s)
     for packet in sequence.packets():
         estimator.step(packet)
     finished = estimator.finish()

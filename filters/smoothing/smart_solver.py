@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from filters.smoothing.structureless import RobustCamera, Sightings
-from filters.smoothing.window import Evaluated, Prior, System, Window
+from filters.smoothing.smart_factors import RobustCamera, Sightings
+from filters.smoothing.smart_window import Evaluated, MarginalPrior, SmartWindow, System
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
 
@@ -20,16 +20,16 @@ MOST_ITERATIONS = 5
 # Newton's method doubles its digits: after a step of so few sigmas of all states together the next is of a tenth of
 # one, and is taken with the next frame. Where a step gains hardly anything, the rest gain nothing.
 LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
-# Only for a step that fails: a millionth of what the sightings say of one pose, given the rest, is more than is known
-# of position and heading in the world, and would hold them where they were.
+# Only for a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than there
+# is on position and heading in the world, and would hold them where they were.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class SolvedWindow:
     """A window at its minimum and the root of the information it was last linearised to, a step short of that."""
 
-    window: Window
+    window: SmartWindow
     root: Array
 
     def cov(self, i: int) -> Array:
@@ -43,7 +43,7 @@ class Solution:
         return np.asarray(half.T @ half)
 
 
-def solved(window: Window, camera: RobustCamera) -> Solution:
+def solve_window(window: SmartWindow, camera: RobustCamera) -> SolvedWindow:
     """Return the window at its minimum, by Levenberg-Marquardt.
 
     Raises EstimatorError where the error is not a number or the states are not determined.
@@ -59,17 +59,17 @@ def solved(window: Window, camera: RobustCamera) -> Solution:
             break
         damping = step.damping / 10.0 if step.damping > _FIRST_DAMPING else 0.0
     try:
-        return Solution(here.window, system.root)
+        return SolvedWindow(here.window, system.root)
     except np.linalg.LinAlgError as refusal:
         raise EstimatorError(f"the window does not determine its states ({refusal})") from refusal
 
 
-def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
+def without_oldest(window: SmartWindow, count: int, camera: RobustCamera) -> SmartWindow:
     """Marginalise the oldest states with every track they saw; the rows of the other points stay as they are."""
     seen = window.sightings
-    spoken = np.unique(seen.point[seen.pose < count])
-    told = replace(_only(window, spoken), motion=window.motion[: count + 1])
-    system, gone = Evaluated.of(told, camera).linearised(), count * window.size
+    leaving_points = np.unique(seen.point[seen.pose < count])
+    leaving = replace(_only(window, leaving_points), motion=window.motion[: count + 1])
+    system, gone = Evaluated.of(leaving, camera).linearised(), count * window.size
     root = np.linalg.cholesky(system.information[:gone, :gone])
     across = solve_triangular(root, system.information[:gone, gone:], lower=True)
     information = system.information[gone:, gone:] - across.T @ across
@@ -78,21 +78,21 @@ def without_oldest(window: Window, count: int, camera: RobustCamera) -> Window:
     for keys in window.keys[:count]:
         for key in keys:
             values.erase(key)
-    left = ~np.isin(seen.point, spoken)
+    left = ~np.isin(seen.point, leaving_points)
     kept = Sightings(seen.pose[left] - count, seen.point[left], seen.uv_px[left])
-    prior = Prior(information, vector, values)
+    prior = MarginalPrior(information, vector, values)
     motion = (gtsam.NonlinearFactorGraph(), *window.motion[count + 1 :])
-    return Window(window.keys[count:], values, motion, prior, kept, window.points)
+    return SmartWindow(window.keys[count:], values, motion, prior, kept, window.points)
 
 
-def _only(window: Window, points: IntArray) -> Window:
+def _only(window: SmartWindow, points: IntArray) -> SmartWindow:
     """Return the window with some points (M,), by their ascending rows, and their sightings."""
     seen = window.sightings.of_points(points)
     rows = np.searchsorted(points, seen.point).astype(np.int64)
     return replace(window, points=window.points[points], sightings=Sightings(seen.pose, rows, seen.uv_px))
 
 
-class _Step(NamedTuple):
+class _DescentStep(NamedTuple):
     """Where a step leads, how long it is in standard deviations of all states together, and how it was damped."""
 
     there: Evaluated
@@ -100,21 +100,21 @@ class _Step(NamedTuple):
     damping: float
 
 
-def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _Step:
+def _descent(here: Evaluated, system: System, damping: float, camera: RobustCamera) -> _DescentStep:
     """Return a step that costs no more, damped as far as that takes, or one of no length."""
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
             there = Evaluated.of(_moved(here.window, system, step), camera)
             if there.error <= here.error:
-                return _Step(there, float(np.sqrt(step @ system.vector)), damping)
+                return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
         except np.linalg.LinAlgError:
             pass
         damping = max(10.0 * damping, _FIRST_DAMPING)
-    return _Step(here, 0.0, damping)
+    return _DescentStep(here, 0.0, damping)
 
 
-def _moved(window: Window, system: System, step: Array) -> Window:
+def _moved(window: SmartWindow, system: System, step: Array) -> SmartWindow:
     """Return the window a step (D,) of its states on, its landmarks with them."""
     delta, start, dims = gtsam.VectorValues(), 0, window.values.dims()
     for key in window.all_keys:
