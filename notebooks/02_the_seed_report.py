@@ -45,7 +45,7 @@ plt.rcParams |= {"figure.dpi": 80, "figure.constrained_layout.use": True, "axes.
 # faults are planted (`planted.py`).
 
 # %%
-SECONDS = 15.0
+SECONDS = 12.0
 
 
 def dataset(number: str, seed: int) -> Sequence:
@@ -282,7 +282,7 @@ variants = {
     "mixed axes": planted.mixed_axes,
     "gyro bias": planted.gyro_bias,
 }
-drive = planted.drive(duration_s=10.0, seed=0)
+drive = planted.drive(duration_s=8.0, seed=0)
 harm = {
     name: compare(plant(drive), ["dead-reckoning", "seed-ekf", "ekf", "batch"], keep=faults())
     for name, plant in variants.items()

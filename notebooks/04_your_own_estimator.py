@@ -116,7 +116,7 @@ print(f"{mine.status}: position error {scores.values['ate_se3_m']:.2f} m over {d
 # Beside the others, on the same packets. `own=` takes estimators that live in a notebook.
 
 # %%
-result = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build})
+result = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build}, max_frames=300)
 result.table("ATE SE(3)", "RPE 100 m", "reproj held-out")
 
 # %%
@@ -166,7 +166,7 @@ print("two-view:", find("two-view").summary())
 # estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
-over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=8, max_frames=40)
+over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=6, max_frames=40)
 over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%

@@ -23,24 +23,6 @@ _OF_ONE_MACHINE = re.compile(
 )
 
 
-# Half a minute and more each: a page's commands, a whole notebook.
-_LONGEST = {"test_everything_a_page_shows_runs_and_prints_the_tables_shown", "test_it_runs_where_no_real_recording_is"}
-# As long together, and on one worker, for its tests share their runs.
-_LONG_FILE = "test_figures_on_real_data.py"
-# What pytest-xdist hands to each of two workers before it shares out the rest as they ask for it.
-_FIRST_SHARE = 1 / 8
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest tests first in the shares of two workers, so that neither has one left when the other is done."""
-    longest = [item for item in items if getattr(item, "originalname", None) in _LONGEST]
-    together = [item for item in items if item.path.name == _LONG_FILE]
-    others = [item for item in items if item not in longest and item not in together]
-    one, other = longest[::2], together + longest[1::2]
-    rest = max(round(_FIRST_SHARE * len(items)) - len(one), 0)
-    items[:] = [*one, *others[:rest], *other, *others[rest:]]
-
-
 @pytest.fixture(scope="session")
 def real() -> Callable[[str], Path]:
     """Return a real recording by its place in the shared data, or skip where it is absent."""

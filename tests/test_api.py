@@ -64,7 +64,7 @@ def test_a_recording_and_its_truth_are_paths_or_strings(
 ) -> None:
     result.save(tmp_path / "run")
     truth = tmp_path / "run/trajectories/truth.tum"
-    compared = toolkit.compare(kind(RECORDING), "dead-reckoning", truth=kind(truth), max_frames=FRAMES)
+    compared = toolkit.compare(kind(RECORDING), "dead-reckoning", truth=kind(truth), max_frames=FRAMES, workers=1)
     assert compared.comparison.sequence.truth is not None
     np.testing.assert_array_equal(compared.comparison.sequence.truth.t_ns, np.array(_stamps(truth)))
 
@@ -78,7 +78,7 @@ def _stamps(tum: Path) -> list[int]:
     "names", ["ekf", ["ekf"], ("ekf",), iter(["ekf"])], ids=["a name", "list", "tuple", "iterator"]
 )
 def test_estimators_are_one_name_or_several(result: Result, names: str | Iterable[str]) -> None:
-    alone = toolkit.compare("drive", names, max_frames=FRAMES)
+    alone = toolkit.compare("drive", names, max_frames=FRAMES, workers=1)
     assert alone.comparison.estimators == ("ekf",)
     assert ate(alone) == ate(result)[2:]
 
@@ -92,7 +92,7 @@ def test_an_estimator_that_is_no_file_is_compared_under_its_own_name(result: Res
     with_own = toolkit.compare("drive", "ekf", own=own, max_frames=FRAMES, workers=1)
     assert list(with_own.runs) == ["ekf", "mine"]
     assert with_own.metrics["mine", "final"]["ate_se3_m"] == result.metrics["dead-reckoning", "final"]["ate_se3_m"]
-    assert list(toolkit.compare("drive", own=own, max_frames=FRAMES).runs) == ["mine"]
+    assert list(toolkit.compare("drive", own=own, max_frames=FRAMES, workers=1).runs) == ["mine"]
 
 
 def test_faults_that_are_kept_are_not_repaired() -> None:
@@ -100,7 +100,10 @@ def test_faults_that_are_kept_are_not_repaired() -> None:
     uv_px = drive.observations.uv_px.copy()
     uv_px[::97, 1] = uv_px[::97, 0]  # no disparity
     faulty = replace(drive, observations=replace(drive.observations, uv_px=uv_px))
-    found = [toolkit.compare(faulty, [], keep=keep, max_frames=FRAMES).comparison.findings for keep in ((), faults())]
+    found = [
+        toolkit.compare(faulty, [], keep=keep, max_frames=FRAMES, workers=1).comparison.findings
+        for keep in ((), faults())
+    ]
     assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
 
 
@@ -177,8 +180,8 @@ def test_seeds_are_repeated_from_the_first(over: Result) -> None:
 
 def test_settings_are_a_record_or_nested_values(result: Result) -> None:
     told = {"noise": {"pixel_sigma_px": 0.5}, "first_seed": 1}
-    by_values = toolkit.compare("drive", "ekf", settings=told, max_frames=FRAMES)
-    by_record = toolkit.compare("drive", "ekf", settings=by_values.comparison.settings, max_frames=FRAMES)
+    by_values = toolkit.compare("drive", "ekf", settings=told, max_frames=FRAMES, workers=1)
+    by_record = toolkit.compare("drive", "ekf", settings=by_values.comparison.settings, max_frames=FRAMES, workers=1)
     assert ate(by_values) == ate(by_record) != ate(result)[2:]
     with pytest.raises(
         VislamError, match=r"there is no setting noise.pixel_sigma; did you mean noise.pixel_sigma_px\?"

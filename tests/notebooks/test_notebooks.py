@@ -5,7 +5,8 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -89,14 +90,30 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not [target for target in linked if not (NOTEBOOKS / target).exists()]
 
 
+@contextmanager
+def _one_processor() -> Iterator[None]:
+    """Let what is started meanwhile use one processor, another one for each worker that runs tests."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    every = os.sched_getaffinity(0)
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    os.sched_setaffinity(0, {sorted(every)[worker % len(every)]})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, every)
+
+
 @each
 def test_it_runs_where_no_real_recording_is(
     source: Path, execution: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("VISLAM_DATA", str(tmp_path))
-    # Tests run side by side: numerical libraries that start threads of their own would only fight for the cores.
+    # Tests run side by side: what starts threads or processes of its own would only fight for the cores.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, os.environ.get(name, "1"))
-    executed = execution.execute(source)  # raises where a cell fails
+    with _one_processor():
+        executed = execution.execute(source)  # raises where a cell fails
     said = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
     assert "the real" not in said
