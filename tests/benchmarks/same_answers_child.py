@@ -85,7 +85,9 @@ def read_of(sequence: Any, prior: Any) -> dict[str, Any]:
 
 def answers_of(run: Any, sequence: Any) -> dict[str, Any]:
     """Return all that a run answered except what it cost, by output and kind."""
-    score_run, cost = first_of(("toolkit.metrics",), "score_run"), first_of(("toolkit.metrics.cost",), "METRICS")
+    score_run = first_of(("toolkit.metrics",), "score_run")
+    # Keys in some revisions, records with a key in others.
+    cost = {getattr(metric, "key", metric) for metric in first_of(("toolkit.metrics.cost",), "METRICS")}
     found: dict[str, Any] = {
         "status": np.array(run.status),
         "landmarks/ids": run.landmarks.track_ids,
