@@ -6,7 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,37 +44,70 @@ def commands(block: Block) -> Iterator[str]:
         yield from (part for part in parts if part.startswith("vislam "))
 
 
+# Runs the commands and programs of a page one after the other, as a terminal and a script would, and says what each
+# printed. Those that are not to be whole draw every figure without rendering it, and start no further processes.
+_DRIVER = """
+import contextlib, io, json, sys
+from pathlib import Path
+from matplotlib.figure import Figure
+from toolkit.cli import main
+from toolkit.experiment import pipeline
+
+usable_cpus, savefig = pipeline.usable_cpus, Figure.savefig
+
+def run(kind, what, whole):
+    pipeline.usable_cpus = usable_cpus if whole else lambda: 1
+    Figure.savefig = savefig if whole else lambda figure, path, **options: Path(path).touch()
+    if kind == "vislam":
+        # 1 is a result, too: an estimator of an example may diverge, and its text says so.
+        status = main(what)
+        assert status in (0, 1), (what, status)
+    else:
+        exec(compile(what, "a block of the page", "exec"), {"__name__": "__main__"})
+
+printed = []
+for step in json.load(sys.stdin):
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        run(*step)
+    printed.append(out.getvalue())
+json.dump(printed, sys.stdout)
+"""
+# The first line of the README is run exactly as a stranger runs it.
+WHOLE = "vislam compare"
+
+
 class Desk:
     """A copy of the packages in a directory of its own: files dropped into it are found, and nothing else sees them."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
 
-    def write(self, block: Block) -> None:
-        assert block.title is not None
-        (self.directory / block.title).write_text(block.text, encoding="utf-8")
+    def write(self, page: Path) -> None:
+        """Write the files that a page shows to where it says."""
+        for block in blocks(page):
+            if block.title is not None:
+                (self.directory / block.title).write_text(block.text, encoding="utf-8")
 
-    def vislam(self, command: str) -> str:
-        return self._python("-m", "toolkit.cli", *shlex.split(command)[1:])
-
-    def run(self, program: str) -> str:
-        return self._python("-c", program)
-
-    def _python(self, *arguments: str) -> str:
-        # -m and -c put the working directory first on the path, so the copy is what is imported.
+    def do(self, steps: Sequence[str | Block]) -> list[str]:
+        """Run commands and programs in one process, and return what each printed."""
+        words = [
+            ("vislam", shlex.split(step)[1:], step == WHOLE) if isinstance(step, str) else ("python", step.text, False)
+            for step in steps
+        ]
+        # -c puts the working directory first on the path, so the copy is what is imported.
         ended = subprocess.run(
-            [sys.executable, *arguments],
+            [sys.executable, "-c", _DRIVER],
             cwd=self.directory,
-            stdin=subprocess.DEVNULL,
+            input=json.dumps(words),
             capture_output=True,
             text=True,
             timeout=300,
             check=False,
         )
-        # 1 is a result, too: an estimator of an example may diverge, and its text says so.
-        assert ended.returncode in (0, 1), f"{arguments}: {ended.stderr}"
-        assert "Traceback" not in ended.stderr, f"{arguments}: {ended.stderr}"
-        return ended.stdout
+        assert ended.returncode == 0, ended.stderr
+        assert "Traceback" not in ended.stderr, ended.stderr
+        printed: list[str] = json.loads(ended.stdout)
+        return printed
 
 
 @pytest.fixture
@@ -112,24 +145,27 @@ def _name(page: Path) -> str:
     return str(page.relative_to(PROJECT))
 
 
-def _runs(page: Path) -> bool:
-    return any(block.language == "python" or any(commands(block)) for block in blocks(page))
+def _steps(page: Path) -> list[str | Block]:
+    """Return the commands and the programs of a page, in order."""
+    return [
+        step
+        for block in blocks(page)
+        if block.title is None
+        for step in ([block] if block.language == "python" else commands(block))
+    ]
 
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=_name)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if _runs(page)], ids=_name)
+@pytest.mark.parametrize("page", [page for page in PAGES if _steps(page)], ids=_name)
 def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, desk: Desk) -> None:
-    printed: dict[str, str] = {}
+    desk.write(page)
+    steps = _steps(page)
+    printed = dict(zip(steps, desk.do(steps), strict=True))
     for block in blocks(page):
-        if block.title is not None:
-            desk.write(block)
-        elif block.language == "python":
-            desk.run(block.text)
-        elif block.text.startswith("$ vislam"):
+        if block.text.startswith("$ vislam"):
             _assert_tables_agree(block.text, printed[block.text.partition("\n")[0].removeprefix("$ ")])
-        printed |= {command: desk.vislam(command) for command in commands(block)}
 
 
 def _assert_tables_agree(shown: str, printed: str) -> None:
@@ -156,12 +192,10 @@ def _rows(text: str) -> dict[tuple[str, ...], list[str]]:
 
 
 def test_the_examples_of_extending_do_what_the_page_says(desk: Desk) -> None:
-    for block in blocks(PROJECT / "docs/extending.md"):
-        if block.title is not None:
-            desk.write(block)
-    listed = desk.vislam("vislam list")
+    desk.write(PROJECT / "docs/extending.md")
+    compare = "vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run"
+    listed, _ = desk.do(["vislam list", compare])
     assert all(name in listed for name in ("constant-velocity", "plain-json", "path_ratio"))
-    desk.vislam("vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run")
     runs = json.loads((desk.directory / "run/metrics.json").read_text())["runs"]
     assert [run["status"] for run in runs] == ["diverged", "diverged", "ok", "ok"]
     # White noise of 0.1 m on steps of 0.5 m and more lengthens a path by no more than a few percent.

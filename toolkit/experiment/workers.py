@@ -14,6 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -85,6 +86,8 @@ class Workers:
 
     def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
         """Have a process do some work."""
+        # Started with the first process, Python's own tracker would let interrupts through to it again.
+        resource_tracker.ensure_running()
         with _interrupts_held_back():
             if self._executor is None:
                 self._executor = ProcessPoolExecutor(self.count, initializer=_begin, env=_ONE_THREAD)
