@@ -1,11 +1,10 @@
 """The value of every metric but the costs, written down, on trajectories from closed formulas.
 
-A changed formula fails here. The accuracy gate compares a revision with a baseline of its own making, so that a
-metric which changes (a mean in
-place of an RMSE, another alignment, another rule for segments) would change both sides alike. What stands here came
-out of the toolkit once. Beside it, by other means: evo 1.38.1 gave the same ate_none_m (without an IMU), ate_se3_m,
-ate_sim3_m, ate_se3_deg, rpe_1s_m and rpe_1s_deg to 1e-9 on the matched pairs of ``drifting``, plain loops after
-KITTI's development kit its two figures; the circle has closed forms.
+The accuracy gate compares a revision with a baseline of its own making, so that a metric which changes (a mean in
+place of an RMSE, another alignment, another rule for segments) would change both sides alike: here it fails. The
+values came out of the toolkit once. Beside it, by other means: evo 1.38.1 gave the same ate_none_m (without an IMU),
+ate_se3_m, ate_sim3_m, ate_se3_deg, rpe_1s_m and rpe_1s_deg to 1e-9 on the matched pairs of ``drifting``, plain loops
+after KITTI's development kit its two figures; the circle has closed forms.
 """
 
 from dataclasses import replace
