@@ -1,8 +1,8 @@
 """Joint EKF of the pose and the landmarks in view, all cross-covariances kept (Smith, Self & Cheeseman 1990).
 
-The gauge: in world coordinates a joint EKF evaluates the Jacobians of one landmark at ever new estimates and so
-believes it measures its heading, which nothing does. Here every Jacobian is taken at first estimates, with which
-global position and heading stay exactly unobservable (Huang, Mourikis & Roumeliotis 2010).
+The gauge: in world coordinates a joint EKF evaluates the Jacobians of one landmark at ever new estimates, which
+together reduce the variance of its heading, though nothing measures it. Here every Jacobian is taken at first
+estimates, with which global position and heading stay exactly unobservable (Huang, Mourikis & Roumeliotis 2010).
 """
 
 from filters.kalman.joint_ekf import JointEkf

@@ -14,9 +14,9 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
-from filters.smoothing.smart_factors import RobustCamera, Sightings
+from filters.smoothing.smart_factors import RobustCamera
 from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
-from filters.smoothing.smart_window import MarginalPrior, SmartWindow, TrackedWindow
+from filters.smoothing.smart_window import TrackedWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -43,7 +43,7 @@ class Smart:
         self._outlier_check = OutlierCheck(setup.rig, outliers.gate_probability)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
-        self._tracked = _nothing()
+        self._tracked = TrackedWindow.empty()
         self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
         self._points: dict[int, Array] = {}
@@ -83,7 +83,7 @@ class Smart:
     def _started(self, packet: Packet) -> TrackedWindow:
         """Return a window that begins here, held at the state as predicted."""
         hold = self._motion.hold(self._belief, packet.index)
-        return self._with_state(_nothing(), packet.index, packet.frame, hold)
+        return self._with_state(TrackedWindow.empty(), packet.index, packet.frame, hold)
 
     def _with_state(
         self, tracked: TrackedWindow, k: int, frame: StereoFrame, factors: gtsam.NonlinearFactorGraph
@@ -127,11 +127,3 @@ class Smart:
             self._complete(range(leaving))
             window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
-
-
-def _nothing() -> TrackedWindow:
-    none = np.empty(0, dtype=np.int64)
-    window = SmartWindow(
-        (), gtsam.Values(), (), MarginalPrior.nothing(), Sightings(none, none, np.empty((0, 3))), np.empty((0, 3))
-    )
-    return TrackedWindow(window, none)

@@ -121,7 +121,7 @@ def test_a_table_has_the_columns_asked_for_in_their_order_by_key_or_name(result:
 
 
 def test_an_unknown_column_is_refused(result: Result) -> None:
-    with pytest.raises(VislamError, match=r"no column is called ate_se3 \(did you mean ate_se3_m\?\)"):
+    with pytest.raises(VislamError, match=r"no metric is called ate_se3; did you mean ate_se3_m\?"):
         result.table("ate_se3")
 
 

@@ -34,65 +34,51 @@ Source = str | Path | Sequence
 Names = str | Iterable[str]
 
 
-def compare(
+def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     source: Source,
     estimators: Names | None = None,
     *,
     own: Mapping[str, Build] | None = None,
     truth: str | Path | None = None,
+    trajectories: Mapping[str, str | Path] | None = None,
     max_frames: int | None = None,
+    keep: Names = (),
+    seed: int | None = None,
+    seeds: int | None = None,
     settings: Settings | Mapping[str, Any] = DEFAULTS,
-    **more: Any,
+    workers: int | None = None,
 ) -> "Result":
     """Audit a recording, run estimators on it from the same start, and score them.
 
     ``source`` is a recording's path, a built-in name or a sequence; ``estimators`` one name or several, "ladder" for
-    every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name; ``truth`` a
-    TUM file. ``settings`` is a record or nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. Further
-    arguments: ``keep`` (faults the audit reports and leaves alone), ``trajectories`` (files of other systems by name),
-    ``seed``, ``seeds`` (repeat a simulated source), ``workers`` (processes; by default one a processor).
+    every rung, by default those of the command line; ``own`` further functions ``build(setup)`` by name. ``truth`` is a
+    TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit reports and
+    leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a record or
+    nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes, one a
+    processor by default.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
     trajectory that cannot, SettingsError for a setting that does not exist.
     """
-    plan = _plan(source, estimators, own or {}, truth, max_frames, settings, _Further(**more))
+    unnamed = () if own else defaults()
+    plan = Plan(
+        sources=(source if isinstance(source, Sequence) else str(source),),
+        estimators=unnamed if estimators is None else _names(estimators),
+        own=own or {},
+        settings=_with_seeds(settings, seed, seeds),
+        truth=None if truth is None else Path(truth),
+        trajectories={name: Path(file) for name, file in (trajectories or {}).items()},
+        keep=frozenset(_names(keep)),
+        max_frames=max_frames,
+        workers=workers,
+    )
     return Result(run_plan(plan, silent)[0])
 
 
-@dataclass(frozen=True)
-class _Further:
-    """The arguments of :func:`compare` that few need."""
-
-    keep: Names = ()
-    trajectories: Mapping[str, str | Path] | None = None
-    seed: int | None = None
-    seeds: int | None = None
-    workers: int | None = None
-
-
-def _plan(
-    source: Source,
-    estimators: Names | None,
-    own: Mapping[str, Build],
-    truth: str | Path | None,
-    max_frames: int | None,
-    settings: Settings | Mapping[str, Any],
-    more: _Further,
-) -> Plan:
-    unnamed = () if own else defaults()
+def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
     values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
-    values |= {key: value for key, value in (("first_seed", more.seed), ("seeds", more.seeds)) if value is not None}
-    return Plan(
-        sources=(source if isinstance(source, Sequence) else str(source),),
-        estimators=unnamed if estimators is None else _names(estimators),
-        own=own,
-        settings=settings_of(values, "settings"),
-        truth=None if truth is None else Path(truth),
-        trajectories={name: Path(file) for name, file in (more.trajectories or {}).items()},
-        keep=frozenset(_names(more.keep)),
-        max_frames=max_frames,
-        workers=more.workers,
-    )
+    given = {"first_seed": seed, "seeds": seeds}
+    return settings_of(values | {key: value for key, value in given.items() if value is not None}, "settings")
 
 
 def _names(given: Names) -> tuple[str, ...]:

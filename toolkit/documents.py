@@ -138,8 +138,8 @@ def _in_words(why: msgspec.ValidationError, document: object, record: type[msgsp
 
 def _parts(why: msgspec.ValidationError) -> tuple[str, str]:
     """Return what msgspec says, and the path at which: of a key, that of the object it is in."""
-    told = _PLACED.fullmatch(str(why))
-    return (told["what"], told["path"]) if told else (str(why), "")
+    placed = _PLACED.fullmatch(str(why))
+    return (placed["what"], placed["path"]) if placed else (str(why), "")
 
 
 def _plain(what: str) -> str:

@@ -66,7 +66,7 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Noise(Struct, frozen=True, forbid_unknown_fields=True):
-    """What every estimator is told of the noise; by default what the recording states or its samples show."""
+    """The noise every estimator assumes; by default what the recording states or its samples show."""
 
     pixel_sigma_px: (
         Annotated[

@@ -58,8 +58,7 @@ class JointEkf:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        if packet.motion is not None:
-            propagate(self._joint, self._motion, self._at, packet.motion)
+        propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
         gate = FrameGate(self._gate_probability)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)

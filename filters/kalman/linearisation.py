@@ -60,8 +60,10 @@ class AtFirstEstimates:
         return joint.first_points
 
 
-def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion) -> None:
-    """Carry a joint belief over the motion between two frames, linearised as chosen."""
+def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None) -> None:
+    """Carry a joint belief over the motion between two frames, linearised as chosen; before the first there is none."""
+    if motion is None:
+        return
     increment = model.integrate(motion, joint.core.bias)
     prediction = increment.predict(joint.core)
     joint.propagate(prediction, at.transition(joint, increment, prediction))

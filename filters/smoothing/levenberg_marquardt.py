@@ -36,6 +36,14 @@ class Solution(NamedTuple):
     converged: bool
 
 
+class _Linearised(NamedTuple):
+    """Values, their error, and the graph linearised there."""
+
+    values: gtsam.Values
+    error: float
+    linear: gtsam.GaussianFactorGraph
+
+
 class _DampedStep(NamedTuple):
     values: gtsam.Values
     error: float
@@ -60,11 +68,10 @@ def solve(
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
     for iteration in range(1, stopping.max_iterations + 1):
         progress.advance(iteration - 1, stopping.max_iterations, stage)
-        linear = graph.linearize(values)
+        here = _Linearised(values, error, graph.linearize(values))
         factor, step = 2.0, None
         while step is None:
-            damped = _damped(linear, keys, damping)
-            step = _tried(graph, linear, damped, ordering, values)
+            step = _tried(graph, here, _damped(here.linear, keys, damping), ordering)
             if step is None or not step.error <= error:
                 solvable, step = step is not None, None
                 damping, factor = damping * factor, factor * 2.0
@@ -90,10 +97,9 @@ def _damped(linear: gtsam.GaussianFactorGraph, keys: dict[int, list[int]], dampi
 
 def _tried(
     graph: gtsam.NonlinearFactorGraph,
-    linear: gtsam.GaussianFactorGraph,
+    here: _Linearised,
     damped: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
-    values: gtsam.Values,
 ) -> _DampedStep | None:
     """Return where one damped step leads, or None where even the damped system is indeterminate."""
     try:
@@ -102,10 +108,10 @@ def _tried(
         if "Indeterminate" in str(refusal):
             return None
         raise
-    moved = values.retract(delta)
-    predicted = linear.error(values.zeroVectors()) - linear.error(delta)
+    moved = here.values.retract(delta)
+    predicted = here.linear.error(here.values.zeroVectors()) - here.linear.error(delta)
     error = graph.error(moved)
-    return _DampedStep(moved, error, (graph.error(values) - error) / max(predicted, np.finfo(float).tiny))
+    return _DampedStep(moved, error, (here.error - error) / max(predicted, np.finfo(float).tiny))
 
 
 def _keys_by_dimension(values: gtsam.Values) -> dict[int, list[int]]:

@@ -1,4 +1,7 @@
-"""A window of states held by motion factors and a linear prior, with structureless vision, as normal equations.
+"""The window of `smart`: states held by motion factors and a linear prior, tracks without landmark variables.
+
+A :class:`SmartWindow` is the problem, a :class:`TrackedWindow` knows which track each of its points is, and
+:class:`Evaluated` turns it into normal equations, which ``smart_solver`` solves.
 
 Everything is dense: a window has a few hundred unknowns.
 """
@@ -68,6 +71,13 @@ class TrackedWindow:
 
     window: SmartWindow
     track_ids: IntArray
+
+    @classmethod
+    def empty(cls) -> "TrackedWindow":
+        """Return a window without states."""
+        none = np.empty(0, dtype=np.int64)
+        sightings = Sightings(none, none, np.empty((0, 3)))
+        return cls(SmartWindow((), gtsam.Values(), (), MarginalPrior.nothing(), sightings, np.empty((0, 3))), none)
 
     def points_by_id(self) -> dict[int, Array]:
         """Return the point (3,) m of every track."""

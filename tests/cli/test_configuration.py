@@ -159,7 +159,7 @@ def test_an_unknown_column_is_answered_with_the_nearest_before_anything_runs(
 ) -> None:
     monkeypatch.setattr(runner, "run", None)
     assert vislam("compare", "drive", "--columns", "ate_se3", "--out", "run") == 2
-    assert "no column is called ate_se3 (did you mean ate_se3_m?)" in one_line()
+    assert "no metric is called ate_se3; did you mean ate_se3_m?" in one_line()
     assert not Path("run").exists()
 
 

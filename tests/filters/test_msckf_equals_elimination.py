@@ -43,8 +43,7 @@ def window_of(recording) -> Window:
     model = motion_model(setup.noise, setup.gravity_world)
     joint, tracks = JointBelief(model.initial_belief(setup.prior)), WindowTracks()
     for packet in recording.sequence.packets():
-        if packet.motion is not None:
-            propagate(joint, model, at, packet.motion)
+        propagate(joint, model, at, packet.motion)
         joint.clone(packet.index)
         tracks.add_frame(packet.frame)
     taken = tracks.take(np.ones(len(tracks.ended()), dtype=bool))

@@ -26,8 +26,7 @@ def scene():
     model = motion_model(sequence.noise, sequence.gravity_world)
     joint = JointBelief(model.initial_belief(sequence.prior))
     for packet in list(sequence.packets())[:WINDOW]:
-        if packet.motion is not None:
-            propagate(joint, model, AtLatestEstimates(), packet.motion)
+        propagate(joint, model, AtLatestEstimates(), packet.motion)
         joint.clone(packet.index)
     rng = np.random.default_rng(0)
     ahead = np.stack([rng.uniform(14, 25, TRACKS), rng.uniform(-6, 6, TRACKS), rng.uniform(-2, 2, TRACKS)], axis=1)

@@ -13,6 +13,7 @@ from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
 from filters.smoothing.smart_factors import Sightings
 from filters.smoothing.smart_solver import SolvedWindow, without_oldest
+from filters.smoothing.smart_window import MarginalPrior, SmartWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.models.motion import motion_model, state_cov
@@ -147,7 +148,7 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
     none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
-    window = smart.SmartWindow(keys, values, (), smart.MarginalPrior.nothing(), none, np.empty((0, 3)))
+    window = SmartWindow(keys, values, (), MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):
         np.testing.assert_allclose(SolvedWindow(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])

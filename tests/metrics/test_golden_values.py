@@ -1,11 +1,10 @@
 """The value of every metric but the costs, written down, on trajectories from closed formulas.
 
-A changed formula fails here. The accuracy gate compares a revision with a baseline of its own making, so that a
-metric which changes (a mean in
-place of an RMSE, another alignment, another rule for segments) would change both sides alike. What stands here came
-out of the toolkit once. Beside it, by other means: evo 1.38.1 gave the same ate_none_m (without an IMU), ate_se3_m,
-ate_sim3_m, ate_se3_deg, rpe_1s_m and rpe_1s_deg to 1e-9 on the matched pairs of ``drifting``, plain loops after
-KITTI's development kit its two figures; the circle has closed forms.
+The accuracy gate compares a revision with a baseline of its own making, so that a metric which changes (a mean in
+place of an RMSE, another alignment, another rule for segments) would change both sides alike: here it fails. The
+values came out of the toolkit once. Beside it, by other means: evo 1.38.1 gave the same ate_none_m (without an IMU),
+ate_se3_m, ate_sim3_m, ate_se3_deg, rpe_1s_m and rpe_1s_deg to 1e-9 on the matched pairs of ``drifting``, plain loops
+after KITTI's development kit its two figures; the circle has closed forms.
 """
 
 from dataclasses import replace
@@ -109,78 +108,66 @@ def drifting(make_sequence, make_run):
     return make
 
 
+# What neither the kind of motion nor a known start changes, and what only a known start changes.
+WHATEVER_THE_START: dict[str, float] = {
+    "ate_sim3_m": 0.3842189961,
+    "ate_se3_deg": 0.858606696,
+    "rpe_1s_deg": 0.2001193513,
+    "kitti_r_deg_per_m": 0.003632896472,
+    "nis_mean": 0.4454559512,
+    "coverage_percent": 99.25,
+    "pairs": 397,
+}
+WITHOUT_A_KNOWN_START: dict[str, float] = {
+    "ate_se3_m": 1.257898801,
+    "ate_yaw_m": 2.296237497,
+    "rpe_1s_m": 0.3939201074,
+    "rpe_100m_percent": 1.831399939,
+    "kitti_t_percent": 1.509738253,
+    "reproj_median_px": 20.79253305,
+    "reproj_rmse_px": 36.52933918,
+    "heldout_reproj_median_px": 2.304274847,
+    "heldout_reproj_rmse_px": 5.277458993,
+}
+
 GOLDEN: dict[tuple[str, bool], dict[str, float]] = {
-    ("twist", False): {
+    ("twist", False): WHATEVER_THE_START
+    | WITHOUT_A_KNOWN_START
+    | {
         "ate_none_m": 8.35925435,
-        "ate_se3_m": 1.257898801,
-        "ate_yaw_m": 2.296237497,
-        "ate_sim3_m": 0.3842189961,
-        "ate_se3_deg": 0.858606696,
-        "rpe_1s_m": 0.3939201074,
-        "rpe_1s_deg": 0.2001193513,
-        "rpe_100m_percent": 1.831399939,
-        "kitti_t_percent": 1.509738253,
-        "kitti_r_deg_per_m": 0.003632896472,
         "end_drift_percent": 1.473644761,
-        "reproj_median_px": 20.79253305,
-        "reproj_rmse_px": 36.52933918,
-        "heldout_reproj_median_px": 2.304274847,
-        "heldout_reproj_rmse_px": 5.277458993,
-        "nis_mean": 0.4454559512,
         "nees_pose_mean": 119.5507745,
         "nees_ori_mean": 4.606113086,
         "nees_pos_mean": 225.8675537,
         "nees_pose_in_band_percent": 3.022670025,
-        "coverage_percent": 99.25,
-        "pairs": 397,
     },
-    ("imu", False): {
+    ("imu", False): WHATEVER_THE_START
+    | WITHOUT_A_KNOWN_START
+    | {
         "ate_none_m": 8.922772544,
-        "ate_se3_m": 1.257898801,
-        "ate_yaw_m": 2.296237497,
-        "ate_sim3_m": 0.3842189961,
-        "ate_se3_deg": 0.858606696,
-        "rpe_1s_m": 0.3939201074,
-        "rpe_1s_deg": 0.2001193513,
-        "rpe_100m_percent": 1.831399939,
-        "kitti_t_percent": 1.509738253,
-        "kitti_r_deg_per_m": 0.003632896472,
         "end_drift_percent": 1.599599474,
-        "reproj_median_px": 20.79253305,
-        "reproj_rmse_px": 36.52933918,
-        "heldout_reproj_median_px": 2.304274847,
-        "heldout_reproj_rmse_px": 5.277458993,
-        "nis_mean": 0.4454559512,
         "nees_pose_mean": 153.2644971,
         "nees_ori_mean": 5.370355414,
         "nees_pos_mean": 287.6965623,
         "nees_pose_in_band_percent": 3.778337531,
-        "coverage_percent": 99.25,
-        "pairs": 397,
     },
-    ("imu", True): {
+    ("imu", True): WHATEVER_THE_START
+    | {
         "ate_none_m": 7.744234046,
         "ate_se3_m": 0.5043667562,
         "ate_yaw_m": 0.536527162,
-        "ate_sim3_m": 0.3842189961,
-        "ate_se3_deg": 0.858606696,
         "rpe_1s_m": 0.3820852205,
-        "rpe_1s_deg": 0.2001193513,
         "rpe_100m_percent": 1.766554717,
         "kitti_t_percent": 1.424684063,
-        "kitti_r_deg_per_m": 0.003632896472,
         "end_drift_percent": 1.36594518,
         "reproj_median_px": 11.88140026,
         "reproj_rmse_px": 16.28738389,
         "heldout_reproj_median_px": 2.307594079,
         "heldout_reproj_rmse_px": 5.277958035,
-        "nis_mean": 0.4454559512,
         "nees_pose_mean": 1.819269837,
         "nees_ori_mean": 1.58480363,
         "nees_pos_mean": 1.257849099,
         "nees_pose_in_band_percent": 93.95465995,
-        "coverage_percent": 99.25,
-        "pairs": 397,
     },
 }
 

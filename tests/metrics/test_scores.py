@@ -145,5 +145,5 @@ def test_two_files_cannot_declare_the_same_key(tmp_path, monkeypatch, found_anew
 
 def test_a_metric_is_chosen_by_its_key_or_its_name():
     assert [m.key for m in metrics.metrics_called(["NIS mean", "ate_se3_m"])] == ["nis_mean", "ate_se3_m"]
-    with pytest.raises(VislamError, match=r"no column is called ATE SE3 \(did you mean ATE SE\(3\)\?\); there are"):
+    with pytest.raises(VislamError, match=r"no metric is called ATE SE3; did you mean ATE SE\(3\)\?"):
         metrics.metrics_called(["pairs", "ATE SE3"])

@@ -112,7 +112,7 @@ def test_all_columns_are_every_metric_with_a_value(comparison: Comparison) -> No
 
 
 def test_an_unknown_column_is_answered_with_the_nearest(comparison: Comparison) -> None:
-    with pytest.raises(VislamError, match=r"no column is called ate_se3 \(did you mean ate_se3_m\?\)"):
+    with pytest.raises(VislamError, match=r"no metric is called ate_se3; did you mean ate_se3_m\?"):
         comparison_table(comparison, ("ate_se3",))
 
 

@@ -31,14 +31,14 @@ def parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status; any expected trouble is told in one line on stderr."""
+    """Run the command line and return its exit status; any expected trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with _termination_as_interrupt():
             options = parser().parse_args(given)
             options.command_line = ["vislam", *given]
             status: int = options.command(options)
-            # Here and not at the interpreter's end, where a closed pipe could no longer be told from a defect.
+            # Here and not at the interpreter's end, where a closed pipe looks like a defect.
             sys.stdout.flush()
             return status
     except VislamError as error:

@@ -39,6 +39,6 @@ def command(options: argparse.Namespace) -> int:
     """Write the file and say what is in it."""
     from toolkit.report.export import export
 
-    told = export(options.run, options.estimator, options.output, options.format, options.out)
-    print(f"{options.out}: {told}")
+    written = export(options.run, options.estimator, options.output, options.format, options.out)
+    print(f"{options.out}: {written}")
     return 0

@@ -223,7 +223,7 @@ def _how_it_ended(error: BrokenProcessPool) -> str:
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """Have processes started here be deaf to Ctrl-C from birth; one that comes meanwhile is delivered afterwards."""
+    """Have processes started here ignore Ctrl-C from their start; one that comes meanwhile is delivered afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

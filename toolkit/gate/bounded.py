@@ -59,7 +59,7 @@ def judge_coverage(case: Case, estimator: str, before: Series, now: Series, boun
 
 
 def _both(before: Values, now: Values) -> list[tuple[float, float]]:
-    """Return the values before and now of the runs that have both; a lost one is told elsewhere."""
+    """Return the values before and now of the runs that have both; a lost one has a verdict of its own."""
     return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
 
 

@@ -15,7 +15,7 @@ def installed() -> dict[str, str]:
 def differences(releases: Mapping[str, str]) -> tuple[str, ...]:
     """Say what here is another release than in a baseline; nothing where all that matters is the same."""
     return tuple(
-        f"{name} {releases.get(name, '(not told)')}, here {here}"
+        f"{name} {releases.get(name, '(not given)')}, here {here}"
         for name, here in installed().items()
         if _matters(name, releases.get(name, "")) != _matters(name, here)
     )

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol, cast
 import numpy as np
 
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import VislamError, no_such
+from toolkit.errors import VislamError, did_you_mean
 from toolkit.estimate import Output, Run
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
@@ -115,7 +115,8 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
     chosen = tuple(names)
     for name in chosen:
         if name not in by_name:
-            raise VislamError(no_such("column", name, by_name))
+            close = did_you_mean(name, by_name)
+            raise VislamError(f"no metric is called {name}{close}; 'vislam list' names them all, by key")
     return tuple(by_name[name] for name in chosen)
 
 

@@ -72,11 +72,11 @@ def _add_suite(root: ElementTree.Element, sequence: str, verdicts: tuple[Verdict
     for verdict in verdicts:
         who = ".".join(filter(None, (sequence, verdict.estimator, verdict.output)))
         case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
-        told = f"{about(verdict)}: {verdict.words}" if verdict.words else ""
+        message = f"{about(verdict)}: {verdict.words}" if verdict.words else ""
         if verdict.fails:
-            ElementTree.SubElement(case, "failure", type=verdict.finding, message=told).text = _numbers(verdict)
-        elif told:
-            ElementTree.SubElement(case, "system-out").text = f"{told}\n{_numbers(verdict)}"
+            ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = _numbers(verdict)
+        elif message:
+            ElementTree.SubElement(case, "system-out").text = f"{message}\n{_numbers(verdict)}"
 
 
 def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
@@ -85,7 +85,7 @@ def _counts(verdicts: tuple[Verdict, ...]) -> dict[str, str]:
 
 
 def _numbers(verdict: Verdict) -> str:
-    told = {
+    numbers = {
         "before": verdict.before,
         "now": verdict.after,
         "change in percent": verdict.change_percent,
@@ -93,7 +93,7 @@ def _numbers(verdict: Verdict) -> str:
         "p, adjusted": verdict.p,
         "sees, in percent": verdict.seen_percent,
     }
-    return "\n".join(f"{name}: {value:.7g}" for name, value in told.items() if value is not None)
+    return "\n".join(f"{name}: {value:.7g}" for name, value in numbers.items() if value is not None)
 
 
 WRITERS: Mapping[str, Callable[[Check], str]] = {

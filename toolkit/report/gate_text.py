@@ -69,8 +69,8 @@ def headline(check: Check) -> str:
         return f"the gate passes: nothing got worse than {check.baseline} ({judged} comparisons)"
     missing = sum(verdict.finding == "missing" for verdict in check.failures)
     parts = [(len(check.failures) - missing, "got worse"), (missing, "missing")]
-    told = ", ".join(f"{count} {what}" for count, what in parts if count)
-    return f"the gate fails: of {judged} comparisons with {check.baseline}, {told}"
+    counts = ", ".join(f"{count} {what}" for count, what in parts if count)
+    return f"the gate fails: of {judged} comparisons with {check.baseline}, {counts}"
 
 
 def failure_lines(check: Check) -> Iterator[str]:

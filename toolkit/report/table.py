@@ -183,9 +183,16 @@ def as_text(table: Table) -> str:
 
 def as_markdown(table: Table) -> str:
     """Return the table in Markdown; units stand in brackets behind the names."""
-    heads = [" ".join(filter(None, lines[:-1])) + (f" [{lines[-1]}]" if lines[-1] else "") for lines in table.headings]
+    heads = [_in_one_line(lines) for lines in table.headings]
     text = tabulate(table.rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
     return "\n\n".join(filter(None, (text, "\n".join(f"- {line}" for line in table.under))))
+
+
+def _in_one_line(heading: tuple[str, ...]) -> str:
+    """Return a heading in one line, the unit in brackets; a word divided by a hyphen becomes whole."""
+    *words, unit = heading
+    name = " ".join(filter(None, words)).replace("- ", "-")
+    return f"{name} [{unit}]" if unit else name
 
 
 def _sides(table: Table) -> list[Literal["left", "right"]]:

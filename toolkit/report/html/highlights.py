@@ -11,7 +11,7 @@ Row = dict[str, Any]
 
 
 class _Question(NamedTuple):
-    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and how it is told."""
+    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and in what words."""
 
     asks: str
     outputs: tuple[str, ...]
