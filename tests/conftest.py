@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from toolkit import runner
 from toolkit.estimate import Run
 from toolkit.estimator import find
+from toolkit.experiment import pipeline, workers
 from toolkit.progress import SILENT
 from toolkit.sequence import Prior, Sequence
 
@@ -55,9 +56,16 @@ def without_pixels() -> Callable[[], AbstractContextManager[None]]:
     """Return a context in which every figure is drawn, but an empty file stands where its pixels would be.
 
     Rendering takes longer than all else in a comparison of a few frames. Tests that are about something else do
-    without; the documentation's commands, the examples in help and a test of run directories render theirs.
+    without; the first line of the README and a test of run directories render theirs.
     """
     return _without_pixels
+
+
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have all work done in this process where nobody says in how many: each takes a second to start."""
+    for module in (workers, pipeline):
+        monkeypatch.setattr(module, "usable_cpus", lambda: 1)
 
 
 @pytest.fixture

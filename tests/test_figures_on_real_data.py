@@ -32,7 +32,7 @@ RunOn = Callable[[str, Case], Run]
 def prepare(real: Callable[[str], Path]) -> Prepare:
     @cache
     def prepared(source: str, truth: str | None) -> Case:
-        sequence = load_sequence(source if source == "kitti00" else str(real(source)))
+        sequence = load_sequence(str(real(source)))
         if truth is not None:
             sequence = with_truth(sequence, load_truth(real(truth)))
         sequence = audit(sequence).sequence
@@ -69,11 +69,6 @@ def dataset_03(prepare: Prepare) -> Case:
     return prepare("ucsd/03.npz", None)
 
 
-@pytest.fixture(scope="module")
-def kitti00(prepare: Prepare) -> Case:
-    return prepare("kitti00", "kitti00/gt_imu.tum")
-
-
 def test_dead_reckoning_on_0027_errs_by_what_was_measured_before(drive_27, run_on):
     """15.8 +- 0.3 m: the twist, its lag and its noise are the file's, no estimator has a part in it."""
     assert scored(run_on("dead-reckoning", drive_27), drive_27, "causal")["ate_se3_m"] == pytest.approx(15.8, abs=0.3)
@@ -106,11 +101,6 @@ def test_on_03_the_smoother_is_no_worse_than_the_filter_and_finds_the_bias_too(d
     smoother = scored(smoothed, dataset_03, "final")
     of_filter = scored(run_on("ekf", dataset_03), dataset_03, "final")
     assert smoother["heldout_reproj_median_px"] <= of_filter["heldout_reproj_median_px"]
-
-
-@pytest.mark.parametrize(("name", "output", "most_m"), [("ekf", "causal", 0.6), ("batch", "final", 0.4)])
-def test_kitti00_with_its_real_imu(name, output, most_m, kitti00, run_on):
-    assert scored(run_on(name, kitti00), kitti00, output)["ate_se3_m"] <= most_m
 
 
 def test_a_recording_without_features_is_dead_reckoned(prepare, run_on):

@@ -17,7 +17,7 @@ from toolkit.metrics import cost, known_metrics
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
-pytestmark = pytest.mark.usefixtures("unrendered")
+pytestmark = pytest.mark.usefixtures("unrendered", "one_process")
 QUICK = ("--max-frames", "10", "--workers", "1")
 COST = {metric.key for metric in cost.METRICS}
 
@@ -110,14 +110,28 @@ def test_an_option_that_an_estimator_does_not_have_is_told_before_anything_runs(
 
 
 def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
-    """In as many processes as there are processors, with whatever changed the first: settings, start, seed, cut."""
+    """In two processes and then in one, with whatever changed the first: settings, start, seed, cut."""
     words = ("--estimators", "dead-reckoning,ekf", "--max-frames", "12", "--seed", "3", "--start", "truth")
-    assert vislam("compare", "drive", *words, "--set", "noise.pixel_sigma_px=0.7", "--no-repair", "--out", "once") == 0
+    assert (
+        vislam(
+            "compare",
+            "drive",
+            *words,
+            "--set",
+            "noise.pixel_sigma_px=0.7",
+            "--no-repair",
+            "--workers",
+            "2",
+            "--out",
+            "once",
+        )
+        == 0
+    )
     assert vislam("compare", "--config", "once/manifest.json", "--out", "again") == 0
     assert metrics("again") == metrics("once")
     once, again = manifest("once"), manifest("again")
     for told in (once, again):
-        for key in ("command", "date"):
+        for key in ("command", "date", "threads"):
             del told[key]
     assert again == once
 

@@ -46,6 +46,7 @@ def test_help_has_an_example_and_the_exit_statuses(helps: dict[str, str], comman
     assert tuple(told) == STATUSES
 
 
+@pytest.mark.usefixtures("one_process", "unrendered")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_examples_in_help_run(helps: dict[str, str], command: str, vislam: Callable[..., int]) -> None:
     examples = re.findall(r"^  \$ vislam (.*)$", helps[command], flags=re.MULTILINE)

@@ -14,7 +14,8 @@ from toolkit.settings import DEFAULTS, Noise, settings_of
 
 def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
     """Return the pixel covariance (3, 3) px^2 and the motion noise that estimators are told."""
-    sequence = prepare(Recording(source, max_frames=5, noise=Noise(**noise))).sequence
+    short = load_sequence(source).truncated(20)  # soon audited
+    sequence = prepare(Recording(short, noise=Noise(**noise))).sequence
     return sequence.rig.cov_uv_px2, sequence.noise
 
 
@@ -49,11 +50,11 @@ def test_a_factor_on_an_imu_leaves_its_random_walks() -> None:
 
 
 def test_a_start_from_the_truth_is_the_truth_and_says_so() -> None:
-    from_truth = prepare(Recording("drive", max_frames=5, start="truth"))
+    from_truth = prepare(Recording(load_sequence("drive").truncated(20), start="truth"))
     assert from_truth.sequence.truth is not None
     np.testing.assert_allclose(from_truth.prior.T_world_imu, from_truth.sequence.truth.T_world_imu[0], atol=1e-12)
     assert "truth" in from_truth.prior.source
-    assert prepare(Recording("drive", max_frames=5)).prior.source != from_truth.prior.source
+    assert prepare(Recording(load_sequence("drive").truncated(20))).prior.source != from_truth.prior.source
 
 
 def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:

@@ -89,25 +89,3 @@ def test_options_are_read_without_importing(tunable: str) -> None:
     assert find(tunable).options() == {"gain", "mode"}
     assert find("plain").options() == set()
     assert "estimators_with_options.tunable" not in sys.modules
-
-
-@pytest.mark.parametrize(
-    ("estimator", "given"),
-    [
-        ("ekf", {"outliers": {"filter_huber": 0.1}}),
-        ("ekf", {"outliers": {"gate_probability": 0.2}}),
-        ("batch", {"outliers": {"batch_cauchy": 0.05}}),
-        ("msckf", {"window": {"twist_clones": 2}}),
-        ("fixed-lag", {"window": {"lag_s": 0.3}}),
-        ("isam2", {"outliers": {"smoother_huber": 0.1}}),
-        ("msckf-slam", {"window": {"landmarks": 0}}),
-    ],
-)
-def test_a_setting_changes_what_an_estimator_answers(estimator: str, given: dict[str, object]) -> None:
-    answers = [
-        run(Plan(("drive",), (estimator,), settings=settings_of(settings, "here"), max_frames=25, workers=1))[0]
-        for settings in ({}, given)
-    ]
-    before, after = (one.rows[-1].scores.values["ate_none_m"] for one in answers)
-    assert before is not None
-    assert before != after

@@ -42,9 +42,22 @@ def same(one: Run, other: Run) -> bool:
         (Outliers(gate_probability=0.5), {"ekf", "ekf-slam", "msckf"}, {"seed-ekf", "mapping"}),
         (Outliers(filter_huber=0.5), {"ekf"}, {"msckf", "fixed-lag", "seed-ekf"}),
         (Outliers(smoother_huber=0.5), {"fixed-lag", "smart", "isam2"}, {"ekf"}),
+        (Outliers(batch_huber=0.3), {"batch"}, {"isam2"}),
+        (Outliers(batch_cauchy=0.1), {"batch"}, {"isam2"}),
         (Outliers(batch_cut_probability=0.3), {"batch"}, {"isam2"}),
     ],
-    ids=["lag", "twist clones", "imu clones", "landmarks", "gate", "filter huber", "smoother huber", "batch cut"],
+    ids=[
+        "lag",
+        "twist clones",
+        "imu clones",
+        "landmarks",
+        "gate",
+        "filter huber",
+        "smoother huber",
+        "batch huber",
+        "batch cauchy",
+        "batch cut",
+    ],
 )
 def test_a_setting_moves_the_estimators_it_is_for_alone(part, moved, unmoved):
     assert {name for name in moved | unmoved if not same(answer(name), answer(name, part))} == moved
