@@ -95,11 +95,11 @@ result.table("ATE SE(3)", "reproj held-out", "NIS mean")
 # %% [markdown]
 # ## The same with exact truth
 #
-# `drive` is a simulation: a car for a minute, with noise like that of a real one; its first 20 seconds will do. Its
-# truth is exact, so here the errors mean what they say. Every seed draws another noise; this is seed 0.
+# `drive-imu` is a simulation: a car with an IMU, with noise like that of a real one. Its truth is exact, so here the
+# errors mean what they say. Its first 15 seconds will do. Every seed draws another noise; this is seed 0.
 
 # %%
-simulated = toolkit.compare("drive", ["dead-reckoning", "ekf", "batch"], max_frames=200)
+simulated = toolkit.compare("drive-imu", ["dead-reckoning", "ekf", "batch"], max_frames=150)
 simulated.table("ATE SE(3)", "reproj held-out", "NIS mean")
 
 # %%

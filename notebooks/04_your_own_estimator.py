@@ -116,7 +116,7 @@ print(f"{mine.status}: position error {scores.values['ate_se3_m']:.2f} m over {d
 # Beside the others, on the same packets. `own=` takes estimators that live in a notebook.
 
 # %%
-result = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build}, max_frames=300)
+result = compare("drive", ["dead-reckoning", "ekf"], own={"two-view": build})
 result.table("ATE SE(3)", "RPE 100 m", "reproj held-out")
 
 # %%

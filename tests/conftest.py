@@ -4,17 +4,21 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 
 from toolkit import runner
+from toolkit.audit import Audit
 from toolkit.estimate import Run
 from toolkit.estimator import find
-from toolkit.experiment import pipeline, workers
+from toolkit.experiment import pipeline, recording, workers
+from toolkit.experiment.recording import Recording
 from toolkit.progress import SILENT
 from toolkit.sequence import Prior, Sequence
+from toolkit.simulation import SCENARIOS
 
 PROJECT = Path(__file__).parents[1]
 
@@ -59,6 +63,29 @@ def without_pixels() -> Callable[[], AbstractContextManager[None]]:
     without; the first line of the README and a test of run directories render theirs.
     """
     return _without_pixels
+
+
+_audited_recording = recording.audited_recording
+
+
+@cache
+def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], seed: int) -> Audit:
+    """Return a simulated recording audited; a test that puts another audit in gets what that one says."""
+    return _audited_recording(Recording(source, seed, keep=keep))
+
+
+@pytest.fixture(scope="module")
+def audited_once() -> Iterator[None]:
+    """Simulate and audit each built-in recording once for all tests of a worker that run a few frames of it."""
+
+    def remembered(asked: Recording) -> Audit:
+        if asked.truth is None and asked.duration_s is None and asked.source in SCENARIOS:
+            return _audited(recording.audit, asked.source, asked.keep, asked.seed)
+        return _audited_recording(asked)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "audited_recording", remembered)
+        yield
 
 
 @pytest.fixture

@@ -21,6 +21,8 @@ from toolkit.estimator import LADDER, defaults, find
 from toolkit.metrics import describe
 from toolkit.report.table import comparison_table
 
+pytestmark = pytest.mark.usefixtures("audited_once")
+
 FRAMES = 20
 RECORDING = Path(__file__).parents[1] / "data" / "drive_small"
 
@@ -40,12 +42,12 @@ PROGRAM = textwrap.dedent(f"""
 
 
 @pytest.fixture(scope="module")
-def result() -> Result:
+def result(audited_once: None) -> Result:
     return toolkit.compare("drive", ["dead-reckoning", "ekf"], max_frames=FRAMES, workers=1)
 
 
 @pytest.fixture(scope="module")
-def over() -> Result:
+def over(audited_once: None) -> Result:
     return toolkit.compare("drive", "dead-reckoning", max_frames=FRAMES, seed=4, seeds=2, workers=1)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
 from toolkit.divergence import MOST_FAR_STEPS, contradiction, gate_collapse
-from toolkit.estimate import Trajectory
+from toolkit.estimate import Run, Trajectory
 from toolkit.geometry import Array, se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
 from toolkit.sequence import Sequence
@@ -20,8 +21,15 @@ SCENARIOS = {"drive": DRIVE, "drive-imu": DRIVE_IMU, "flight": FLIGHT}
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 
 
+@cache
 def recording(scenario: str, seed: int = 0) -> Sequence:
     return simulate(replace(SCENARIOS[scenario], duration_s=10.0), seed)
+
+
+@pytest.fixture(scope="module")
+def run_on(run_estimator: Callable[..., Run]) -> Callable[[str, str], Run]:
+    """Return a function that runs an estimator once on a scenario."""
+    return cache(lambda name, scenario: run_estimator(name, recording(scenario)))
 
 
 def jumping(trajectory: Trajectory, share: float, jump: Array) -> Trajectory:
@@ -36,9 +44,8 @@ def jumping(trajectory: Trajectory, share: float, jump: Array) -> Trajectory:
 
 @every_scenario
 @pytest.mark.parametrize("name", ["dead-reckoning", "ekf", "batch"])
-def test_a_run_that_works_contradicts_nothing(name, scenario, run_estimator):
-    sequence = recording(scenario)
-    assert contradiction(run_estimator(name, sequence).final, sequence) is None
+def test_a_run_that_works_contradicts_nothing(name, scenario, run_on):
+    assert contradiction(run_on(name, scenario).final, recording(scenario)) is None
 
 
 @every_scenario
@@ -55,23 +62,23 @@ TURN = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
 @every_scenario
 @pytest.mark.parametrize("jump", [JUMP_M, TURN], ids=["position", "heading"])
-def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction(scenario, jump, run_estimator):
+def test_jumps_in_a_fifth_of_the_steps_are_a_contradiction(scenario, jump, run_on):
     sequence = recording(scenario)
-    spoiled = jumping(run_estimator("ekf", sequence).causal, 0.2, jump)
+    spoiled = jumping(run_on("ekf", scenario).causal, 0.2, jump)
     reason = contradiction(spoiled, sequence)
     assert reason is not None
     assert "contradict the measured motion" in reason
 
 
 @every_scenario
-def test_a_few_jumps_are_not(scenario, run_estimator):
+def test_a_few_jumps_are_not(scenario, run_on):
     sequence = recording(scenario)
-    assert contradiction(jumping(run_estimator("ekf", sequence).causal, 0.02, JUMP_M), sequence) is None
+    assert contradiction(jumping(run_on("ekf", scenario).causal, 0.02, JUMP_M), sequence) is None
 
 
-def test_the_reason_counts_the_far_steps(run_estimator):
+def test_the_reason_counts_the_far_steps(run_on):
     sequence = recording("drive")
-    run = run_estimator("dead-reckoning", sequence)
+    run = run_on("dead-reckoning", "drive")
     poses = run.causal.T_world_imu.copy()
     poses[1::2] = poses[1::2] @ se3_exp(JUMP_M)
     reason = contradiction(replace(run.causal, T_world_imu=poses), sequence)

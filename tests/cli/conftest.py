@@ -1,43 +1,20 @@
 """The command line run in this process, in an empty directory."""
 
 import shutil
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from toolkit.audit import Audit
 from toolkit.cli import main
-from toolkit.experiment import recording
-from toolkit.experiment.recording import Recording
-from toolkit.simulation import SCENARIOS
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
 
-_audited_recording = recording.audited_recording
-
-
-@cache
-def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], seed: int) -> Audit:
-    """Return a simulated recording audited; a test that puts another audit in gets what that one says."""
-    return _audited_recording(Recording(source, seed, keep=keep))
-
-
 @pytest.fixture(scope="module", autouse=True)
-def audited_once() -> Iterator[None]:
-    """Simulate and audit each built-in recording once for all tests: most of them run ten frames of the same one."""
-
-    def remembered(asked: Recording) -> Audit:
-        if asked.truth is None and asked.duration_s is None and asked.source in SCENARIOS:
-            return _audited(recording.audit, asked.source, asked.keep, asked.seed)
-        return _audited_recording(asked)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording, "audited_recording", remembered)
-        yield
+def _audited_once(audited_once: None) -> None:
+    """Most of these tests run ten frames of the same recording."""
 
 
 @pytest.fixture

@@ -24,6 +24,8 @@ from toolkit.report.terminal import comparison_text
 from toolkit.sequence import Sequence
 from toolkit.simulation import FLIGHT, simulate
 
+pytestmark = pytest.mark.usefixtures("unrendered")
+
 NAME = "openvins (est.txt)"
 OFFSET_M = 0.25
 
@@ -77,7 +79,7 @@ def write_csv(path: Path, head: str, rows: Array) -> None:
 
 def compared(export: Path, max_frames: int | None = None) -> tuple[Comparison, Path]:
     out = export.parent / "run"
-    (comparison,) = run(Plan((str(export),), ("dead-reckoning",), max_frames=max_frames))
+    (comparison,) = run(Plan((str(export),), ("dead-reckoning",), max_frames=max_frames, workers=1))
     write_run(comparison, out, MadeBy("vislam compare", Configuration()))
     return comparison, out
 
