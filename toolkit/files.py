@@ -157,9 +157,7 @@ def replaced_file(target: Path) -> Iterator[Path]:
                 with suppress(OSError):
                     partial.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"{target} cannot be written ({error.strerror or error}); choose another file with --out"
-        ) from error
+        raise _unwritable(target, error, "file") from error
 
 
 def check_file(target: Path) -> None:
@@ -189,8 +187,10 @@ def _beside(target: Path, kind: str) -> Path:
     return target.parent / f".vislam.{kind}-{os.getpid()}"
 
 
-def _unwritable(target: Path, error: OSError) -> OutputError:
-    return OutputError(f"{target} cannot be written ({error.strerror or error}); choose another directory with --out")
+def _unwritable(target: Path, error: OSError, kind: str = "directory") -> OutputError:
+    in_the_way = next((parent for parent in target.parents if os.path.isfile(parent)), None)  # noqa: PTH113
+    why = f"{in_the_way} is a file" if in_the_way else error.strerror or error
+    return OutputError(f"{target} cannot be written ({why}); choose another {kind} with --out")
 
 
 def content_digest(values: Iterable[object], digits: int | None = None) -> str:
