@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import pytest
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.documents import parse, read, schema_name, to_line, to_text, told_schema
+from toolkit.documents import parse, read, to_line, to_text
 from toolkit.errors import DataError, OutputError
 
 
@@ -105,11 +105,3 @@ def test_the_file_and_the_remedy_are_told(tmp_path: Path) -> None:
         read(path, Tree, remedy="plant one", error=OutputError)
     with pytest.raises(DataError, match="cannot be read"):
         read(tmp_path, Tree)
-
-
-def test_the_schema_of_a_file_is_told_without_reading_the_rest(tmp_path: Path) -> None:
-    path = tmp_path / "tree.json"
-    assert told_schema(path) is None
-    for text, schema in ((of('"way": 3'), schema_name(Tree)), ("[]", None), ("{", None)):
-        path.write_text(text)
-        assert told_schema(path) == schema

@@ -1,11 +1,15 @@
-"""A digest tells values apart by shape, place and content, and rounded ones only by the digits asked for."""
+"""A digest tells values apart by shape, place and content; what is written replaces regular files only, and whole."""
 
+import os
+import signal
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from toolkit.files import content_digest
+from toolkit.errors import OutputError
+from toolkit.files import content_digest, replaced_file, uninterrupted
 
 
 @dataclass(frozen=True)
@@ -50,3 +54,27 @@ def test_zero_has_no_sign_where_it_is_rounded() -> None:
 def test_an_array_that_is_not_finite_everywhere_is_rounded_by_what_is() -> None:
     array = np.array([np.nan, np.inf, 1.0])
     assert content_digest([array * (1.0 + 1e-12)], 6) == content_digest([array], 6)
+
+
+def test_a_pipe_is_never_replaced_by_a_file(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(OutputError, match="a device or a pipe"), replaced_file(pipe) as partial:
+        partial.write_text("lost")
+    assert pipe.is_fifo()
+
+
+def test_of_a_link_the_file_behind_it_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    with replaced_file(tmp_path / "link") as partial:
+        partial.write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_text() == "new"
+
+
+def test_a_signal_waits_until_something_is_in_its_place() -> None:
+    done = False
+    with pytest.raises(KeyboardInterrupt), uninterrupted():
+        signal.raise_signal(signal.SIGINT)
+        done = True
+    assert done

@@ -89,15 +89,6 @@ def schema_name(record: type[msgspec.Struct]) -> str:
     return str(name)
 
 
-def told_schema(path: Path) -> object:
-    """Return what a file says its schema is, or None where it is not there, not JSON or has none."""
-    try:
-        document = _decoded(path.read_bytes())
-    except (OSError, *_NOT_JSON):
-        return None
-    return _schema_of(document)
-
-
 def schema(record: type[msgspec.Struct]) -> Json:
     """Return the JSON schema (draft 2020-12) of a record."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(record)}

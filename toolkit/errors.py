@@ -32,6 +32,16 @@ class EstimatorError(VislamError):
     exit_status = 5
 
 
+def printable(text: str) -> str:
+    """Return a text as one line in which nothing acts on a terminal or splits a table.
+
+    Control and format characters, ends of lines and bytes that are no text, as file names may hold, become escapes.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return the known name most like a misspelt one, whatever the case of its letters, or "" where none is close."""
     by_folded = {candidate.casefold(): candidate for candidate in known}

@@ -6,7 +6,8 @@ A directory or a file appears complete or not at all: it is written beside its p
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+import signal
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -16,20 +17,22 @@ import numpy as np
 from toolkit.errors import OutputError
 from toolkit.geometry import Array
 
-# Says whether an existing directory was made by us, so that it may be replaced.
-IsOurs = Callable[[Path], bool]
+# Returns what in a directory was written by us and may be replaced: files by their relative path, folders with a slash.
+Owner = Callable[[Path], Collection[str]]
+# What asks a program to end; one that comes while something is put in its place waits until that is done.
+_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
-def check_replaceable(target: Path, is_ours: IsOurs) -> None:
-    """Raise OutputError unless ``target`` can be created, or is a directory that is empty or ours."""
-    if target.resolve() == Path.cwd():
-        raise OutputError(f"{target} is the current directory and cannot be replaced; name a directory inside it")
-    if target.is_symlink() or (target.exists() and not target.is_dir()):
-        raise OutputError(f"{target} exists and is not a directory; choose another place for the results")
+def check_replaceable(target: Path, owner: Owner) -> None:
+    """Raise OutputError unless ``target`` can be created, or is a directory that holds nothing but files of ours."""
     try:
-        if target.is_dir() and any(target.iterdir()) and not is_ours(target):
-            raise OutputError(f"{target} holds other files, which would be lost; choose another directory")
-        _probe(target.parent)
+        if Path.cwd().is_relative_to(os.path.realpath(target)):
+            raise OutputError(f"{target} is or holds the current directory and cannot be replaced; name one inside it")
+        if target.is_symlink() or (target.exists() and not target.is_dir()):
+            raise OutputError(f"{target} exists and is not a directory; choose another place for the results")
+        if target.is_dir():
+            _check_ours(target, owner, target)
+        _probe(target)
     except OSError as error:
         raise _unwritable(target, error) from error
 
@@ -37,64 +40,141 @@ def check_replaceable(target: Path, is_ours: IsOurs) -> None:
 def check_parent(directory: Path) -> None:
     """Raise OutputError unless directories can be made in ``directory``, or it can itself be made first."""
     try:
-        _probe(directory)
+        _probe(directory / "probe")
     except OSError as error:
         raise _unwritable(directory, error) from error
 
 
-def _probe(directory: Path) -> None:
-    """Make a directory in the nearest one that exists, and take it away again."""
-    probe = _nearest_existing(directory) / f".vislam-probe-{os.getpid()}"
-    probe.mkdir()
-    probe.rmdir()
+def _check_ours(directory: Path, owner: Owner, named: Path) -> None:
+    """Raise OutputError, which calls the directory ``named``, for the first thing in it that we did not write."""
+    ours = owner(directory)
+    for entry in sorted(directory.rglob("*")):
+        name = entry.relative_to(directory).as_posix()
+        is_folder = entry.is_dir() and not entry.is_symlink()
+        if entry.is_symlink() or (f"{name}/" if is_folder else name) not in ours:
+            raise OutputError(
+                f"{named} holds other files, as {name}, which no earlier run wrote and which would be lost; "
+                "choose another directory with --out"
+            )
+
+
+def _probe(target: Path) -> None:
+    """Make what a directory needs to be written, as deep and with names as long, and take it away again."""
+    with _parents_of(target) as parents:
+        partial = _beside(target, "probe")
+        partial.mkdir()
+        partial.rmdir()
+        if not target.exists():
+            target.mkdir()
+            target.rmdir()
+        parents.clear_away()
+
+
+class _Parents:
+    """The directories that were made for something to be written in."""
+
+    def __init__(self, made: list[Path]) -> None:
+        self._made = made
+
+    def clear_away(self) -> None:
+        """Remove those that hold nothing."""
+        with suppress(OSError):
+            for directory in self._made:
+                directory.rmdir()
 
 
 @contextmanager
-def replaced_directory(target: Path, is_ours: IsOurs) -> Iterator[Path]:
+def _parents_of(target: Path) -> Iterator[_Parents]:
+    """Make the directories above a place; where what is done there fails, remove those again."""
+    missing = [parent for parent in target.absolute().parents if not parent.exists()]
+    parents = _Parents(missing)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield parents
+    except BaseException:
+        parents.clear_away()
+        raise
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold back what asks the program to end until the block is left; a part of a rename is neither old nor new."""
+    asked: list[int] = []
+    try:
+        before = {number: signal.getsignal(number) for number in _ENDING}
+        for number in before:
+            signal.signal(number, lambda got, _frame: asked.append(got))
+    except ValueError:  # signals are the main thread's
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        if asked:
+            signal.raise_signal(asked[0])
+
+
+@contextmanager
+def replaced_directory(target: Path, owner: Owner) -> Iterator[Path]:
     """Give an empty directory to write to; on success it takes ``target``'s place, on any failure it is removed.
 
     Raises OutputError where the place is taken by something else or cannot be written.
     """
-    check_replaceable(target, is_ours)
-    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
+    check_replaceable(target, owner)
+    partial = _beside(target, "partial")
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        _swap(partial, target)
+        with _parents_of(target):
+            try:
+                partial.mkdir()
+                yield partial
+                with uninterrupted():
+                    _swap(partial, target, owner)
+            finally:
+                with uninterrupted():
+                    shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         raise _unwritable(target, error) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager
 def replaced_file(target: Path) -> Iterator[Path]:
     """Give a file to write to; on success it takes ``target``'s place, on any failure it is removed.
 
-    Raises OutputError where the place is taken by a directory or cannot be written.
+    Of a link the file it points to is replaced. Raises OutputError where the place is taken by a directory, a device
+    or a pipe, or cannot be written.
     """
-    if target.is_dir():
-        raise OutputError(f"{target} is a directory; name a file in it with --out")
-    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
+    place = Path(os.path.realpath(target))
+    partial = _beside(place, "partial")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(target)
+        check_file(target)
+        with _parents_of(place):
+            try:
+                yield partial
+                partial.replace(place)
+            finally:
+                with suppress(OSError):
+                    partial.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"{target} cannot be written ({error.strerror or error}); choose another file with --out"
-        ) from error
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
+        raise _unwritable(target, error, "file") from error
 
 
-def _swap(new: Path, target: Path) -> None:
-    """Rename ``new`` to ``target``; what was there comes back if that fails or is interrupted."""
-    old = target.parent / f".{target.name}.replaced-{os.getpid()}"
+def check_file(target: Path) -> None:
+    """Raise OutputError where something that is no regular file stands at a place."""
+    if target.is_dir():
+        raise OutputError(f"{target} is a directory; name a file in it")
+    if target.exists() and not target.is_file():
+        raise OutputError(f"{target} is a device or a pipe, and files are written whole; name a regular file")
+
+
+def _swap(new: Path, target: Path, owner: Owner) -> None:
+    """Rename ``new`` to ``target``; what was there comes back if that fails, or if it holds what is not ours by now."""
+    old = _beside(target, "replaced")
     try:
         if target.exists():
             target.rename(old)
+            _check_ours(old, owner, target)
         new.rename(target)
     finally:
         if old.exists() and not target.exists():
@@ -102,13 +182,15 @@ def _swap(new: Path, target: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def _nearest_existing(path: Path) -> Path:
-    absolute = path.absolute()
-    return next(p for p in (absolute, *absolute.parents) if p.exists())
+def _beside(target: Path, kind: str) -> Path:
+    """Return a place for what comes before or after ``target``, whose name may be as long as names can be."""
+    return target.parent / f".vislam.{kind}-{os.getpid()}"
 
 
-def _unwritable(target: Path, error: OSError) -> OutputError:
-    return OutputError(f"{target} cannot be written ({error.strerror or error}); choose another directory with --out")
+def _unwritable(target: Path, error: OSError, kind: str = "directory") -> OutputError:
+    in_the_way = next((parent for parent in target.parents if os.path.isfile(parent)), None)  # noqa: PTH113
+    why = f"{in_the_way} is a file" if in_the_way else error.strerror or error
+    return OutputError(f"{target} cannot be written ({why}); choose another {kind} with --out")
 
 
 def content_digest(values: Iterable[object], digits: int | None = None) -> str:

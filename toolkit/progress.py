@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol, TextIO
 
+from toolkit.errors import printable
+
 # Seconds between two lines where the stream is a file or a pipe, and before the first.
 LOG_EVERY_S = 10.0
 _FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
@@ -44,7 +46,8 @@ def on_stream(stream: TextIO) -> ProgressFor:
     """Return what shows progress on a stream: one line that redraws itself on a terminal, else a line now and then."""
 
     @contextmanager
-    def shown(label: str) -> Iterator[Progress]:
+    def shown(named: str) -> Iterator[Progress]:
+        label = printable(named)
         if not stream.isatty():
             yield _Log(label, stream)
             return

@@ -5,20 +5,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.gating import chi2_bound
+from toolkit.models.gating import chi2_bound, mean_below_bound
 
 
 @dataclass
 class FrameGate:
     """Accepts innovations below the chi-square quantile of a probability and counts them.
 
-    ``nis`` and ``dof`` are sums over what was accepted, ``tested`` and ``accepted`` numbers of innovations, and
+    ``nis`` and ``dof`` are sums over what was accepted, and ``nis_expected`` what the first is expected to be where the
+    innovations are as large as their covariance says: less than ``dof``, for the gate took the largest away. Robust
+    weights come after the test and change neither. ``tested`` and ``accepted`` numbers of innovations, and
     ``unconverged`` the number of iterated updates that were broken off.
     """
 
     probability: float
     nis: float = 0.0
     dof: int = 0
+    nis_expected: float = 0.0
     tested: int = 0
     accepted: int = 0
     unconverged: int = 0
@@ -32,6 +35,8 @@ class FrameGate:
         accepted = np.asarray((nis < self.bound(dof)) & in_front)
         self.nis += float(nis[accepted].sum())
         self.dof += int(np.broadcast_to(dof, nis.shape)[accepted].sum())
+        expected = mean_below_bound(dof, self.probability)
+        self.nis_expected += float(np.broadcast_to(expected, nis.shape)[accepted].sum())
         self.tested += accepted.size
         self.accepted += int(accepted.sum())
         return accepted
@@ -41,6 +46,7 @@ class FrameGate:
         return {
             "nis": self.nis,
             "nis_dof": self.dof,
+            "nis_expected": self.nis_expected,
             "gate_tested": self.tested,
             "gate_accepted": self.accepted,
             "unconverged": self.unconverged,

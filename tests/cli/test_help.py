@@ -11,7 +11,7 @@ import pytest
 from toolkit.cli import simulate
 
 COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "list", "simulate")
-STATUSES = ("0", "1", "2", "3", "4", "5", "130")
+STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 
 

@@ -103,7 +103,7 @@ def test_a_recording_is_replaced_by_the_next(drive: Sequence, flight: Sequence, 
     assert [entry.name for entry in tmp_path.iterdir()] == ["it"]
 
 
-@pytest.mark.parametrize("interrupted", ["numpy.savez_compressed", "json.dumps", "pathlib.Path.replace"])
+@pytest.mark.parametrize("interrupted", ["numpy.savez_compressed", "json.dumps", "pathlib.Path.rename"])
 def test_an_interruption_leaves_what_was_there(
     interrupted: str, drive: Sequence, flight: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,14 +124,14 @@ def test_an_interruption_between_the_two_moves_puts_the_old_one_back(
     drive: Sequence, flight: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vislam_recording.save(drive, tmp_path / "old")
-    replace_path = Path.replace
+    rename = Path.rename
 
     def interrupt_second(self: Path, target: Path) -> Path:
-        if self.name == "finished":
+        if ".partial-" in self.name:
             raise KeyboardInterrupt
-        return replace_path(self, target)
+        return rename(self, target)
 
-    monkeypatch.setattr(Path, "replace", interrupt_second)
+    monkeypatch.setattr(Path, "rename", interrupt_second)
     with pytest.raises(KeyboardInterrupt):
         vislam_recording.save(flight, tmp_path / "old")
     assert_same(vislam_recording.load(tmp_path / "old"), drive)
@@ -141,9 +141,9 @@ def test_a_folder_with_other_things_is_not_touched(drive: Sequence, tmp_path: Pa
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(OutputError, match=r"thesis\.tex"):
         vislam_recording.save(drive, tmp_path)
-    with pytest.raises(OutputError, match="is a file"):
+    with pytest.raises(OutputError, match="is not a directory"):
         vislam_recording.save(drive, tmp_path / "thesis.tex")
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="cannot be written"):
         vislam_recording.save(drive, tmp_path / "thesis.tex" / "below")
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
@@ -266,3 +266,10 @@ def test_a_file_in_the_way_of_the_folder_is_named(tmp_path: Path, drive: Sequenc
     (tmp_path / "taken").touch()
     with pytest.raises(OutputError, match="taken is a file"):
         vislam_recording.save(drive, tmp_path / "taken" / "recording")
+
+
+def test_another_programs_file_of_the_same_name_is_not_lost(tmp_path: Path, drive: Sequence) -> None:
+    (tmp_path / "recording.json").write_text('{"tracks": 4}')
+    with pytest.raises(OutputError, match=r"recording\.json"):
+        vislam_recording.save(drive, tmp_path)
+    assert (tmp_path / "recording.json").read_text() == '{"tracks": 4}'

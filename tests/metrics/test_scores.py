@@ -10,6 +10,7 @@ from toolkit import metrics
 from toolkit.errors import VislamError
 from toolkit.metrics import Scores, score_run
 from toolkit.metrics._shared.scores import Unavailable, evaluate
+from toolkit.models.gating import chi2_bound, mean_below_bound
 
 
 @pytest.fixture
@@ -32,6 +33,23 @@ def test_nis_is_one_for_a_consistent_filter(case):
     dof = rng.integers(1, 200, 2000).astype(float)
     values = case(info={"nis": rng.chisquare(dof), "nis_dof": dof}).values
     assert values["nis_mean"] == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / dof.sum()))  # four sigma of the mean
+
+
+def test_nis_behind_a_gate_is_held_against_what_passes_it(case):
+    """An honest filter's innovations, gated at 95 %, have a mean of 1; by their degrees of freedom it would be 0.88."""
+    drawn = np.random.default_rng(3).chisquare(3, (2000, 10))
+    accepted = drawn < chi2_bound(3, 0.95)
+    nis, count = (drawn * accepted).sum(axis=1), accepted.sum(axis=1)
+    info = {"nis": nis, "nis_dof": 3.0 * count, "nis_expected": count * mean_below_bound(3, 0.95)}
+    # Four sigma of the mean over its 3 degrees of freedom, which the gate only narrows.
+    assert case(info=info).values["nis_mean"] == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / (3 * count.sum())))
+    without = {name: info[name] for name in ("nis", "nis_dof")}
+    assert case(info=without).values["nis_mean"] == pytest.approx(0.877, abs=0.01)
+
+
+def test_steps_that_say_nothing_of_a_gate_are_held_against_their_degrees_of_freedom(case):
+    info = {"nis": np.array([3.0, 5.0]), "nis_dof": np.array([3.0, 6.0]), "nis_expected": np.array([np.nan, 4.0])}
+    assert case(info=info).values["nis_mean"] == pytest.approx(8.0 / 7.0)
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy import integrate, stats
 
-from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
+from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared, mean_below_bound
 from toolkit.settings import DEFAULTS
 
 HUBER = 1.5
@@ -28,6 +29,20 @@ def test_the_bound_passes_95_percent_of_gaussian_innovations():
     passed = mahalanobis_squared(drawn, covs) < chi2_bound(3, 0.95)
     # The share of 100,000 draws has a standard error of 0.07 %: half a percent is seven of them.
     assert passed.mean() == pytest.approx(0.95, abs=0.005)
+
+
+@pytest.mark.parametrize("dof", [1, 3, 6, 12, 33, 200])
+@pytest.mark.parametrize("probability", [0.5, 0.95, 0.999])
+def test_the_mean_behind_the_gate_is_the_truncated_densitys(dof, probability):
+    bound = stats.chi2.ppf(probability, dof)
+    moment, _ = integrate.quad(lambda x: x * stats.chi2.pdf(x, dof), 0.0, bound, epsabs=1e-10)
+    assert mean_below_bound(dof, probability) == pytest.approx(moment / probability, rel=1e-7)  # of the integration
+
+
+def test_the_mean_behind_the_gate_is_the_known_share_of_the_degrees_of_freedom():
+    dof = np.array([3, 6, 33])
+    np.testing.assert_allclose(mean_below_bound(dof, 0.95) / dof, [0.877, 0.919, 0.970], atol=5e-4)
+    np.testing.assert_allclose(mean_below_bound(dof, 1.0), dof, rtol=1e-12)  # no gate, nothing truncated
 
 
 def test_the_bound_shuts_out_what_is_not_a_number():

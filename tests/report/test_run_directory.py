@@ -1,7 +1,9 @@
 """A run directory is complete or not there, and never takes the place of somebody else's files."""
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -101,12 +103,101 @@ def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
 
 
 @unrendered
-def test_an_earlier_run_is_replaced_as_a_whole(comparison: Comparison, tmp_path: Path) -> None:
-    write(comparison, tmp_path / "run")
-    (tmp_path / "run" / "left_over.txt").write_text("from the last time")
-    write(comparison, tmp_path / "run")
-    assert not (tmp_path / "run" / "left_over.txt").exists()
+def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, tmp_path: Path) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    first = {path.relative_to(target) for path in target.rglob("*")}
+    # Another page than that of this run stands for one of it, and it has files that the next run has not.
+    (target / "report.html").write_text("<title>drive - vislam report</title>")
+    (target / "trajectories" / "truth.tum").rename(target / "trajectories" / "gone_final.tum")
+    manifest = json.loads((target / "manifest.json").read_text())
+    manifest["files"].append("trajectories/gone_final.tum")
+    (target / "manifest.json").write_text(json.dumps(manifest))
+    write(comparison, target)
+    assert {path.relative_to(target) for path in target.rglob("*")} == first
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@unrendered
+def test_the_manifest_lists_every_file_of_the_run(comparison: Comparison, tmp_path: Path) -> None:
+    write(comparison, tmp_path / "run")
+    files = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    assert read_manifest(tmp_path / "run" / "manifest.json").files == tuple(sorted(files))
+
+
+@pytest.mark.parametrize("of_an_earlier_version", [False, True])
+@pytest.mark.parametrize(
+    "name", ["notes.txt", "figures/top_view_for_the_paper.png", "raw/imu.csv", "trajectories/other.tum", "report.html"]
+)
+@unrendered
+def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
+    comparison: Comparison, tmp_path: Path, name: str, of_an_earlier_version: bool
+) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    if of_an_earlier_version:
+        manifest = json.loads((target / "manifest.json").read_text())
+        del manifest["files"]
+        (target / "manifest.json").write_text(json.dumps(manifest))
+    check_run_directory(target)
+    (target / name).parent.mkdir(exist_ok=True)
+    (target / name).write_text("years of work")
+    first = name.partition("/")[0] if name.startswith("raw") else name
+    with pytest.raises(OutputError, match=f"holds other files, as {re.escape(first)},"):
+        check_run_directory(target)
+    with pytest.raises(OutputError, match="would be lost"):
+        write(comparison, target)
+    assert (target / name).read_text() == "years of work"
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@unrendered
+def test_a_link_in_a_run_directory_is_not_followed_nor_lost(comparison: Comparison, tmp_path: Path) -> None:
+    write(comparison, tmp_path / "run")
+    (tmp_path / "run" / "report.md").unlink()
+    (tmp_path / "mine.md").write_text("mine")
+    (tmp_path / "run" / "report.md").symlink_to(tmp_path / "mine.md")
+    with pytest.raises(OutputError, match=r"report\.md"):
+        check_run_directory(tmp_path / "run")
+
+
+@unrendered
+def test_a_file_that_comes_while_the_run_is_written_is_not_lost(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "run"
+    write(comparison, target)
+    report_text = run_directory.report_text
+
+    def meanwhile(*given: Any) -> str:
+        (target / "notes.txt").write_text("just now")
+        return report_text(*given)
+
+    monkeypatch.setattr(run_directory, "report_text", meanwhile)
+    with pytest.raises(OutputError, match=r"notes\.txt"):
+        write(comparison, target)
+    assert (target / "notes.txt").read_text() == "just now"
+    assert (target / "metrics.json").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@unrendered
+def test_no_directory_is_left_above_a_run_that_failed(
+    comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_directory, "drawn", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write(comparison, tmp_path / "runs" / "of" / "today")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_too_long_is_refused_before_anything_runs(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="too long"):
+        check_run_directory(tmp_path / ("long" * 70))
+    assert list(tmp_path.iterdir()) == []
 
 
 @unrendered

@@ -1,19 +1,29 @@
 """The command ``vislam``: one module a subcommand, arguments only; whatever is slow to import is imported to run."""
 
+import io
 import os
 import signal
 import sys
+import time
+import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from toolkit.cli import baseline, check, check_data, compare, export, list_parts, report, simulate
 from toolkit.cli.arguments import Parser, ShowVersion, epilog
-from toolkit.errors import VislamError
+from toolkit.errors import OutputError, VislamError, printable
 
+# A defect and a lack of the system's means, as sysexits.h numbers them.
+_DEFECT, _SYSTEM = 70, 71
 _INTERRUPTED = 130
 # 128 + SIGPIPE, as the shell reports any program whose reader went away.
 _READER_GONE = 141
+_ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+# Within this after the first, further signals let it clean up; one that comes later interrupts again, for the first may
+# have come where Python cannot raise it.
+_PATIENCE_S = 10.0
+_WITH_TRACEBACK = "VISLAM_TRACEBACK"
 
 
 def parser() -> Parser:
@@ -31,44 +41,106 @@ def parser() -> Parser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status; any expected trouble is one line on stderr."""
+    """Run the command line and return its exit status; any trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    _prepare_streams()
     try:
-        with _termination_as_interrupt():
-            options = parser().parse_args(given)
-            options.command_line = ["vislam", *given]
-            status: int = options.command(options)
-            # Here and not at the interpreter's end, where a closed pipe looks like a defect.
-            sys.stdout.flush()
-            return status
+        with _ended_once():
+            return _run(given)
     except VislamError as error:
         return _told(str(error), error.exit_status)
     except KeyboardInterrupt:
         return _told("interrupted; what was not finished is not written", _INTERRUPTED)
     except BrokenPipeError:
         # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_output()
         return _READER_GONE
+    except Exception as error:  # the last resort: whatever it is, it is told in one line
+        return _unexpected(error)
+
+
+def _run(given: list[str]) -> int:
+    try:
+        options = parser().parse_args(given)
+        options.command_line = ["vislam", *given]
+        status: int = options.command(options)
+    except SystemExit:  # argparse leaves this way, after a help text too
+        sys.stdout.flush()
+        raise
+    # Here and not at the interpreter's end, where a closed pipe or a full disk looks like a defect.
+    sys.stdout.flush()
+    return status
+
+
+def _prepare_streams() -> None:
+    """Have characters that the terminal's encoding lacks written as escapes, and text without a reader be lost."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _unexpected(error: Exception) -> int:
+    """Tell in one line what the commands do not foresee, and return its exit status."""
+    if os.environ.get(_WITH_TRACEBACK, "0") not in ("", "0"):
+        traceback.print_exc()
+    if isinstance(error, OSError) and not _output_works():
+        _give_up_output()
+        return _told(f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status)
+    if isinstance(error, MemoryError):
+        return _told("the memory does not suffice; use fewer --workers, or a part of the recording", _SYSTEM)
+    if isinstance(error, OSError):
+        return _told(f"the system refuses to go on: {error}", _SYSTEM)
+    if isinstance(error, UnicodeError):
+        return _told(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
+    kind = type(error).__name__
+    how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
+    return _told(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
+
+
+def _output_works() -> bool:
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return False
+    return True
+
+
+def _give_up_output() -> None:
+    """Send what standard output still holds nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _told(message: str, status: int) -> int:
-    print(f"vislam: error: {' '.join(message.split())}", file=sys.stderr)
+    with suppress(OSError):
+        print(f"vislam: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     return status
 
 
 @contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C, so that what is half-written is cleaned up then, too."""
+def _ended_once() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP like Ctrl-C, and whichever comes first so once: what is half-written is cleaned up.
+
+    A signal that the caller has us ignore, as nohup does, stays ignored.
+    """
+    first: list[float] = []
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
+        if not first or time.monotonic() - first[-1] > _PATIENCE_S:
+            first.append(time.monotonic())
+            raise KeyboardInterrupt
 
+    heard = {number: before for number in _ENDING if (before := signal.getsignal(number)) != signal.SIG_IGN}
     try:
-        before = signal.signal(signal.SIGTERM, interrupt)
+        for number in heard:
+            signal.signal(number, interrupt)
     except ValueError:  # only the main thread may do this; embedded elsewhere, signals are not ours
         yield
         return
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, before in heard.items():
+            signal.signal(number, signal.SIG_DFL if before is None else before)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
-from toolkit.errors import VislamError
+from toolkit.errors import VislamError, no_such, printable
 
 if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
@@ -24,7 +24,10 @@ exit status:
   3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
-  130  interrupted (Ctrl-C or SIGTERM); nothing is left half-written"""
+  70   a defect of vislam itself; VISLAM_TRACEBACK=1 shows where
+  71   the system's means do not suffice: memory, processes, an encoding
+  130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written
+  141  the reader of the output went away"""
 
 
 class UsageError(VislamError):
@@ -46,7 +49,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Leave with status 2 and one line on stderr."""
-        self.exit(2, f"vislam: error: {message} (see {self.prog} --help)\n")
+        self.exit(2, f"vislam: error: {printable(message)} (see {self.prog} --help)\n")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Refuse what is no choice, with the nearest that is."""
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, no_such("choice", str(value), map(str, action.choices)))
 
 
 class ShowVersion(argparse.Action):
@@ -166,5 +174,5 @@ def known_names(kind: str, given: Iterable[str], known: Collection[str]) -> list
     checked = list(given)
     for name in checked:
         if name not in known:
-            raise UsageError(f"no {kind} is called {name}; there are {', '.join(known)}")
+            raise UsageError(no_such(kind, name, known))
     return checked

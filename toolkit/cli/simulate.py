@@ -38,6 +38,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.simulation import SCENARIOS as KNOWN
     from toolkit.simulation import simulate
 
+    vislam_recording.check_folder(options.out)
     scenario = KNOWN[options.scenario]
     if options.duration is not None:
         scenario = replace(scenario, duration_s=options.duration)

@@ -5,7 +5,6 @@ origin. The arrays are compressed and never pickled. A folder is written beside 
 """
 
 import json
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -15,7 +14,8 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from toolkit.errors import DataError, OutputError
+from toolkit.errors import DataError
+from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
 from toolkit.resampling import Pairing
 from toolkit.sequence import (
@@ -74,44 +74,19 @@ def save(sequence: Sequence, directory: Path) -> None:
 
     Raises OutputError where the folder holds anything else or cannot be written.
     """
-    directory = Path(directory)
-    foreign = [entry.name for entry in _entries(directory) if entry.name not in (_TEXT, _ARRAYS)]
-    if foreign:
-        raise OutputError(f"{directory} holds {foreign[0]}, which is no part of a recording; choose another folder")
-    try:
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
-            finished = Path(workshop) / "finished"
-            finished.mkdir()
-            np.savez_compressed(finished / _ARRAYS, **_to_arrays(sequence))
-            text = json.dumps(_to_text(sequence), indent=2, ensure_ascii=False)
-            (finished / _TEXT).write_text(text + "\n", encoding="utf-8")
-            _put_in_place(finished, directory, Path(workshop) / "replaced")
-    except OSError as error:
-        raise OutputError(f"cannot write {directory}: {_cause(directory, error)}; choose another folder") from error
+    with replaced_directory(Path(directory), _written_by_us) as partial:
+        np.savez_compressed(partial / _ARRAYS, **_to_arrays(sequence))
+        text = json.dumps(_to_text(sequence), indent=2, ensure_ascii=False)
+        (partial / _TEXT).write_text(text + "\n", encoding="utf-8")
 
 
-def _cause(directory: Path, error: OSError) -> str:
-    """Return why a folder cannot be written: a file in its path, or the system's error message."""
-    in_the_way = next((parent for parent in directory.parents if parent.is_file()), None)
-    return f"{in_the_way} is a file" if in_the_way else error.strerror or str(error)
+def check_folder(directory: Path) -> None:
+    """Raise OutputError unless a recording can be written to a folder without the loss of anything else."""
+    check_replaceable(directory, _written_by_us)
 
 
-def _entries(directory: Path) -> list[Path]:
-    if directory.exists() and not directory.is_dir():
-        raise OutputError(f"{directory} is a file; choose a folder")
-    return sorted(directory.iterdir()) if directory.exists() else []
-
-
-def _put_in_place(finished: Path, directory: Path, replaced: Path) -> None:
-    if directory.exists():
-        directory.replace(replaced)
-    try:
-        finished.replace(directory)
-    except BaseException:
-        if replaced.exists():
-            replaced.replace(directory)
-        raise
+def _written_by_us(directory: Path) -> frozenset[str]:
+    return frozenset((_TEXT, _ARRAYS) if recognises(directory) else ())
 
 
 def _text_file(path: Path) -> Path:

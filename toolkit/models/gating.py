@@ -6,7 +6,7 @@ the held-out metric, which judges all estimators alike.
 """
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtr, chdtri
 
 from toolkit.geometry import Array, IntArray
 
@@ -29,6 +29,17 @@ MOST_MISMATCHED = 0.5
 def chi2_bound(dof: IntArray | int, probability: float) -> Array:
     """Return the value that chi-square variables with ``dof`` (N,) degrees of freedom stay below so often."""
     return np.asarray(chdtri(dof, 1.0 - probability), dtype=float)
+
+
+def mean_below_bound(dof: IntArray | int, probability: float) -> Array:
+    """Return the mean (N,) of chi-square variables with ``dof`` (N,) degrees of freedom that passed their gate.
+
+    A test that passes below ``q``, the quantile of ``probability``, leaves a truncated variable, whose mean is not
+    ``d`` but ``d F(q; d + 2) / F(q; d)``, F being the distribution function: ``x`` times the density for d is ``d``
+    times that for d + 2. At 95 % that is 0.877 d for d = 3, 0.919 d for 6, 0.97 d for 33.
+    """
+    freedom = np.asarray(dof, dtype=float)
+    return np.asarray(freedom * chdtr(freedom + 2.0, chi2_bound(dof, probability)) / probability, dtype=float)
 
 
 def mahalanobis_squared(residuals: Array, covs: Array) -> Array:

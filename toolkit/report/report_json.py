@@ -10,7 +10,7 @@ from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
+from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
@@ -181,21 +181,15 @@ def _nees(row: Row, comparison: Comparison) -> NeesSeries:
 
 
 def _nis(row: Row, comparison: Comparison) -> NisSeries:
-    """Return each step's NIS over its degrees of freedom with the two-sided 95 % band for as many."""
-    causal, info = row.run.causal, row.run.info
-    if row.output != "causal" or causal is None:
-        raise Unavailable("innovations belong to the causal output")
-    if not {"nis", "nis_dof"} <= info.keys():
-        raise Unavailable("the estimator reports no innovations")
-    nis, dof = info["nis"], info["nis_dof"]
-    given = np.isfinite(nis) & np.isfinite(dof) & (dof > 0.0)
-    if not given.any():
-        raise Unavailable("no step reports an innovation")
-    bands = {int(d): nees_band(int(d)) for d in np.unique(dof[given])}
-    low, high = np.array([bands[int(d)] for d in dof[given]]).T
+    """Return each step's NIS over what is expected of it, with the two-sided 95 % band for its degrees of freedom."""
+    found = nis_over_time(Evaluation(row.run, row.output, comparison.sequence))
+    causal = row.run.causal
+    assert causal is not None, "an output without estimates has no innovations"
+    bands = {d: nees_band(d) for d in np.unique(found.dof).tolist()}
+    low, high = np.array([bands[d] for d in found.dof.tolist()]).T
     return NisSeries(
-        t_s=_seconds(causal.t_ns[given], int(comparison.sequence.frames_t_ns[0])),
-        per_dof=numbers(nis[given] / dof[given]),
+        t_s=_seconds(causal.t_ns[found.rows], int(comparison.sequence.frames_t_ns[0])),
+        per_dof=numbers(found.nis / found.expected),
         low=numbers(low),
         high=numbers(high),
     )

@@ -4,9 +4,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+from msgspec import UNSET
+
 from toolkit.datasets.trajectories import tum
-from toolkit.documents import schema_name, to_line, to_text, told_schema
-from toolkit.estimate import Landmarks, Trajectory
+from toolkit.documents import to_line, to_text
+from toolkit.errors import DataError
+from toolkit.estimate import Landmarks, Output, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.pipeline import Case
@@ -15,22 +19,65 @@ from toolkit.report import report_json
 from toolkit.report.figures import drawn, save
 from toolkit.report.figures.alignment import truth_during
 from toolkit.report.manifest import manifest_document
-from toolkit.report.records import Manifest
+from toolkit.report.records import Manifest, read_manifest
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import metrics_document, seeds_document
 
 METRICS, SEEDS = "metrics.json", "seeds.json"
 REPORT, MANIFEST = "report.json", "manifest.json"
+REPORT_TEXT, PAGE = "report.md", "report.html"
+FOLDERS = ("figures", "landmarks", "trajectories")
+# The figures of the versions that did not list their files; one more a run is named for its estimator.
+_FIGURES = (
+    *("top_all", "errors_over_time", "reprojection", "frame_times"),
+    *("errors_over_seeds", "nees_over_seeds"),
+)
 
 
 def check_run_directory(target: Path) -> None:
-    """Raise OutputError unless a run directory can be written at ``target``."""
-    check_replaceable(target, is_run_directory)
+    """Raise OutputError unless a run directory can be written at ``target`` without the loss of anybody's files."""
+    check_replaceable(target, written_by_us)
 
 
-def is_run_directory(directory: Path) -> bool:
-    """Say whether a directory holds a manifest of ours; many programs write a file of that name."""
-    return told_schema(directory / MANIFEST) == schema_name(Manifest)
+def written_by_us(directory: Path) -> frozenset[str]:
+    """Return what in a directory an earlier run wrote: files by their relative path, folders with a slash behind.
+
+    They are those its manifest lists, or where an earlier version listed none, those that version wrote by its
+    estimators' names; and the page that ``vislam report`` puts beside them. None where there is no manifest of ours:
+    many programs write a file of that name.
+    """
+    try:
+        manifest = read_manifest(directory / MANIFEST)
+    except DataError:
+        return frozenset()
+    files = _files_of_an_earlier_version(manifest) if manifest.files is UNSET else frozenset(manifest.files)
+    page = {PAGE} if _is_page(directory / PAGE) else set()
+    return files | page | {f"{folder}/" for folder in FOLDERS}
+
+
+def _is_page(path: Path) -> bool:
+    """Say whether a file is a page of ours, by its title."""
+    try:
+        with path.open("rb") as file:
+            return b"vislam report</title>" in file.read(4096)
+    except OSError:
+        return False
+
+
+def _files_of_an_earlier_version(manifest: Manifest) -> frozenset[str]:
+    """Return the files of a run whose manifest does not list them."""
+    others = () if manifest.references is UNSET else manifest.references
+    names = (*manifest.estimators, *others)
+    outputs: tuple[Output, ...] = ("causal", "final")
+    figures = (*_FIGURES, *(f"top_{plain_name(name)}" for name in names))
+    return frozenset(
+        (
+            *(METRICS, SEEDS, REPORT, MANIFEST, REPORT_TEXT, report_json.TRUTH_FILE),
+            *(report_json.trajectory_file(name, output) for name in names for output in outputs),
+            *(report_json.landmarks_file(name) for name in names),
+            *(f"figures/{figure}.png" for figure in figures),
+        )
+    )
 
 
 def directories_for(cases: Sequence[Case], out: Path) -> tuple[Path, ...]:
@@ -72,7 +119,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
 
     Raises OutputError where ``target`` cannot be written or holds something else; nothing is left behind then.
     """
-    with replaced_directory(target, is_run_directory) as directory:
+    with replaced_directory(target, written_by_us) as directory:
         if comparison.over_seeds:
             _write_text(directory / SEEDS, to_text(seeds_document(comparison)))
             _write_text(directory / REPORT, to_line(report_json.seeds_report_document(comparison)))
@@ -82,8 +129,15 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             _write_trajectories(comparison, directory)
         (directory / "figures").mkdir()
         captions = save(drawn(comparison), directory / "figures")
-        _write_text(directory / "report.md", report_text(comparison, captions))
-        _write_text(directory / MANIFEST, to_text(manifest_document(comparison, made_by.command, made_by.asked)))
+        _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
+        manifest = manifest_document(comparison, made_by.command, made_by.asked)
+        _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))
+
+
+def _files_in(directory: Path) -> tuple[str, ...]:
+    """Return the files of a run, and its manifest, by their relative paths."""
+    written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
+    return tuple(sorted([*written, MANIFEST]))
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:

@@ -1,4 +1,4 @@
-"""Estimation errors normalised by their stated covariance (NEES), and the chi-square band of a consistent estimator.
+"""Errors (NEES) and innovations (NIS) normalised by their stated covariance, and the bands of a consistent estimator.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
 the normalised estimation error squared (NEES) e^T P^-1 e of a consistent estimator is chi-square distributed.
@@ -18,6 +18,7 @@ from toolkit.sequence import Sequence
 
 POSE_DOF = 6
 BAND_PROBABILITY = 0.95
+INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
 # A prior this improbable under its own covariance is expressed in another world frame than the truth.
 _OTHER_WORLD = 1e-6
 
@@ -51,7 +52,26 @@ class Nees:
     placed: bool
 
 
-def nees_band(dof: int, runs: int = 1) -> tuple[float, float]:
+@dataclass(frozen=True, eq=False)
+class Nis:
+    """The innovations of the frames that report any: their ``rows`` (n,) among the causal estimates, and sums (n,).
+
+    ``expected`` is what a consistent estimator's ``nis`` is on average: ``dof``, or less behind a gate, which takes
+    the largest innovations away.
+    """
+
+    rows: IntArray
+    nis: Array
+    dof: Array
+    expected: Array
+
+    @property
+    def mean(self) -> float:
+        """Return the NIS of the whole run over what is expected of it: 1 where the estimator is consistent."""
+        return float(self.nis.sum() / self.expected.sum())
+
+
+def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:
     """Return the two-sided 95 % band of the mean over ``runs`` of a NEES over its degrees of freedom.
 
     The sum of N independent NEES is chi-square with N times their degrees of freedom.
@@ -61,7 +81,26 @@ def nees_band(dof: int, runs: int = 1) -> tuple[float, float]:
     return low, high
 
 
-def chi2_quantile(probability: float, dof: int) -> float:
+def nis_over_time(evaluation: Evaluation) -> Nis:
+    """Return the innovations a causal output reports, with what is expected of them.
+
+    An estimator that reports no ``nis_expected`` is taken to have no gate. Raises Unavailable where it reports none.
+    """
+    info = evaluation.run.info
+    if evaluation.output != "causal" or evaluation.run.causal is None:
+        raise Unavailable(INNOVATIONS_ARE_CAUSAL)
+    if not {"nis", "nis_dof"} <= info.keys():
+        raise Unavailable("the estimator reports no innovations")
+    nis, dof = info["nis"], info["nis_dof"]
+    expected = info.get("nis_expected", dof)
+    expected = np.where(np.isfinite(expected), expected, dof)
+    rows = np.flatnonzero(np.isfinite(nis) & np.isfinite(dof) & (dof > 0.0) & (expected > 0.0))
+    if not rows.size:
+        raise Unavailable("no step reports an innovation")
+    return Nis(rows, nis[rows], dof[rows], expected[rows])
+
+
+def chi2_quantile(probability: float, dof: float) -> float:
     """Return the value a chi-square variable stays below with the probability."""
     return 2.0 * float(gammaincinv(0.5 * dof, probability))
 

@@ -49,3 +49,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     ]
     cpu: str
     os: str
+    files: (
+        Annotated[tuple[str, ...], Meta(description="that the run wrote, relative to its directory, this one too")]
+        | UnsetType
+    ) = UNSET

@@ -62,7 +62,7 @@ class NisSeries(_Columns, frozen=True, kw_only=True):
     """NIS of each step that reports one."""
 
     t_s: Times
-    per_dof: Annotated[Numbers, Meta(description="over the step's degrees of freedom")]
+    per_dof: Annotated[Numbers, Meta(description="over what is expected of the step: its degrees of freedom, or less")]
     low: Annotated[Numbers, Meta(description="lower end of the 95 % band for as many")]
     high: Annotated[Numbers, Meta(description="upper end of the 95 % band for as many")]
 
