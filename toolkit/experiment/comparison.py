@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from toolkit.experiment.consistency import Consistency, consistency_of
 from toolkit.experiment.statistics import MeanNees, Spread, mean_nees, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Scores, describe
@@ -115,6 +116,18 @@ class Row:
             return self.scores.notes.get(key, "not computed")
         notes = (scored.scores.notes.get(key) for scored in self.good)
         return next((note for note in notes if note), "no run is ok" if not self.good else "not computed")
+
+    @cached_property
+    def consistency(self) -> Consistency | None:
+        """What the only run, however it ended, or the runs that are ok say of the stated uncertainty, or None."""
+        only = self.outcomes[0].outputs.get(self.output) if len(self.outcomes) == 1 else None
+        return consistency_of(self.good if only is None else (only,))
+
+    @property
+    def mark(self) -> str:
+        """Return "overconfident" or "timid" where the stated uncertainty is so, else nothing."""
+        verdict = "consistent" if self.consistency is None else self.consistency.verdict
+        return "" if verdict == "consistent" else verdict
 
     @cached_property
     def mean_nees(self) -> MeanNees | None:

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.metrics import describe, known_metrics
-from toolkit.report.records.metrics import AuditEntry, Metrics, ScoredRun, SequenceRead, Value
+from toolkit.report.records.metrics import AuditEntry, Judged, Metrics, ScoredRun, SequenceRead, Value
 from toolkit.report.records.seeds import LogEntry, MetricOverSeeds, RunOverSeeds, Seeds, SequenceOfSeeds, WholeRuns
 from toolkit.sequence import Sequence
 
@@ -91,7 +91,15 @@ def _run(row: Row) -> ScoredRun:
         metrics=metrics,
         notes={key: notes[key] for key in sorted(notes)},
         log=tuple(row.run.log),
+        consistency=_judged(row),
     )
+
+
+def _judged(row: Row) -> Judged | UnsetType:
+    found = row.consistency
+    if found is None:
+        return UNSET
+    return Judged(verdict=found.verdict, metric=found.metric, mean=found.mean, band=(found.low, found.high))
 
 
 def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
@@ -105,6 +113,7 @@ def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
         metrics={key: _metric(spread, tuple(group.values(key))) for key, spread in spreads.items()},
         notes={key: group.reason(key) for key, spread in spreads.items() if spread is None},
         over_seeds=_whole_runs(group),
+        consistency=_judged(group),
     )
 
 

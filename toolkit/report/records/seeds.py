@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.estimate import Output, Status
-from toolkit.report.records.metrics import ALL_PROMISED, Count, Motion, Notes, Value, check_promised
+from toolkit.report.records.metrics import ALL_PROMISED, Consistency, Count, Motion, Notes, Value, check_promised
 
 
 class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
@@ -60,6 +60,7 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
     metrics: Annotated[dict[str, MetricOverSeeds], ALL_PROMISED]
     notes: Notes
     over_seeds: WholeRuns
+    consistency: Consistency = UNSET
 
     def __post_init__(self) -> None:
         ends: tuple[Status, ...] = ("ok", "diverged", "failed")
