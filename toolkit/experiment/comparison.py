@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from toolkit.experiment.consistency import Consistency, consistency_of
-from toolkit.experiment.statistics import MeanNees, Spread, mean_nees, spread_of
+from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean_nees, quantiles_of_all, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
-from toolkit.metrics import Scores, describe
+from toolkit.metrics import Metric, Scores, describe
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import DEFAULTS, Settings
 
@@ -109,6 +109,16 @@ class Row:
     def spread(self, key: str) -> Spread | None:
         """Return what a metric's values over the runs that are ok say, or None where there is no value."""
         return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)
+
+    def quantiles_of_all(self, metric: Metric) -> QuantilesOfAll | None:
+        """Return a metric's quartiles over all runs, one that is not ok counted as infinitely bad.
+
+        Returns None where runs are ok and none of them has a value, or no value is better than another.
+        """
+        good = [value for scored in self.good if (value := scored.scores.values.get(metric.key)) is not None]
+        if self.good and not good:
+            return None
+        return quantiles_of_all(good, len(self.outcomes) - self.counts["ok"], metric.best)
 
     def reason(self, key: str) -> str:
         """Return why a metric has no value under any seed."""

@@ -7,7 +7,7 @@ from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
-from toolkit.report.table import Columns, explained_metrics, number, shared_values
+from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
@@ -100,6 +100,24 @@ def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
                 yield f"{estimator} {status} under {seeds}{why}"
     if not comparison.all_ok:
         yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
+        yield from _medians_of_all(comparison)
+
+
+def _medians_of_all(comparison: Comparison) -> Iterator[str]:
+    """Yield the median of the first metric over all runs, in which one that did not end well is infinitely bad."""
+    metric = next((metric for metric in shown_metrics(comparison) if metric.best), None)
+    if metric is None:
+        return
+    told = []
+    for row in comparison.lines:
+        found = row.quantiles_of_all(metric)
+        if found is not None:
+            ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
+            median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
+            told.append(f"{row.estimator}{'' if row.label == 'both' else f' {row.output}'} {median} ({ended})")
+    if told:
+        what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
+        yield f"{what}: {'; '.join(told)}"
 
 
 def _marks(comparison: Comparison) -> Iterator[str]:

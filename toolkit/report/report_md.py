@@ -26,9 +26,11 @@ measured its heading and position, which nothing measured. The rungs after it ex
 outside the band is a defect of the estimator or of its noise."""
 _HOW_TO_READ_MANY = f"""\
 Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
-means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric.
+means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
+quartiles over all runs.
 
-- **ok of N**: how many runs ended well. The others are named above and are in no mean.
+- **ok of N**: how many runs ended well. The others are named above and are in no mean; the median over all runs in the
+  notes has them, each as infinitely bad.
 - **std**: the standard deviation of the first metric over the seeds.
 - **NEES band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
   95 % chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their
