@@ -13,10 +13,11 @@ from toolkit.datasets import is_drawn_from_a_seed
 from toolkit.documents import parse, to_text
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.statistics import mean_nees, spread_of
+from toolkit.experiment.statistics import mean_nees, quantiles_of_all, spread_of
 from toolkit.metrics import describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report.figures import over_seeds as figures
+from toolkit.report.messages import note_lines
 from toolkit.report.records import Seeds
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import seeds_document
@@ -69,6 +70,38 @@ def test_a_seed_that_diverged_is_counted_and_in_no_mean(over: Comparison) -> Non
     assert astray.spread("ate_none_m").mean == pytest.approx((3.0 + 5.0 + 6.0) / 3)
     assert astray.values("ate_none_m") == [3.0, 4.0, 5.0, 6.0]
     assert not over.all_ok
+
+
+def test_quartiles_over_all_runs_are_the_sound_ones_where_no_run_is_bad():
+    found = quantiles_of_all([3.0, 1.0, 2.0, 7.0, 5.0], 0, "least")
+    assert (found.lower_quartile, found.median, found.upper_quartile, found.reason) == (2.0, 3.0, 5.0, "")
+    between = quantiles_of_all([1.0, 2.0, 3.0, 4.0], 0, "most")
+    assert (between.lower_quartile, between.median, between.upper_quartile) == (1.75, 2.5, 3.25)
+
+
+def test_a_bad_run_spoils_the_quartiles_it_reaches():
+    one = quantiles_of_all([1.0, 2.0, 3.0, 4.0], 1, "least")
+    assert (one.lower_quartile, one.median, one.upper_quartile) == (2.0, 3.0, 4.0)
+    half = quantiles_of_all([1.0, 2.0, 3.0], 3, "one")
+    assert (half.lower_quartile, half.median, half.upper_quartile) == (2.25, None, None)
+    assert half.reason == "3 of 6 runs did not end well, and each counts as infinitely bad"
+    least = quantiles_of_all([90.0, 95.0, 100.0], 1, "most")  # of a share, the bad run's is the lowest
+    assert (least.lower_quartile, least.median, least.upper_quartile) == (None, 92.5, 96.25)
+    assert quantiles_of_all([1.0], 1, "") is quantiles_of_all([], 0, "least") is None
+
+
+def test_runs_that_ended_badly_are_told_beside_the_means(over: Comparison, document: Document) -> None:
+    astray, broken = (document["runs"][i] for i in (2, 3))
+    assert (astray["ok_share"], broken["ok_share"]) == (0.75, 0.0)
+    # Under the seeds 3, 5 and 6 its ATE is 3, 5 and 6 m; seed 4 diverged.
+    quartiles = astray["metrics"]["ate_none_m"]["quantiles_all"]
+    assert {name: quartiles[name] for name in ("lower_quartile", "median")} == {"lower_quartile": 4.5, "median": 5.5}
+    assert quartiles["upper_quartile"] is None
+    assert quartiles["reason"] == "1 of 4 runs did not end well, and each counts as infinitely bad"
+    assert "quantiles_all" not in astray["metrics"]["ate_se3_m"]  # its sound runs have none
+    assert broken["metrics"]["ate_none_m"]["quantiles_all"]["median"] is None
+    words = "\n".join(note_lines(over))
+    assert "honest final 4.50 m (100 % ok); astray causal 5.50 m (75 % ok); broken final none, 4 of 4 runs" in words
 
 
 def test_an_estimator_without_any_answer_keeps_a_line(over: Comparison) -> None:

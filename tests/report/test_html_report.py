@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from toolkit.errors import DataError, OutputError
-from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
+from toolkit.metrics import Scores
 from toolkit.report.html import write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.page import SCRIPTS, json_in_html, page_text
@@ -22,6 +23,7 @@ from toolkit.report.html.thinning import evenly, running_median, with_peaks
 from toolkit.report.run_directory import MadeBy, write_run
 
 Json = dict[str, Any]
+Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 HOSTILE = "</script><script>window.broken = 1</script><!-- <img src=x onerror=alert(1)> {{ script }} \u2028"
 
 
@@ -195,6 +197,30 @@ def test_an_answer_comes_from_runs_that_are_ok_and_whole() -> None:
     assert (first["answer"], first["row"]) == ("whole", "a")
     assert first["next"] == "next: other, 4 m"
     assert highlights([{**_highlighted(ate=None), "id": "a", "estimator": "mute"}], "twist") == []
+
+
+def _with_figures(name: str, **figures: float | None) -> Json:
+    row = _highlighted(ate=None)
+    return {**row, "id": name, "estimator": name, "metrics": row["metrics"] | figures}
+
+
+def test_most_honest_is_a_contest_of_nees_between_estimators() -> None:
+    one, other = _with_figures("one", nees_pose_mean=3.0), _with_figures("other", nees_pose_mean=0.5)
+    assert [tile["answer"] for tile in highlights([one, other], "twist")] == ["other"]
+    assert highlights([one], "twist") == []
+    assert highlights([one, {**one, "id": "its final answer"}], "twist") == []
+    assert highlights([_with_figures("one", nis_mean=1.0), _with_figures("other", nis_mean=2.0)], "twist") == []
+
+
+def test_the_page_marks_who_is_overconfident(comparison: Comparison, rescored: Rescored, tmp_path: Path) -> None:
+    sure = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 9.0}, {}))
+    (case,) = payload_of([read_run(written(sure, tmp_path / "run"))])["cases"]
+    assert {row["estimator"]: row["mark"] for row in case["rows"]} == {
+        "steady": "overconfident",
+        "astray": "overconfident",
+        "late": "overconfident",
+        "broken": "",
+    }
 
 
 def test_the_earlier_page_is_replaced_or_kept_whole(run_directory: Path, tmp_path: Path) -> None:

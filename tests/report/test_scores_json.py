@@ -9,6 +9,7 @@ import pytest
 from toolkit.documents import parse, to_text
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, describe
+from toolkit.report.messages import note_lines
 from toolkit.report.records.metrics import PROMISED_KEYS, Metrics
 from toolkit.report.scores_json import metrics_document
 
@@ -53,6 +54,23 @@ def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], w
     blind = metrics_document(without_truth)
     assert parse(to_text(blind), Metrics) == blind
     assert blind.sequence.path_m is None
+
+
+def test_the_verdict_on_the_stated_uncertainty_is_told_with_its_figures(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
+    built = json.loads(to_text(metrics_document(timid)))
+    assert parse(to_text(metrics_document(timid)), Metrics) == metrics_document(timid)
+    low, high = built["runs"][0]["consistency"].pop("band")
+    assert (low, high) == (pytest.approx(1.2373 / 6, rel=1e-4), pytest.approx(14.4494 / 6, rel=1e-4))
+    assert built["runs"][0]["consistency"] == {"verdict": "timid", "metric": "nees_pose_mean", "mean": 0.1}
+    assert "consistency" not in built["runs"][-1]  # it failed without an answer
+    words = [line for line in note_lines(timid) if "timid" in line]
+    assert words[0] == (
+        "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 holds 95 % of consistent estimators however "
+        "correlated their errors"
+    )
 
 
 def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:

@@ -92,6 +92,21 @@ def test_the_widest_default_table_fits_100_characters() -> None:
     assert max(map(len, as_text(table).splitlines())) <= 100
 
 
+def test_a_mark_stands_below_how_the_run_ended_and_beside_it_in_markdown() -> None:
+    table = Table((("name",), ("output",), ("status",), ("m",)), (("ekf", "both", "ok", "0.1"),) * 2, 3)
+    marked = table._replace(marks=("overconfident", ""), under=("a remark",))
+    lines = as_text(marked).splitlines()
+    assert lines[2:] == [
+        "ekf   both    ok      0.1",
+        "              overconfident",
+        "ekf   both    ok      0.1",
+        "",
+        "a remark",
+    ]
+    assert "| ok, overconfident |" in as_markdown(marked)
+    assert as_text(marked._replace(marks=())) == as_text(marked._replace(marks=("", "")))
+
+
 def test_a_ladders_changes_stand_under_the_table(comparison: Comparison) -> None:
     laddered = replace(comparison, changes={"steady": "no error growth", "late": "+ the future"})
     table = comparison_table(laddered)

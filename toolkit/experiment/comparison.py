@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from toolkit.experiment.statistics import MeanNees, Spread, mean_nees, spread_of
+from toolkit.experiment.consistency import Consistency, consistency_of
+from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean_nees, quantiles_of_all, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
-from toolkit.metrics import Scores, describe
+from toolkit.metrics import Metric, Scores, describe
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import DEFAULTS, Settings
 
@@ -109,12 +110,34 @@ class Row:
         """Return what a metric's values over the runs that are ok say, or None where there is no value."""
         return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)
 
+    def quantiles_of_all(self, metric: Metric) -> QuantilesOfAll | None:
+        """Return a metric's quartiles over all runs, one that is not ok counted as infinitely bad.
+
+        Returns None where runs are ok and none of them has a value, or no value is better than another.
+        """
+        good = [value for scored in self.good if (value := scored.scores.values.get(metric.key)) is not None]
+        if self.good and not good:
+            return None
+        return quantiles_of_all(good, len(self.outcomes) - self.counts["ok"], metric.best)
+
     def reason(self, key: str) -> str:
         """Return why a metric has no value under any seed."""
         if len(self.outcomes) == 1:
             return self.scores.notes.get(key, "not computed")
         notes = (scored.scores.notes.get(key) for scored in self.good)
         return next((note for note in notes if note), "no run is ok" if not self.good else "not computed")
+
+    @cached_property
+    def consistency(self) -> Consistency | None:
+        """What the only run, however it ended, or the runs that are ok say of the stated uncertainty, or None."""
+        only = self.outcomes[0].outputs.get(self.output) if len(self.outcomes) == 1 else None
+        return consistency_of(self.good if only is None else (only,))
+
+    @property
+    def mark(self) -> str:
+        """Return "overconfident" or "timid" where the stated uncertainty is so, else nothing."""
+        verdict = "consistent" if self.consistency is None else self.consistency.verdict
+        return "" if verdict == "consistent" else verdict
 
     @cached_property
     def mean_nees(self) -> MeanNees | None:

@@ -1,9 +1,12 @@
 """What many seeds say together: every metric's mean, median and spread, and the NEES averaged over the seeds.
 
+A mean is over the runs that ended well; quartiles over all runs have the others in them, as infinitely bad ones.
+
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
 over N independent runs the mean NEES of a consistent estimator stays within the chi-square band for N runs.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,6 +14,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
+from toolkit.metrics._shared.scores import Best
 
 
 @dataclass(frozen=True)
@@ -25,6 +29,26 @@ class Spread:
     lower_quartile: float
     upper_quartile: float
     most: float
+
+
+@dataclass(frozen=True)
+class QuantilesOfAll:
+    """Quartiles over n runs of which ``bad`` did not end well; None where so many are bad that they decide it.
+
+    A run that did not end well counts as infinitely bad: what it scored until then says nothing of where it would go.
+    """
+
+    n: int
+    bad: int
+    lower_quartile: float | None
+    median: float | None
+    upper_quartile: float | None
+
+    @property
+    def reason(self) -> str:
+        """Return why a quartile is None, nothing where none is."""
+        lacking = None in (self.lower_quartile, self.median, self.upper_quartile)
+        return f"{self.bad} of {self.n} runs did not end well, and each counts as infinitely bad" if lacking else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +80,31 @@ def spread_of(values: Iterable[float]) -> Spread | None:
     least, lower, median, upper, most = np.percentile(given, [0.0, 25.0, 50.0, 75.0, 100.0]).tolist()
     std = float(given.std(ddof=1)) if given.size > 1 else None
     return Spread(given.size, float(given.mean()), median, std, least, lower, upper, most)
+
+
+def quantiles_of_all(good: Iterable[float], bad: int, best: Best) -> QuantilesOfAll | None:
+    """Return the quartiles over the values of the good runs and as many bad ones as there are, each infinitely bad.
+
+    Infinitely large, or infinitely small for a metric whose most is best. Returns None where there are no runs, or no
+    value of the metric is better than another.
+    """
+    given = list(good)
+    if best == "" or not (given or bad):
+        return None
+    sign = -1.0 if best == "most" else 1.0
+    ordered = sorted([sign * value for value in given] + [np.inf] * bad)
+    parts = (0.75, 0.5, 0.25) if best == "most" else (0.25, 0.5, 0.75)
+    lower, median, upper = (_quantile(ordered, part) for part in parts)
+    return QuantilesOfAll(len(ordered), bad, *(None if q is None else sign * q for q in (lower, median, upper)))
+
+
+def _quantile(ordered: list[float], part: float) -> float | None:
+    """Return a quantile of ascending values, linear between two of them; None where it is infinite."""
+    place = part * (len(ordered) - 1)
+    below, above = ordered[math.floor(place)], ordered[math.ceil(place)]
+    if math.isinf(above):
+        return None
+    return below + (place - math.floor(place)) * (above - below)
 
 
 def mean_nees(nees: Array) -> MeanNees:

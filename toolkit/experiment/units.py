@@ -11,7 +11,7 @@ from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, repeated, score_run
-from toolkit.metrics._shared.consistency import body_errors, nees_over_time
+from toolkit.metrics._shared.consistency import body_errors, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.progress import Progress
 from toolkit.sequence import Sequence
@@ -37,11 +37,15 @@ class Unit:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """One output's scores, and at each frame (K,) its pose NEES over 6 and its position error, NaN where unknown."""
+    """One output's scores, and at each frame (K,) its pose NEES over 6 and its position error, NaN where unknown.
+
+    ``nis_dof`` is how many degrees of freedom of the mean NIS are independent, None where there is no NIS.
+    """
 
     scores: Scores
     nees_pose: Array
     position_m: Array
+    nis_dof: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +109,14 @@ def _scored(run: Run, output: Output, sequence: Sequence) -> Scored:
             _put(nees_pose, sequence.frames_t_ns, nees.t_ns, nees.pose)
         except Unavailable:
             pass  # the scores have the reason
-    return Scored(score_run(run, output, sequence), nees_pose, position_m)
+    return Scored(score_run(run, output, sequence), nees_pose, position_m, _nis_dof(evaluation))
+
+
+def _nis_dof(evaluation: Evaluation) -> float | None:
+    try:
+        return nis_over_time(evaluation).independent_dof
+    except Unavailable:
+        return None
 
 
 def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) -> None:

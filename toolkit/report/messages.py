@@ -5,13 +5,17 @@ from collections.abc import Callable, Iterator
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.metrics import unavailable
+from toolkit.metrics import metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
-from toolkit.report.table import Columns, explained_metrics, shared_values
+from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
+_MARK = {
+    "overconfident": "overconfident, too sure of itself",
+    "timid": "timid, less sure of itself than it could be",
+}
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
@@ -67,6 +71,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     if not len(comparison.sequence.observations):
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
+    yield from _marks(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -95,6 +100,41 @@ def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
                 yield f"{estimator} {status} under {seeds}{why}"
     if not comparison.all_ok:
         yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
+        yield from _medians_of_all(comparison)
+
+
+def _medians_of_all(comparison: Comparison) -> Iterator[str]:
+    """Yield the median of the first metric over all runs, in which one that did not end well is infinitely bad."""
+    metric = next((metric for metric in shown_metrics(comparison) if metric.best), None)
+    if metric is None:
+        return
+    told = []
+    for row in comparison.lines:
+        found = row.quantiles_of_all(metric)
+        if found is not None:
+            ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
+            median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
+            told.append(f"{row.estimator}{'' if row.label == 'both' else f' {row.output}'} {median} ({ended})")
+    if told:
+        what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
+        yield f"{what}: {'; '.join(told)}"
+
+
+def _marks(comparison: Comparison) -> Iterator[str]:
+    """Yield a line for each row that is marked overconfident or timid: by which figure, against which band."""
+    for row in comparison.lines:
+        found = row.consistency
+        if found is not None and row.mark:
+            name = metrics_called((found.metric,))[0].name
+            whose = row.estimator if row.label == "both" else f"{row.estimator} {row.output}"
+            yield (
+                f"{whose} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
+                f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
+            )
+
+
+def _figure(value: float) -> str:
+    return number(value, 2)
 
 
 def consistency_lines(comparison: Comparison) -> Iterator[str]:
@@ -110,7 +150,7 @@ def consistency_lines(comparison: Comparison) -> Iterator[str]:
         verdict = f"{row.estimator}{{}}: in its band at {nees.in_band_percent:.0f} % of the frames"
         if nees.in_band_percent < _MOSTLY_PERCENT:
             above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
-            how = "too sure of itself" if above >= below else "less sure of itself than it could be"
+            how = _MARK.get(row.mark, "over the whole run no more than errors that last from frame to frame explain")
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
         if verdict not in given:
             given.add(verdict)

@@ -6,14 +6,26 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, remark_lines
 from toolkit.report.table import as_markdown, comparison_table, explained_metrics
 
-_HOW_TO_READ_ONE = """\
+_READ_BEFORE = """\
+Causal and held-out are said of what an estimator is given. Before its first packet, the same for all: with raw IMU
+samples the start, where the recording brings none, is found from about the first 1.5 s of sightings that are not
+withheld, so causal answers of that time rest on a little of their future; and the audit looks for faults in the whole
+recording, withheld tracks included. Its findings are above."""
+_MARKED = """\
+`overconfident` or `timid` beside how a run ended: its errors, or without a truth its innovations, are larger or smaller
+than the uncertainty it states allows; the notes have the figures."""
+_HOW_TO_READ_ONE = f"""\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
 estimator knew at each frame, a **final** line on its answer after the last frame; compare like with like.
 A line named for a file, as in `openvins (est.txt)`, was not run here: what another system made of the recording was
 read from that file and scored by the same rules. An error over half a recording is not half an error: read it beside
 the matched pairs and the coverage above the table, or in it where the rows differ.
 
-{metrics}
+{_MARKED}
+
+{_READ_BEFORE}
+
+{{metrics}}
 
 `metrics.json` has every metric, and for each one that is missing the reason."""
 
@@ -26,9 +38,15 @@ measured its heading and position, which nothing measured. The rungs after it ex
 outside the band is a defect of the estimator or of its noise."""
 _HOW_TO_READ_MANY = f"""\
 Every estimator read the same recording under each seed; the seed draws every error, the trajectory stays. Numbers are
-means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric.
+means over the runs that are ok; `seeds.json` has median, spread and each seed's value of every metric, and the
+quartiles over all runs.
 
-- **ok of N**: how many runs ended well. The others are named above and are in no mean.
+{_MARKED}
+
+{_READ_BEFORE}
+
+- **ok of N**: how many runs ended well. The others are named above and are in no mean; the median over all runs in the
+  notes has them, each as infinitely bad.
 - **std**: the standard deviation of the first metric over the seeds.
 - **NEES band**: the share of the frames at which the pose NEES averaged over the seeds lies within the two-sided
   95 % chi-square band for that many runs: 95 % on average for a consistent estimator. The frames of a run share their

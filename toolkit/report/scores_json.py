@@ -1,15 +1,24 @@
 """The scores of a comparison as records: ``metrics.json`` for one seed, ``seeds.json`` for many."""
 
 import math
+from dataclasses import asdict, fields
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
-from toolkit.metrics import describe, known_metrics
-from toolkit.report.records.metrics import AuditEntry, Metrics, ScoredRun, SequenceRead, Value
-from toolkit.report.records.seeds import LogEntry, MetricOverSeeds, RunOverSeeds, Seeds, SequenceOfSeeds, WholeRuns
+from toolkit.metrics import Metric, describe, known_metrics
+from toolkit.report.records.metrics import AuditEntry, Judged, Metrics, ScoredRun, SequenceRead, Value
+from toolkit.report.records.seeds import (
+    LogEntry,
+    MetricOverSeeds,
+    QuantilesAll,
+    RunOverSeeds,
+    Seeds,
+    SequenceOfSeeds,
+    WholeRuns,
+)
 from toolkit.sequence import Sequence
 
 
@@ -91,46 +100,50 @@ def _run(row: Row) -> ScoredRun:
         metrics=metrics,
         notes={key: notes[key] for key in sorted(notes)},
         log=tuple(row.run.log),
+        consistency=_judged(row),
     )
 
 
+def _judged(row: Row) -> Judged | UnsetType:
+    found = row.consistency
+    if found is None:
+        return UNSET
+    return Judged(verdict=found.verdict, metric=found.metric, mean=found.mean, band=(found.low, found.high))
+
+
 def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
-    spreads = {key: group.spread(key) for key in describe()}
+    metrics = known_metrics()
     return RunOverSeeds(
         estimator=group.estimator,
         output=group.output,
         change=over.changes.get(group.estimator, UNSET),
         status=tuple(outcome.status for outcome in group.outcomes),
         counts=dict(group.counts),
-        metrics={key: _metric(spread, tuple(group.values(key))) for key, spread in spreads.items()},
-        notes={key: group.reason(key) for key, spread in spreads.items() if spread is None},
+        metrics={metric.key: _metric(group, metric) for metric in metrics},
+        notes={metric.key: group.reason(metric.key) for metric in metrics if group.spread(metric.key) is None},
         over_seeds=_whole_runs(group),
+        consistency=_judged(group),
+        ok_share=group.counts["ok"] / len(group.outcomes),
     )
 
 
-def _metric(spread: Spread | None, values: tuple[Value, ...]) -> MetricOverSeeds:
-    if spread is None:
-        return MetricOverSeeds(
-            n=0,
-            mean=None,
-            median=None,
-            std=None,
-            least=None,
-            lower_quartile=None,
-            upper_quartile=None,
-            most=None,
-            values=values,
-        )
-    return MetricOverSeeds(
-        n=spread.n,
-        mean=spread.mean,
-        median=spread.median,
-        std=spread.std,
-        least=spread.least,
-        lower_quartile=spread.lower_quartile,
-        upper_quartile=spread.upper_quartile,
-        most=spread.most,
-        values=values,
+def _metric(group: Row, metric: Metric) -> MetricOverSeeds:
+    spread = group.spread(metric.key)
+    told = (
+        dict.fromkeys((field.name for field in fields(Spread)), None) | {"n": 0} if spread is None else asdict(spread)
+    )
+    return MetricOverSeeds(**told, values=tuple(group.values(metric.key)), quantiles_all=_quantiles_all(group, metric))
+
+
+def _quantiles_all(group: Row, metric: Metric) -> QuantilesAll | UnsetType:
+    found = group.quantiles_of_all(metric)
+    if found is None:
+        return UNSET
+    return QuantilesAll(
+        lower_quartile=found.lower_quartile,
+        median=found.median,
+        upper_quartile=found.upper_quartile,
+        reason=found.reason or UNSET,
     )
 
 

@@ -36,13 +36,15 @@ Columns = None | Literal["all"] | tuple[str, ...]
 class Table(NamedTuple):
     """Headings (one tuple of lines a column), rows of cells, and lines that belong under the table.
 
-    The first ``labels`` columns are words, the others numbers.
+    The first ``labels`` columns are words, the others numbers. ``marks`` has a remark or nothing for each row, which
+    stands with its third cell, how the row's runs ended.
     """
 
     headings: tuple[tuple[str, ...], ...]
     rows: tuple[tuple[str, ...], ...]
     labels: int
     under: tuple[str, ...] = ()
+    marks: tuple[str, ...] = ()
 
 
 class _Column(NamedTuple):
@@ -74,7 +76,8 @@ def comparison_table(comparison: Comparison, columns: Columns = None) -> Table:
     rows = tuple((row.estimator, row.label, *(column.cell(row) for column in chosen)) for row in comparison.lines)
     headings = (("estimator", "", ""), ("output", "", ""), *(column.heading for column in chosen))
     under = change_lines((name, comparison.changes.get(name, "")) for name in comparison.estimators)
-    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under))
+    marks = tuple(row.mark for row in comparison.lines)
+    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under), marks)
 
 
 def _ok_of(comparison: Comparison) -> _Column:
@@ -172,19 +175,36 @@ def number(value: float, decimals: int) -> str:
 
 
 def as_text(table: Table) -> str:
-    """Return the table with aligned columns, words to the left and numbers to the right; nothing is wrapped or cut."""
+    """Return the table with aligned columns, words to the left and numbers to the right; nothing is wrapped or cut.
+
+    A row's mark stands on a line of its own below its third cell, where it widens no column.
+    """
     # Headings as rows, because tabulate makes every column two characters wider than its heading.
     heads = [line for line in zip(*table.headings, strict=True) if any(line)]
     rows = [*heads, SEPARATING_LINE, *table.rows]
     text = tabulate(rows, tablefmt=_PLAIN_TEXT, colalign=_sides(table), disable_numparse=True)
     lines = [line.rstrip() for line in text.splitlines()]
+    if any(table.marks):
+        lines = [*lines[: -len(table.rows)], *_marked(lines[-len(table.rows) :], table)]
     return "\n".join([*lines, *(["", *table.under] if table.under else [])])
+
+
+def _marked(lines: list[str], table: Table) -> Iterator[str]:
+    """Yield the lines of the rows, each followed by its mark if it has one."""
+    names, outputs = (max(len(text) for text in (*table.headings[i], *(row[i] for row in table.rows))) for i in (0, 1))
+    indent = " " * (names + outputs + 2 * len(_CELLS.sep))
+    for line, mark in zip(lines, table.marks, strict=True):
+        yield line
+        if mark:
+            yield indent + mark
 
 
 def as_markdown(table: Table) -> str:
     """Return the table in Markdown; units stand in brackets behind the names."""
     heads = [_in_one_line(lines) for lines in table.headings]
-    text = tabulate(table.rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
+    marks = table.marks or ("",) * len(table.rows)
+    rows = [_with_mark(row, mark) for row, mark in zip(table.rows, marks, strict=True)]
+    text = tabulate(rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
     return "\n\n".join(filter(None, (text, "\n".join(f"- {line}" for line in table.under))))
 
 
@@ -193,6 +213,10 @@ def _in_one_line(heading: tuple[str, ...]) -> str:
     *words, unit = heading
     name = " ".join(filter(None, words)).replace("- ", "-")
     return f"{name} [{unit}]" if unit else name
+
+
+def _with_mark(row: tuple[str, ...], mark: str) -> tuple[str, ...]:
+    return (*row[:2], f"{row[2]}, {mark}", *row[3:]) if mark else row
 
 
 def _sides(table: Table) -> list[Literal["left", "right"]]:

@@ -17,6 +17,7 @@ from toolkit.metrics._shared.scores import Unavailable
 from toolkit.sequence import Sequence
 
 POSE_DOF = 6
+SIGHTING_DOF = 3
 BAND_PROBABILITY = 0.95
 INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
 # A prior this improbable under its own covariance is expressed in another world frame than the truth.
@@ -69,6 +70,16 @@ class Nis:
     def mean(self) -> float:
         """Return the NIS of the whole run over what is expected of it: 1 where the estimator is consistent."""
         return float(self.nis.sum() / self.expected.sum())
+
+    @property
+    def independent_dof(self) -> float:
+        """Return the degrees of freedom of a chi-square variable that scatters, over them, at least as the mean does.
+
+        Frames are independent in a consistent filter. The innovations of one frame share the error of its pose: in the
+        worst case they are one innovation of a stereo sighting, of three degrees of freedom.
+        """
+        weights = self.expected / self.expected.sum()
+        return float(1.0 / np.sum(weights**2 / np.minimum(self.dof, SIGHTING_DOF)))
 
 
 def nees_band(dof: float, runs: int = 1) -> tuple[float, float]:

@@ -11,7 +11,10 @@ Row = dict[str, Any]
 
 
 class _Question(NamedTuple):
-    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and in what words."""
+    """What is asked, of which rows, by which metric (the first that any row has), in what unit, and in what words.
+
+    A ``contest`` has no answer where only one estimator has the metric.
+    """
 
     asks: str
     outputs: tuple[str, ...]
@@ -19,6 +22,7 @@ class _Question(NamedTuple):
     unit: str
     tells: Callable[[str, float], str]
     distance: Callable[[float], float] = abs
+    contest: bool = False
 
 
 def _from_one(value: float) -> float:
@@ -37,9 +41,8 @@ def _held_out(_: str, value: float) -> str:
     return f"{_short(value)} px off the median withheld sighting"
 
 
-def _honesty(key: str, value: float) -> str:
-    what = "pose NEES" if key == "nees_pose_mean" else "NIS"
-    return f"mean {what} {_short(value)}; 1 is honest, more is too sure"
+def _honesty(_: str, value: float) -> str:
+    return f"mean pose NEES {_short(value)}; 1 is honest, more is too sure"
 
 
 def _time(_: str, value: float) -> str:
@@ -57,7 +60,7 @@ def highlights(rows: list[Row], motion: str) -> list[dict[str, str]]:
         _Question("Most accurate at the time (causal)", ("causal", "both"), ate, " m", _error),
         _Question("Most accurate in the end (final)", ("final", "both"), ate, " m", _error),
         _Question("Best on withheld tracks", everyone, ("heldout_reproj_median_px",), " px", _held_out),
-        _Question("Most honest uncertainty", everyone, ("nees_pose_mean", "nis_mean"), "", _honesty, _from_one),
+        _Question("Most honest uncertainty", everyone, ("nees_pose_mean",), "", _honesty, _from_one, contest=True),
         _Question("Fastest", everyone, ("total_s",), " s", _time),
     )
     eligible = list(_eligible(rows))
@@ -79,6 +82,8 @@ def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
         ranked = sorted(given, key=lambda pair: question.distance(pair[1]))
         if ranked:
             (best, value), *others = ranked
+            if question.contest and len({row["estimator"] for row, _ in given}) < 2:
+                return None
             after = next(((row, v) for row, v in others if row["estimator"] != best["estimator"]), None)
             return {
                 "asks": question.asks,

@@ -12,7 +12,7 @@ from toolkit.geometry import Array
 from toolkit.metrics import known_metrics
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.run_files import RunFiles, SeedsFiles, Track
-from toolkit.report.html.seeds_payload import seeds_case
+from toolkit.report.html.seeds_payload import mark_of, seeds_case
 from toolkit.report.html.thinning import MOST_LANDMARKS, MOST_POSES, coordinates, evenly, running_median, thinned
 from toolkit.report.records.report import DrawnMap, DrawnRun, NeesSeries
 
@@ -92,6 +92,7 @@ def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
                 "estimator": name,
                 "output": "both" if name in repeated else run.output,
                 "status": run.status,
+                "mark": mark_of(run.consistency),
                 "colour": colours[name],
                 "change": changes.get(name, ""),
                 "metrics": run.metrics,

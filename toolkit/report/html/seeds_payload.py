@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from msgspec import UNSET, to_builtins
+from msgspec import UNSET, UnsetType, to_builtins
 from msgspec.structs import asdict
 
 from toolkit.report.html.run_files import SeedsFiles
 from toolkit.report.html.thinning import thinned
+from toolkit.report.records.metrics import Judged
 from toolkit.report.records.report import DrawnOverSeeds
 from toolkit.report.records.seeds import RunOverSeeds
 
@@ -39,6 +40,7 @@ def _rows(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json
                 "estimator": run.estimator,
                 "output": run.output,
                 "status": _status(run),
+                "mark": mark_of(run.consistency),
                 "colour": colours[run.estimator],
                 "change": "" if run.change is UNSET else run.change,
                 "metrics": {key: metric.mean for key, metric in run.metrics.items()},
@@ -50,6 +52,11 @@ def _rows(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json
             }
         )
     return rows
+
+
+def mark_of(judged: Judged | UnsetType) -> str:
+    """Return "overconfident" or "timid" where a run is so, nothing where it is consistent or cannot be judged."""
+    return "" if judged is UNSET or judged.verdict == "consistent" else judged.verdict
 
 
 def _status(run: RunOverSeeds) -> str:

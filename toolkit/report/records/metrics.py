@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.estimate import Output, Status
 
@@ -50,6 +50,23 @@ class AuditEntry(Struct, frozen=True, kw_only=True):
     detail: Annotated[str, Meta(description="one sentence")]
 
 
+class Judged(Struct, frozen=True, kw_only=True):
+    """What a run's errors, or its innovations, say of the uncertainty it states."""
+
+    verdict: Annotated[
+        Literal["consistent", "overconfident", "timid"], Meta(description="by where the mean is: in, above, below band")
+    ]
+    metric: Annotated[str, Meta(description="key of the metric it rests on")]
+    mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]
+    band: Annotated[tuple[float, float], Meta(description="of 95 % of consistent estimators")]
+
+
+Consistency = (
+    Annotated[Judged, Meta(description="absent where neither NEES nor NIS can be had, and before it was added")]
+    | UnsetType
+)
+
+
 class ScoredRun(Struct, frozen=True, kw_only=True):
     """One kind of output of one estimator."""
 
@@ -61,6 +78,7 @@ class ScoredRun(Struct, frozen=True, kw_only=True):
     metrics: Annotated[dict[str, Value], ALL_PROMISED]
     notes: Notes
     log: Annotated[tuple[str, ...], Meta(description="what the estimator had to recover from")]
+    consistency: Consistency = UNSET
 
     def __post_init__(self) -> None:
         check_promised(dict(self.metrics))

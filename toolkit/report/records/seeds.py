@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from toolkit.estimate import Output, Status
-from toolkit.report.records.metrics import ALL_PROMISED, Count, Motion, Notes, Value, check_promised
+from toolkit.report.records.metrics import ALL_PROMISED, Consistency, Count, Motion, Notes, Value, check_promised
 
 
 class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
@@ -16,6 +16,19 @@ class SequenceOfSeeds(Struct, frozen=True, kw_only=True):
     frames: Annotated[Count, Meta(description="camera frames")]
     duration_s: Annotated[float, Meta(description="from the first frame to the last", ge=0)]
     motion: Motion
+
+
+class QuantilesAll(Struct, frozen=True, kw_only=True):
+    """Quartiles over all runs, where one that is not ok counts as infinitely bad; null where such runs decide it."""
+
+    lower_quartile: float | None
+    median: float | None
+    upper_quartile: float | None
+    reason: Annotated[str, Meta(description="why a quartile is null")] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        if None in (self.lower_quartile, self.median, self.upper_quartile) and not self.reason:
+            raise ValueError("a quartile over all runs is null, and reason does not say why")
 
 
 class MetricOverSeeds(Struct, frozen=True, kw_only=True):
@@ -30,6 +43,12 @@ class MetricOverSeeds(Struct, frozen=True, kw_only=True):
     upper_quartile: float | None
     most: float | None
     values: Annotated[tuple[Value, ...], Meta(description="one a seed, whatever the run's status")]
+    quantiles_all: (
+        Annotated[
+            QuantilesAll, Meta(description="absent where no value is best, or none was had, and before it was added")
+        ]
+        | UnsetType
+    ) = UNSET
 
     def __post_init__(self) -> None:
         of_any = (self.mean, self.median, self.least, self.lower_quartile, self.upper_quartile, self.most)
@@ -60,6 +79,8 @@ class RunOverSeeds(Struct, frozen=True, kw_only=True):
     metrics: Annotated[dict[str, MetricOverSeeds], ALL_PROMISED]
     notes: Notes
     over_seeds: WholeRuns
+    consistency: Consistency = UNSET
+    ok_share: Annotated[float, Meta(description="of the seeds, from 0 to 1", ge=0, le=1)] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         ends: tuple[Status, ...] = ("ok", "diverged", "failed")

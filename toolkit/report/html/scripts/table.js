@@ -76,7 +76,8 @@ function summaryTable(cases, columns, title) {
     if (i === 0) return el("th", { scope: "row", class: "word" }, swatch(row), el("span", { text: row.estimator }));
     const text = column.text(row);
     if (column.name !== "status") return el("td", { class: "word", text });
-    return el("td", { class: "word" }, el("span", { class: text === "ok" ? "status ok" : "status bad", text }));
+    const mark = row.mark ? [" ", el("span", { class: "status mark", text: row.mark })] : [];
+    return el("td", { class: "word" }, el("span", { class: text === "ok" ? "status ok" : "status bad", text }), ...mark);
   }
 
   function fill() {

@@ -1,0 +1,106 @@
+"""Who is marked overconfident or timid: those off by more than a consistent estimator's run can be, and no others."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.experiment.comparison import Row
+from toolkit.experiment.consistency import consistency_of
+from toolkit.experiment.units import Scored, outcome_of
+from toolkit.metrics import Evaluation, Scores
+from toolkit.metrics._shared.consistency import nis_over_time
+
+NOTHING = np.empty(0)
+
+
+@pytest.fixture
+def make_evaluation() -> Callable[..., Evaluation]:
+    """Return a function that makes an evaluation whose run reports innovations of some freedom in every frame."""
+
+    def make(frames: int, dof: float) -> Evaluation:
+        sequence = load_sequence("drive").truncated(frames)
+        said = Trajectory(sequence.frames_t_ns, np.tile(np.eye(4), (frames, 1, 1)))
+        info = {"nis": np.full(frames, dof), "nis_dof": np.full(frames, dof)}
+        return Evaluation(Run("made-up", "ok", said, said, Landmarks.none(), None, info), "causal", sequence)
+
+    return make
+
+
+def run_of(nees: float | None = None, nis: float | None = None, nis_dof: float | None = None) -> Scored:
+    return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis}), NOTHING, NOTHING, nis_dof)
+
+
+def verdict(*runs: Scored) -> str | None:
+    found = consistency_of(runs)
+    return None if found is None else found.verdict
+
+
+@pytest.mark.parametrize(
+    ("nees", "expected"),
+    [(0.19, "timid"), (0.22, "consistent"), (1.0, "consistent"), (2.3, "consistent"), (2.5, "overconfident")],
+)
+def test_one_run_is_judged_by_the_band_of_one_pose(nees: float, expected: str) -> None:
+    """A textbook's quantiles of six degrees of freedom, 1.237 and 14.449, over 6: 0.206 and 2.408."""
+    assert verdict(run_of(nees)) == expected
+
+
+def test_many_seeds_see_what_one_cannot() -> None:
+    assert verdict(run_of(1.5)) == "consistent"
+    assert verdict(*[run_of(1.5)] * 20) == "overconfident"
+    assert verdict(*[run_of(0.6)] * 20) == "timid"
+    assert verdict(*[run_of(1.1)] * 20) == "consistent"
+
+
+def test_the_errors_decide_where_there_are_any_and_else_the_innovations() -> None:
+    assert verdict(run_of(nees=1.0, nis=1.5, nis_dof=900.0)) == "consistent"
+    assert verdict(run_of(nis=1.5, nis_dof=900.0)) == "overconfident"
+    assert verdict(run_of(nis=0.8, nis_dof=900.0)) == "timid"
+    assert verdict(run_of(nis=1.05, nis_dof=900.0)) == "consistent"
+    assert verdict(run_of(nis=1.5, nis_dof=6.0)) == "consistent"
+    assert verdict(run_of()) is None
+
+
+@pytest.mark.parametrize("alike", [1, 10, 100])
+def test_five_percent_of_consistent_runs_are_marked_at_most_however_long_their_errors_last(alike: int) -> None:
+    """Errors of 100 poses that change every 1, 10 or 100 poses, drawn from the covariance that is stated."""
+    drawn = np.random.default_rng(alike).chisquare(6, (4000, 100 // alike)) / 6.0
+    marked = np.mean([verdict(run_of(float(run.mean()))) != "consistent" for run in drawn])
+    assert marked <= 0.05 + 4.0 * np.sqrt(0.05 * 0.95 / 4000)  # four standard errors of the share
+
+
+def test_innovations_that_share_one_error_count_once_a_frame(make_evaluation: Callable[..., Evaluation]) -> None:
+    """100 frames of 30 sightings each whose NIS is that of one: the mean scatters as 300 degrees of freedom say."""
+    one = np.random.default_rng(5).chisquare(3, (2000, 100))
+    means, dof = (30.0 * one).sum(axis=1) / (90.0 * 100), nis_over_time(make_evaluation(100, dof=90.0)).independent_dof
+    assert dof == pytest.approx(300.0)
+    assert means.var() == pytest.approx(2.0 / dof, rel=0.15)  # the variance of 2000 draws scatters by 3 %
+    assert nis_over_time(make_evaluation(100, dof=2.0)).independent_dof == pytest.approx(200.0)
+
+
+def test_on_a_drive_the_decoupled_filter_is_marked_and_the_others_are_not(run_estimator: Callable[..., Run]) -> None:
+    """README's table: pose NEES of 37096, 0.51 and 1.08."""
+    sequence = load_sequence("drive", seed=0)
+    marks = {}
+    for name in ("ekf", "dead-reckoning", "batch"):
+        outcome = outcome_of(run_estimator(name, sequence), sequence, 0)
+        marks[name] = {output: Row(output, (outcome,)).mark for output in outcome.outputs}
+        assert outcome.status == "ok"
+    assert marks == {
+        "ekf": {"causal": "overconfident", "final": "overconfident"},
+        "dead-reckoning": {"causal": "", "final": ""},
+        "batch": {"final": ""},
+    }
+
+
+def test_without_truth_innovations_mark_a_filter_that_is_told_half_the_noise(
+    run_estimator: Callable[..., Run],
+) -> None:
+    sequence = replace(load_sequence("drive", seed=1).truncated(60), truth=None)
+    rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 / 4.0)
+    for name, told, expected in (("sound", sequence, ""), ("told", replace(sequence, rig=rig), "overconfident")):
+        outcome = outcome_of(run_estimator("msckf-fej", told), told, 1)
+        assert Row("causal", (outcome,)).mark == expected, name
