@@ -16,6 +16,7 @@ import msgspec
 from msgspec import inspect
 
 from toolkit.errors import DataError, VislamError
+from toolkit.inputs import read_input
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
@@ -56,11 +57,11 @@ def read(
     document, what is wrong there, and ``remedy``.
     """
     try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise error(f"{path} is missing; {remedy}") from None
-    except OSError as why:
-        raise error(f"{path} cannot be read ({why.strerror or why}); {remedy}") from why
+        content = read_input(path)
+    except DataError as why:
+        if isinstance(why.__cause__, FileNotFoundError):
+            raise error(f"{path} is missing; {remedy}") from None
+        raise error(str(why)) from why
     try:
         return parse(content, record)
     except DataError as why:

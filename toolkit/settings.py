@@ -13,7 +13,8 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import VislamError, did_you_mean
+from toolkit.errors import DataError, VislamError, did_you_mean
+from toolkit.inputs import read_text_input
 
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Scalar = bool | int | float | str
@@ -131,10 +132,10 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the nested values of a TOML file; raise SettingsError where it cannot be read."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror}); name a TOML file") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        return tomllib.loads(read_text_input(path, "settings are TOML"))
+    except DataError as error:
+        raise SettingsError(str(error)) from error
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise SettingsError(f"{path}: is not TOML ({error})") from error
 
 

@@ -1,11 +1,15 @@
 """Every kind of trouble has its exit status and one line on stderr, and leaves nothing half-written."""
 
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -13,6 +17,7 @@ from toolkit import runner
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
+ROOT = Path(__file__).parents[2]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
 
@@ -111,6 +116,120 @@ def test_nothing_but_results_is_written_when_all_is_well(vislam: Vislam, capsys:
     assert told.err == ""
     assert "results: run\n" in told.out
     assert [path.name for path in Path().iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("words", [("list",), ("--help",), ("--version",), ("compare", "--help")])
+def test_an_output_on_a_full_disk_is_4_in_one_line(words: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w") as full:
+        told = _vislam(*words, stdout=full)
+    assert told.stderr.startswith("vislam: error: the standard output cannot be written")
+    assert told.stderr.count("\n") == 1
+    assert told.returncode == 4
+
+
+def test_closed_streams_are_no_trouble() -> None:
+    program = f"exec {sys.executable} -m toolkit.cli list >&- 2>&-"
+    assert subprocess.run(["sh", "-c", program], check=False, timeout=60).returncode == 0
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_a_name_that_is_no_text_is_told_in_any_encoding(encoding: str, tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9 \xe2\x82\xac.npz")
+    told = _vislam("check-data", str(tmp_path / name), environment={"LC_ALL": "C", "PYTHONIOENCODING": encoding})
+    assert told.returncode == 3
+    assert told.stderr.count("\n") == 1
+    assert "caf\\udce9" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "says"),
+    [
+        (MemoryError(), 71, "memory"),
+        (OSError(24, "Too many open files"), 71, "Too many open files"),
+        (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), 71, "rename it"),
+        (ZeroDivisionError("float division\nby zero"), 70, "a defect of vislam"),
+        (SystemError("\x1b[2J"), 70, "\\x1b[2J"),
+    ],
+)
+def test_whatever_nobody_foresaw_is_one_line_with_a_documented_status(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int, says: str
+) -> None:
+    monkeypatch.setattr(runner, "run", _raiser(error))
+    monkeypatch.delenv("VISLAM_TRACEBACK", raising=False)
+    assert vislam(*QUICK, "--out", "run") == status
+    assert says in one_line()
+    assert list(Path().iterdir()) == []
+
+
+def test_the_place_of_a_defect_is_shown_when_asked_for(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner, "run", _raiser(ZeroDivisionError()))
+    monkeypatch.setenv("VISLAM_TRACEBACK", "1")
+    assert vislam(*QUICK, "--out", "run") == 70
+    assert "in _raise" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM",), ("SIGHUP",), ("SIGTERM", "SIGINT", "SIGHUP")])
+def test_signals_leave_no_file_and_no_process(tmp_path: Path, signals: tuple[str, ...]) -> None:
+    words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "deep/down")
+    running = subprocess.Popen(
+        [sys.executable, "-m", "toolkit.cli", *words],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    _wait_until(lambda: len(_group(running.pid)) > 2)
+    for name in signals:
+        os.kill(running.pid, getattr(signal, name))
+        time.sleep(0.05)
+    _, told = running.communicate(timeout=30)
+    assert told == "vislam: error: interrupted; what was not finished is not written\n"
+    assert running.returncode == 130
+    assert list(tmp_path.iterdir()) == []
+    _wait_until(lambda: not _group(running.pid))
+
+
+def _group(group: int) -> list[int]:
+    """Return the living processes of a group."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _parent, of_group = stat.read_text().rpartition(")")[2].split()[:3]
+            if int(of_group) == group and state != "Z":
+                found.append(int(stat.parent.name))
+    return found
+
+
+def _wait_until(reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 30.0
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _raiser(error: Exception) -> Callable[..., None]:
+    def _raise(*_: object) -> None:
+        raise error
+
+    return _raise
+
+
+def _vislam(
+    *words: str, stdout: int | IO[str] = subprocess.PIPE, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "toolkit.cli", *words],
+        env={**os.environ, **(environment or {})},
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=60,
+    )
 
 
 def _never(*_: object) -> None:

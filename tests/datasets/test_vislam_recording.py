@@ -187,8 +187,8 @@ def wrong_frame(arrays: dict[str, Any]) -> None:
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no text": (lambda f: (f / "recording.json").unlink(), "does not exist"),
-    "no arrays": (lambda f: (f / "recording.npz").unlink(), "does not exist"),
+    "no text": (lambda f: (f / "recording.json").unlink(), "No such file"),
+    "no arrays": (lambda f: (f / "recording.npz").unlink(), "No such file"),
     "text cut short": (lambda f: (f / "recording.json").write_text('{"schema": "vislam'), "not JSON"),
     "text in another encoding": (lambda f: (f / "recording.json").write_bytes(b'{"name": "\xff"}'), "not JSON"),
     "text is a list": (lambda f: (f / "recording.json").write_text("[]"), "schema is None"),
@@ -208,7 +208,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no archive": (lambda f: (f / "recording.npz").write_text("hello"), "damaged"),
     "empty archive": (lambda f: (f / "recording.npz").write_bytes(b""), "damaged"),
     "a bare array": (lambda f: np.save((f / "recording.npz").open("wb"), np.eye(3)), "damaged"),
-    "pickled array": (edit_arrays(lambda a: a.update(motion_values=np.array([{}], dtype=object))), "damaged"),
+    "pickled array": (edit_arrays(lambda a: a.update(motion_values=np.array([{}], dtype=object))), "never unpickled"),
     "missing array": (edit_arrays(lambda a: a.pop("frames_t_ns")), "frames_t_ns is missing"),
     "missing truth": (edit_arrays(lambda a: a.pop("truth_T_world_imu")), "truth_T_world_imu is missing"),
     "motion of five columns": (

@@ -1,5 +1,6 @@
 """The command ``vislam``: one module a subcommand, arguments only; whatever is slow to import is imported to run."""
 
+import errno
 import io
 import os
 import signal
@@ -23,6 +24,8 @@ _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 # Within this after the first, further signals let it clean up; one that comes later interrupts again, for the first may
 # have come where Python cannot raise it.
 _PATIENCE_S = 10.0
+# What writing fails with; of a file such an error is an OutputError already, so that here it is the output's.
+_NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 
 
@@ -44,9 +47,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
+    with _ended_once():
+        return _guarded(given)
+
+
+def _guarded(given: list[str]) -> int:
     try:
-        with _ended_once():
-            return _run(given)
+        return _run(given)
     except VislamError as error:
         return _told(str(error), error.exit_status)
     except KeyboardInterrupt:
@@ -86,7 +93,7 @@ def _unexpected(error: Exception) -> int:
     """Tell in one line what the commands do not foresee, and return its exit status."""
     if os.environ.get(_WITH_TRACEBACK, "0") not in ("", "0"):
         traceback.print_exc()
-    if isinstance(error, OSError) and not _output_works():
+    if isinstance(error, OSError) and error.filename is None and error.errno in _NOT_WRITTEN:
         _give_up_output()
         return _told(f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status)
     if isinstance(error, MemoryError):
@@ -98,14 +105,6 @@ def _unexpected(error: Exception) -> int:
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
     return _told(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
-
-
-def _output_works() -> bool:
-    try:
-        sys.stdout.flush()
-    except OSError:
-        return False
-    return True
 
 
 def _give_up_output() -> None:
@@ -142,5 +141,7 @@ def _ended_once() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, before in heard.items():
-            signal.signal(number, signal.SIG_DFL if before is None else before)
+        # On the way out after a signal further ones stay harmless: the interpreter, too, cleans up at its end.
+        if not first:
+            for number, before in heard.items():
+                signal.signal(number, signal.SIG_DFL if before is None else before)

@@ -1,6 +1,7 @@
 """What the subcommands share: the parser, the kinds of arguments and the exit statuses."""
 
 import argparse
+import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 from toolkit.errors import VislamError, no_such, printable
 
 if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
@@ -50,6 +53,11 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Leave with status 2 and one line on stderr."""
         self.exit(2, f"vislam: error: {printable(message)} (see {self.prog} --help)\n")
+
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        """Print a help text, and not as argparse does, which keeps a full disk to itself."""
+        if message:
+            (file or sys.stderr).write(message)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse what is no choice, with the nearest that is."""

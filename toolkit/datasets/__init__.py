@@ -15,8 +15,9 @@ from types import ModuleType
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from toolkit.discovery import MissingDependency, announced, modules_in
-from toolkit.errors import DataError
+from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
+from toolkit.inputs import is_regular, open_input, unreadable
 from toolkit.sequence import Sequence
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
@@ -158,7 +159,7 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
     for reader in _readers().values():
         if reader.recognises(path):
             return reader
-    empty = path.is_file() and path.stat().st_size == 0
+    empty = is_regular(path) and path.stat().st_size == 0
     what = "the file is empty and so of no known format" if empty else "its content is of no known format"
     lacking = "".join(f"; {name} is unavailable: {why}" for name, why in unavailable().items())
     raise DataError(f"{source}: {what}; there are {', '.join(formats())}{lacking}")
@@ -169,9 +170,12 @@ def _check_readable(path: Path, source: str) -> None:
         if path.is_dir():
             next(path.iterdir(), None)
         else:
-            path.open("rb").close()
-    except FileNotFoundError as error:
-        names = ", ".join(built_in_names())
-        raise DataError(f"{source}: no such file or directory, and the built-in sequences are {names}") from error
+            open_input(path).close()
     except OSError as error:
-        raise DataError(f"{source}: cannot be read ({error.strerror}); check the path and its permissions") from error
+        raise DataError(unreadable(path, error)) from error
+    except DataError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        names = built_in_names()
+        near = did_you_mean(source, names) or f", and the built-in sequences are {', '.join(names)}"
+        raise DataError(f"{source}: no such file or directory{near}") from error

@@ -22,6 +22,7 @@ from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import IntArray, se3, se3_inverse
+from toolkit.inputs import read_input, read_text_input
 from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
 
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
@@ -50,8 +51,8 @@ def recognises(path: Path) -> bool:
     if features is not None and b"feature_id" in first_line(features):
         return True
     try:
-        return b'"cam0"' in (path / _CALIBRATION).read_bytes()
-    except OSError:
+        return b'"cam0"' in read_input(path / _CALIBRATION)
+    except DataError:
         return False
 
 
@@ -102,10 +103,8 @@ def _tables(folder: Path) -> tuple[Path, Path]:
 
 def _calibration(path: Path) -> Fields:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    except (JSONDecodeError, UnicodeDecodeError) as error:
+        content = json.loads(read_text_input(path, "export it again"))
+    except (JSONDecodeError, RecursionError) as error:
         raise DataError(f"{path}: not valid JSON ({error}); export it again") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a JSON {type(content).__name__}, expected an object; export it again")

@@ -7,6 +7,8 @@ vehicle frame to the world, C_vi = R(theta)^T; with these the truth reprojects t
 0.3-0.8 px (1.9 px indoors), and with any of the alternatives to more.
 """
 
+import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ import numpy.typing as npt
 from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid, observations, stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
+from toolkit.inputs import is_regular, open_input, read_input
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
@@ -34,9 +37,9 @@ _MOTION_CAPTURE_FACTS = (
 
 def recognises(path: Path) -> bool:
     """Say whether the path is a Matlab file of any version."""
-    if not path.is_file():
+    if not is_regular(path):
         return False
-    with path.open("rb") as stream:
+    with open_input(path) as stream:
         return stream.read(6) == b"MATLAB"
 
 
@@ -67,10 +70,11 @@ def load(path: Path) -> Sequence:
 def _read_matlab(path: Path) -> dict[str, npt.NDArray[np.generic]]:
     import scipy.io
 
+    content = io.BytesIO(read_input(path))
     try:
-        variables = scipy.io.loadmat(path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged bytes the checks of the fields speak
+            variables = scipy.io.loadmat(content)  # type: ignore[arg-type]  # a file object is allowed
     except NotImplementedError as error:
         raise DataError(f"{path}: Matlab 7.3 files are not read; save it with -v7") from error
     except Exception as error:  # scipy's reader meets damaged bytes with errors of many kinds

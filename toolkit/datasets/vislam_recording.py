@@ -5,8 +5,6 @@ origin. The arrays are compressed and never pickled. A folder is written beside 
 """
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,9 +12,11 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
+from toolkit.datasets.io.npz_archive import opened
 from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
+from toolkit.inputs import open_input, read_text_input
 from toolkit.resampling import Pairing
 from toolkit.sequence import (
     ImuNoise,
@@ -43,9 +43,9 @@ Text = dict[str, Any]
 def recognises(path: Path) -> bool:
     """Say whether the path is a recording of this format: its folder, or the JSON file in it; damaged ones too."""
     try:
-        with _text_file(path).open("rb") as file:
+        with open_input(_text_file(path)) as file:
             return b'"vislam.recording/' in file.read(4096)
-    except OSError:
+    except (DataError, OSError):
         return False
 
 
@@ -149,12 +149,8 @@ def _to_arrays(sequence: Sequence) -> dict[str, Any]:
 
 def _read_text(file: Path) -> Text:
     try:
-        text = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"{file} does not exist; give the folder of a recording") from error
-    except OSError as error:
-        raise DataError(f"{file} cannot be read: {error.strerror or error}") from error
-    except ValueError as error:
+        text = json.loads(read_text_input(file, "it is not JSON; copy or save the recording again"))
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{file} is not JSON ({error}); copy or save the recording again") from error
     if not isinstance(text, dict) or text.get("schema") != SCHEMA:
         schema = text.get("schema") if isinstance(text, dict) else None
@@ -163,14 +159,8 @@ def _read_text(file: Path) -> Text:
 
 
 def _read_arrays(file: Path) -> Arrays:
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise DataError(f"{file} does not exist; copy it together with {_TEXT}") from error
-    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        reason = str(error).partition("\n")[0]
-        raise DataError(f"{file} is damaged or not an archive of plain arrays ({reason}); copy it again") from error
+    with opened(file) as archive:
+        return archive.fields().arrays
 
 
 def _sequence(text: Text, arrays: Arrays) -> Sequence:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import did_you_mean
+from toolkit.errors import DataError, did_you_mean
+from toolkit.inputs import read_text_input
 from toolkit.settings import Settings, SettingsError, as_values, read_toml, settings_of
 
 # The table of a configuration that says what to compare; all others are settings.
@@ -65,12 +66,10 @@ def as_manifest(configuration: Configuration) -> dict[str, Any]:
 
 def _manifest(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(
-            f"{path}: cannot be read ({error.strerror}); name a manifest.json or a TOML file"
-        ) from error
-    except ValueError as error:
+        document = json.loads(read_text_input(path, "name a manifest.json or a TOML file"))
+    except DataError as error:
+        raise SettingsError(str(error)) from error
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: is not JSON ({error})") from error
     if not isinstance(document, dict) or not isinstance(document.get("settings"), dict):
         raise SettingsError(f"{path}: holds no settings; name the manifest.json of a comparison, or a TOML file")

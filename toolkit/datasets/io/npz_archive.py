@@ -20,9 +20,12 @@ import numpy.typing as npt
 from toolkit.datasets.io.fields import Fields, check_numeric, check_shape
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
+from toolkit.inputs import is_regular, open_input
 
 # Small enough for the processor's cache, large enough that the Python around it does not show.
 _CHUNK_BYTES = 1 << 18
+# A dense array of a recording is far smaller: an hour of IMU samples at 1 kHz has 200 MB.
+_MOST_BYTES = 2 << 30
 _ZIP_MAGIC = b"PK\x03\x04"
 _ZIP_HEADER = struct.Struct("<26xHH")
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError, MemoryError)
@@ -62,6 +65,7 @@ class NpzArchive:
         """Stream one array of the given shape, in either memory order; keep what differs from the filler (NaN does)."""
         with self.archive.open(f"{key}.npy") as stream:
             header = self._header(key, stream)
+            check_numeric(self.path, key, header.dtype)
             check_shape(self.path, key, header.shape, shape)
             size, position, value = _kept_entries(stream, header.dtype, filler)
         if size != math.prod(header.shape):
@@ -70,6 +74,8 @@ class NpzArchive:
         return SparseArray(header.shape, indices, value)
 
     def _dense(self, key: str) -> npt.NDArray[np.generic]:
+        with self.archive.open(f"{key}.npy") as stream:
+            self._check_size(key, self._header(key, stream))
         with self.archive.open(f"{key}.npy") as stream:
             try:
                 array: npt.NDArray[np.generic] = np.lib.format.read_array(stream, allow_pickle=False)
@@ -85,32 +91,40 @@ class NpzArchive:
             # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             header = _Header(*read(stream))
-        except ValueError as error:
+        except (ValueError, TypeError, SyntaxError, OverflowError) as error:
             raise DataError(f"{self.path}: {key} has no valid .npy header: {_first_line(error)}") from error
-        check_numeric(self.path, key, header.dtype)
         return header
+
+    def _check_size(self, key: str, header: _Header) -> None:
+        """Raise DataError where a header asks for more memory than its array fills, or than is sensible."""
+        size = math.prod(header.shape) * header.dtype.itemsize
+        stored = self.archive.getinfo(f"{key}.npy").file_size
+        if header.dtype.kind != "O" and size > stored:
+            raise DataError(f"{self.path}: {key} ends after {stored} of {size} bytes; save it again")
+        if size > _MOST_BYTES:
+            raise DataError(
+                f"{self.path}: {key} takes {size / 1e9:.1f} GB, more than is read at once; cut the recording"
+            )
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[NpzArchive]:
     """Open an archive; damage met while it is open is raised as DataError."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
             yield NpzArchive(path, archive)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except _DAMAGE as error:
+    except (OSError, *_DAMAGE) as error:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
 
 
 def glance(path: Path) -> set[str]:
     """Return the keys of an archive without reading arrays; of a damaged one its first key, of anything else none."""
-    if not path.is_file():
+    if not is_regular(path):
         return set()
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
             return set(_keys(archive))
-    except _DAMAGE:
+    except (OSError, *_DAMAGE):
         return _first_key(path)
 
 

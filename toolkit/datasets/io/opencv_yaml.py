@@ -10,6 +10,7 @@ import numpy as np
 
 from toolkit.datasets.io.fields import Fields
 from toolkit.errors import DataError
+from toolkit.inputs import read_text_input
 
 
 def read_fields(path: Path) -> Fields:
@@ -17,12 +18,7 @@ def read_fields(path: Path) -> Fields:
 
     Raises DataError, naming the line, where the file cannot be read or holds any other form.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file; copy it again") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    text = read_text_input(path, "copy it again")
     found: dict[str, np.ndarray] = {}
     parents: list[tuple[int, str]] = []
     for number, indent, statement in _statements(path, text):

@@ -13,24 +13,26 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
+from toolkit.inputs import is_regular, open_input, read_input, read_text_input
 
+_LONGEST_LINE = 1 << 16
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
 def find_table(folder: Path, name: str) -> Path | None:
     """Return the path of a table in a folder, ``name`` or ``name.gz``, or None where there is neither."""
     candidates = (folder / name, folder / f"{name}.gz")
-    return next((path for path in candidates if path.is_file()), None)
+    return next((path for path in candidates if is_regular(path)), None)
 
 
 def first_line(path: Path) -> bytes:
     """Return the first line of a table, or nothing where it cannot be read."""
     try:
-        with path.open("rb") as raw:
+        with open_input(path) as raw:
             zipped = raw.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
         with gzip.open(path) if zipped else path.open("rb") as stream:
-            return stream.readline()
-    except (OSError, EOFError, zlib.error):
+            return stream.readline(_LONGEST_LINE)
+    except (DataError, OSError, EOFError, zlib.error):
         return b""
 
 
@@ -55,13 +57,11 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
 
 
 def _content(path: Path) -> bytes:
+    content = read_input(path)
     try:
-        content = path.read_bytes()
         return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"{path}: damaged or truncated gzip ({error}); copy it again") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
 
 
 def _first_sentence(error: ValueError) -> str:
@@ -99,12 +99,7 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
 
     Whole numbers all the way: today's nanoseconds as doubles are off by up to 128.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()[header_lines:]
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file; copy it again") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    lines = read_text_input(path, "copy it again").splitlines()[header_lines:]
     entries = [line.partition(",")[0].strip() for line in lines if line.strip() and not line.startswith("#")]
     if not entries:
         raise DataError(f"{path}: holds no rows; copy the whole recording")

@@ -9,6 +9,7 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
+from toolkit.inputs import read_text_input
 from toolkit.resampling import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1
@@ -73,12 +74,7 @@ def read_rows(path: Path, kind: str) -> Rows:
 
     ``kind`` describes such a file in an error. Raises DataError where it is missing, empty or not text.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file; {kind}") from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    text = read_text_input(path, kind)
     lines = [(n, line.partition("#")[0].strip()) for n, line in enumerate(text.splitlines(), start=1)]
     lines = [(n, line) for n, line in lines if line]
     commas = bool(lines) and "," in lines[-1][1]

@@ -1,5 +1,6 @@
 """What a run directory holds, read back with nothing but its own files, so that it works on any machine."""
 
+import io
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.estimate import Output
 from toolkit.geometry import Array
+from toolkit.inputs import read_input
 from toolkit.report.records import (
     Manifest,
     Metrics,
@@ -111,11 +113,12 @@ def _landmarks(path: Path) -> Array:
 
 def _numbers(path: Path, columns: int, delimiter: str | None, header_lines: int = 0) -> Array:
     """Read a table (N, columns); it may have no rows, for a run that diverged may leave no finite pose."""
+    content = read_input(path)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-            table = np.loadtxt(path, delimiter=delimiter, skiprows=header_lines, ndmin=2)
-    except (OSError, ValueError) as error:
+            table = np.loadtxt(io.BytesIO(content), delimiter=delimiter, skiprows=header_lines, ndmin=2)
+    except ValueError as error:
         raise DataError(f"{path} cannot be read ({error}); repeat the comparison") from error
     if not table.size:
         return np.empty((0, columns))

@@ -1,0 +1,77 @@
+"""Files that come in, opened in one way: regular files only, and an error that says what stands in the way.
+
+A pipe would be waited for without end, and a device may never end.
+"""
+
+import errno
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from toolkit.errors import DataError
+
+_KINDS = (
+    (stat.S_ISDIR, "it is a directory; name a file"),
+    (stat.S_ISFIFO, "it is a pipe; write it to a regular file first"),
+    (stat.S_ISSOCK, "it is a socket; name a regular file"),
+    (stat.S_ISCHR, "it is a device; name a regular file"),
+    (stat.S_ISBLK, "it is a device; name a regular file"),
+)
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG), "check the path"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "change its permissions"),
+}
+
+
+def open_input(path: Path) -> BinaryIO:
+    """Open a regular file to read its bytes.
+
+    Raises DataError, with the path, the reason and the remedy, where it is none or cannot be read.
+    """
+    try:
+        check_regular(path)
+        return path.open("rb")
+    except OSError as error:
+        raise DataError(unreadable(path, error)) from error
+
+
+def read_input(path: Path) -> bytes:
+    """Return the content of a regular file; raises DataError as :func:`open_input` does."""
+    with open_input(path) as file:
+        try:
+            return file.read()
+        except OSError as error:
+            raise DataError(unreadable(path, error)) from error
+
+
+def read_text_input(path: Path, kind: str) -> str:
+    """Return the text of a regular file in UTF-8, which ``kind`` describes in the error where it is something else.
+
+    Raises DataError as :func:`open_input` does, or where the bytes are no such text.
+    """
+    try:
+        return read_input(path).decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file; {kind}") from error
+
+
+def check_regular(path: Path) -> None:
+    """Raise DataError for a directory, a pipe, a socket or a device; OSError where the path cannot be looked at."""
+    mode = path.stat().st_mode
+    what = next((words for is_of_kind, words in _KINDS if is_of_kind(mode)), None)
+    if what is not None:
+        raise DataError(f"{path}: cannot be read: {what}")
+
+
+def is_regular(path: Path) -> bool:
+    """Say whether a path is a regular file that can be looked at, whatever else stands there."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def unreadable(path: Path, error: OSError) -> str:
+    """Return the message for a file that cannot be read: the reason, and the remedy that goes with it."""
+    remedy = _REMEDIES.get(error.errno or 0, "copy it again")
+    return f"{path}: cannot be read ({error.strerror or error}); {remedy}"
