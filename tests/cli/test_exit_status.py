@@ -43,6 +43,11 @@ def test_a_wrong_command_line_is_2(vislam: Vislam, one_line: OneLine, words: tup
     one_line()
 
 
+def test_a_run_that_is_marked_overconfident_ends_with_0(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("compare", "drive", "--estimators", "ekf", "--max-frames", "60", "--workers", "1") == 0
+    assert "ekf is overconfident" in capsys.readouterr().out
+
+
 def test_a_recording_that_is_not_there_is_3(vislam: Vislam, one_line: OneLine) -> None:
     assert vislam("compare", "no/such/recording.npz", "--estimators", "dead-reckoning") == 3
     assert "no/such/recording.npz" in one_line()

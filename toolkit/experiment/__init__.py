@@ -1,7 +1,7 @@
 """The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or in processes.
 
 Reading order: recording (what is read) -> units (what is run) -> workers (where) -> pipeline -> comparison (what comes
-of it) -> statistics.
+of it) -> statistics -> consistency (whose stated uncertainty cannot be right).
 """
 
 from toolkit.experiment.comparison import Comparison, Record, Row
