@@ -10,8 +10,10 @@ from typing import Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
+from toolkit.report.prose import in_markdown
 
 MISSING = "-"
 _WIDEST_NUMBER = 5
@@ -175,17 +177,18 @@ def as_text(table: Table) -> str:
     """Return the table with aligned columns, words to the left and numbers to the right; nothing is wrapped or cut."""
     # Headings as rows, because tabulate makes every column two characters wider than its heading.
     heads = [line for line in zip(*table.headings, strict=True) if any(line)]
-    rows = [*heads, SEPARATING_LINE, *table.rows]
+    rows = [*heads, SEPARATING_LINE, *(tuple(map(printable, row)) for row in table.rows)]
     text = tabulate(rows, tablefmt=_PLAIN_TEXT, colalign=_sides(table), disable_numparse=True)
     lines = [line.rstrip() for line in text.splitlines()]
-    return "\n".join([*lines, *(["", *table.under] if table.under else [])])
+    return "\n".join([*lines, *(["", *map(printable, table.under)] if table.under else [])])
 
 
 def as_markdown(table: Table) -> str:
     """Return the table in Markdown; units stand in brackets behind the names."""
     heads = [" ".join(filter(None, lines[:-1])) + (f" [{lines[-1]}]" if lines[-1] else "") for lines in table.headings]
-    text = tabulate(table.rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
-    return "\n\n".join(filter(None, (text, "\n".join(f"- {line}" for line in table.under))))
+    rows = [(*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in table.rows]
+    text = tabulate(rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
+    return "\n\n".join(filter(None, (text, "\n".join(f"- {in_markdown(line)}" for line in table.under))))
 
 
 def _sides(table: Table) -> list[Literal["left", "right"]]:
