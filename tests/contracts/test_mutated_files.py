@@ -352,7 +352,7 @@ def test_a_mutated_recording_is_read_or_refused_in_one_line(name: str, happened:
 
 @pytest.mark.parametrize("name", TRAJECTORIES)
 @given(happened=mutations(tuple(RAW)))
-@examples(120)
+@examples(135)
 def test_a_mutated_trajectory_is_read_or_refused_in_one_line(name: str, happened: list[Mutation]) -> None:
     read_or_refused(read_poses, mutated(originals()[name], happened))
 
