@@ -193,7 +193,7 @@ def test_an_extrinsic_written_with_few_decimals_is_made_a_rotation():
     "rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
 )
 def test_an_extrinsic_that_is_no_rigid_motion_is_refused(rotation):
-    with pytest.raises(DataError, match="not a rigid motion"):
+    with pytest.raises(DataError, match=r"not a rigid motion|holds a reflection"):
         replace(RIG, T_imu_cam=se3(rotation, np.zeros(3)))
 
 
@@ -208,3 +208,21 @@ def test_observations_in_any_order_are_sorted_by_frame_then_track():
     np.testing.assert_array_equal(rows.frame, [0, 0, 1, 1])
     np.testing.assert_array_equal(rows.track_id, [3, 5, 1, 2])
     np.testing.assert_array_equal(rows.uv_px[:, 0], [9.0, 3.0, 6.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value"),
+    [
+        ("noise", "gyro_noise_density", np.zeros(3)),
+        ("noise", "velocity_noise_density", np.array([0.1, np.nan, 0.1])),
+        ("rig", "fx_px", 0.0),
+        ("rig", "baseline_m", -0.5),
+        ("rig", "cov_uv_px2", np.zeros((3, 3))),
+        ("rig", "cx_px", np.inf),
+    ],
+)
+def test_a_noise_or_calibration_that_can_be_none_is_named(part: str, key: str, value: object) -> None:
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    sequence = replace(sequence, **{part: replace(getattr(sequence, part), **{key: value})})
+    with pytest.raises(DataError, match=f"{part}.{key}"):
+        next(sequence.packets())

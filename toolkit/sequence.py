@@ -27,6 +27,8 @@ from toolkit.resampling import NS_PER_S, Pairing, cut_at
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
+# Of a recording or a trajectory: names become those of files, of which systems allow 255 bytes.
+LONGEST_NAME = 200
 # A calibration written with three decimals is off by less; a product of doubles is off by no more.
 _MOST_ROTATION_DEFECT, _ORTHONORMAL = 5e-3, 1e-14
 
@@ -55,7 +57,9 @@ def _rigid(T_imu_cam: Array) -> Array:
         return T_imu_cam
     rotation = T_imu_cam[:3, :3]
     defect = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (defect < _MOST_ROTATION_DEFECT and np.linalg.det(rotation) > 0.0):
+    if defect < _MOST_ROTATION_DEFECT and np.linalg.det(rotation) < 0.0:
+        raise DataError("T_imu_cam holds a reflection, not a rotation: the sign of an axis is wrong")
+    if not defect < _MOST_ROTATION_DEFECT:
         raise DataError("T_imu_cam is not a rigid motion: its rotation is not orthonormal; check the calibration")
     if defect < _ORTHONORMAL:
         return T_imu_cam
@@ -359,6 +363,7 @@ def is_held_out(track_ids: IntArray) -> BoolArray:
 def check_runnable(sequence: Sequence) -> None:
     """Raise DataError unless time increases, values are finite and the motion samples span the frames."""
     name, motion = sequence.name, sequence.motion
+    check_stated(sequence)
     if sequence.frame_count < 2:
         raise DataError(f"{name}: {sequence.frame_count} frame(s); an estimator needs at least two")
     for what, t_ns in (("frame", sequence.frames_t_ns), ("motion sample", motion.t_ns)):
@@ -366,17 +371,35 @@ def check_runnable(sequence: Sequence) -> None:
         if backwards.size:
             raise DataError(
                 f"{name}: the stamp of {what} {backwards[0] + 1} is not after the one before it; "
-                "sort or drop it, or let the audit repair it"
+                "sort or drop it in the recording"
             )
     for what, array in (("motion sample", motion.values), ("observation", sequence.observations.uv_px)):
         bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
         if bad.size:
-            raise DataError(
-                f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it, or let the audit repair it"
-            )
+            raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]
     if motion.t_ns.size == 0 or motion.t_ns[0] > first or motion.t_ns[-1] < last:
         raise DataError(f"{name}: the motion samples do not span the frames; cut the frames to the motion's time")
+
+
+def check_stated(sequence: Sequence) -> None:
+    """Raise DataError, which names the field, where a noise, a calibration or a name can be none."""
+    if len(sequence.name) > LONGEST_NAME:
+        raise DataError(f"a name of {len(sequence.name)} characters is too long for a recording; shorten it")
+    rig = sequence.rig
+    positive: dict[str, Array | float] = {f"noise.{key}": value for key, value in vars(sequence.noise).items()}
+    positive |= {f"rig.{key}": getattr(rig, key) for key in ("fx_px", "fy_px", "baseline_m")}
+    for key, value in positive.items():
+        smallest = float(np.min(value))
+        if not (smallest > 0.0 and np.isfinite(value).all()):
+            raise DataError(f"{sequence.name}: {key} is {smallest:g}, expected a positive number; mend the recording")
+    centre = np.array([rig.cx_px, rig.cy_px])
+    fixed = {"rig.cx_px or cy_px": centre, "rig.T_imu_cam": rig.T_imu_cam, "gravity_world": sequence.gravity_world}
+    for key, value in fixed.items():
+        if not np.isfinite(value).all():
+            raise DataError(f"{sequence.name}: {key} is not finite; a calibration needs every value")
+    if not (np.isfinite(rig.cov_uv_px2).all() and (np.linalg.eigvalsh(rig.cov_uv_px2) > 0.0).all()):
+        raise DataError(f"{sequence.name}: rig.cov_uv_px2 is no covariance: its noise must be positive in every axis")
 
 
 def _cut(samples: MotionSamples, frames_t_ns: IntArray) -> Iterator[Motion]:

@@ -215,12 +215,13 @@ def test_a_quaternion_that_is_not_of_unit_length_is_named(tmp_path: Path, trajec
     assert "line 3 has a quaternion that is not of unit length" in complaint(spoiled(tmp_path, name, rows))
 
 
-@pytest.mark.parametrize("word", ["-1", "1.1"])
-def test_a_matrix_that_is_no_rotation_is_named(tmp_path: Path, word: str) -> None:
+@pytest.mark.parametrize(
+    ("word", "what"),
+    [("-1", "holds a reflection, not a rotation"), ("1.1", "does not hold a rotation; expected r11 r12 r13 x")],
+)
+def test_a_matrix_that_is_no_rotation_is_named(tmp_path: Path, word: str, what: str) -> None:
     rows = ["1 0 0 5 0 1 0 6 0 0 1 7", f"{word} 0 0 5 0 1 0 6 0 0 1 7"]
-    assert "line 2 does not hold a rotation; expected r11 r12 r13 x" in complaint(
-        spoiled(tmp_path, "kitti", [row.split() for row in rows])
-    )
+    assert f"line 2 {what}" in complaint(spoiled(tmp_path, "kitti", [row.split() for row in rows]))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,9 @@ import pytest
 
 from toolkit.datasets import course_npz
 from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
 from toolkit.geometry import (
     Array,
     about_z,
@@ -18,6 +20,7 @@ from toolkit.geometry import (
     rotation_from_quaternion,
     se3,
     se3_exp,
+    se3_inverse,
     so3_exp,
 )
 from toolkit.models.noise import pixel_covariance
@@ -213,3 +216,23 @@ def test_truth_without_overlap_names_both_ranges_and_the_cause(shift_s: float, c
 def test_truth_of_another_real_drive_does_not_overlap(real: Callable[[str], Path]) -> None:
     with pytest.raises(DataError, match="do not overlap"):
         with_truth(course_npz.load(real("ucsd/03.npz")), load_truth(real("kitti00/gt_imu.tum")))
+
+
+@pytest.mark.parametrize(("whole", "remedy"), [(False, "conjugate them"), (True, "invert each one")])
+def test_an_inverted_trajectory_is_called_inverted_whatever_order_fits_by_chance(
+    tmp_path: Path, whole: bool, remedy: str
+) -> None:
+    """A vehicle that turns about the vertical only, as on a plane."""
+    yaw = 2.0 * np.sin(np.linspace(0.0, 6.0, 40))
+    R_world_imu = so3_exp(yaw[:, None] * np.array([0.0, 0.0, 1.0]))
+    steps = R_world_imu[:, :, 0]
+    T_world_imu = se3(R_world_imu, np.cumsum(steps, axis=0))
+    inverse = se3_inverse(T_world_imu)
+    stated = inverse if whole else se3(inverse[:, :3, :3], T_world_imu[:, :3, 3])
+    t_ns = np.arange(40, dtype=np.int64) * 100_000_000
+    path = tmp_path / "inverted.tum"
+    path.write_text(tum.text(Trajectory(t_ns, stated)))
+    with pytest.raises(DataError, match=remedy):
+        load_truth(path)
+    path.write_text(tum.text(Trajectory(t_ns, T_world_imu)))
+    load_truth(path)

@@ -11,7 +11,7 @@ from functools import cache
 from graphlib import TopologicalSorter
 
 from toolkit.audit.fault import Evidence, Fault, Finding, Symptom
-from toolkit.errors import VislamError
+from toolkit.errors import VislamError, no_such
 from toolkit.sequence import Sequence
 
 __all__ = ["Audit", "Finding", "audit", "faults"]
@@ -32,7 +32,7 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     """
     unknown = keep - faults().keys()
     if unknown:
-        raise VislamError(f"no such fault: {', '.join(sorted(unknown))}; choose from {', '.join(faults())}")
+        raise VislamError(no_such("fault", min(unknown), faults()))
     evidence, findings = Evidence(sequence), []
     for fault in _ordered():
         symptom = fault.check(evidence)

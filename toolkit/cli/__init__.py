@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
-    with _ended_once():
+    with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN):
         return _guarded(given)
 
 
@@ -119,10 +119,12 @@ def _told(message: str, status: int) -> int:
 
 
 @contextmanager
-def _ended_once() -> Iterator[None]:
+def _ended_once(afterwards: signal.Handlers) -> Iterator[None]:
     """Treat SIGTERM and SIGHUP like Ctrl-C, and whichever comes first so once: what is half-written is cleaned up.
 
-    A signal that the caller has us ignore, as nohup does, stays ignored.
+    When one has come, further ones meet ``afterwards`` or, where that is the default, what they met before: the
+    interpreter of a command has to clean up at its end, too, and that of a notebook goes on. A signal that the caller
+    has us ignore, as nohup does, stays ignored.
     """
     first: list[float] = []
 
@@ -141,7 +143,6 @@ def _ended_once() -> Iterator[None]:
     try:
         yield
     finally:
-        # On the way out after a signal further ones stay harmless: the interpreter, too, cleans up at its end.
-        if not first:
-            for number, before in heard.items():
-                signal.signal(number, signal.SIG_DFL if before is None else before)
+        ignored = first and afterwards == signal.SIG_IGN
+        for number, before in heard.items():
+            signal.signal(number, signal.SIG_IGN if ignored else before or signal.SIG_DFL)

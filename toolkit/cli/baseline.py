@@ -18,6 +18,7 @@ from toolkit.cli.arguments import (
     positive_seconds,
     settings_asked,
 )
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -92,7 +93,7 @@ def command(options: argparse.Namespace) -> int:
     made = new_baseline(cases, workers, made_by, of_this_process(), settings_asked(options))
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
-    print("\n".join([*ends, f"baseline: {out}"]))
+    print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
     return 1 if ends else 0
 
 

@@ -18,6 +18,7 @@ from toolkit.cli.arguments import (
     named_file,
     names,
 )
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -96,7 +97,7 @@ def command(options: argparse.Namespace) -> int:
             print_above(comparison_text(comparison, columns, width_of_output()))
             with progress_for(f"{comparison.name}: figures and report"):
                 write_run(comparison, directory, made_by)
-            print_above(f"\nresults: {directory}\n")
+            print_above(f"\nresults: {printable(str(directory))}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
 
@@ -180,11 +181,14 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     from toolkit.estimator import find_all
     from toolkit.experiment.comparison import plain_name
     from toolkit.report.export import TRUTH
+    from toolkit.sequence import LONGEST_NAME
 
     # What a name becomes as that of a file must differ, too.
     taken = {plain_name(name): name for name in (TRUTH, *find_all(estimators))}
     for name in trajectories:
         plain = plain_name(name)
+        if len(plain) > LONGEST_NAME:
+            raise UsageError(f"--trajectory: a name of {len(plain)} characters is none of a file; choose a shorter one")
         if not plain or plain in taken:
             why = f"is taken by {taken[plain]}" if plain else "has no letter or digit"
             raise UsageError(f"--trajectory: the name {name} {why}; choose another")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import epilog
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -40,5 +41,5 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.report.export import export
 
     written = export(options.run, options.estimator, options.output, options.format, options.out)
-    print(f"{options.out}: {written}")
+    print(printable(f"{options.out}: {written}"))
     return 0

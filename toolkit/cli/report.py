@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import epilog
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -45,5 +46,5 @@ def command(options: argparse.Namespace) -> int:
     if target is None:
         target = options.runs[0] / _NAME if len(options.runs) == 1 else Path(_NAME)
     write_html(options.runs, target)
-    print(f"report: {target}")
+    print(printable(f"report: {target}"))
     return 0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import at_least, epilog, positive_seconds
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -45,7 +46,7 @@ def command(options: argparse.Namespace) -> int:
     sequence = simulate(scenario, options.seed)
     vislam_recording.save(sequence, options.out)
     print(
-        f"{options.out}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, "
+        f"{printable(str(options.out))}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, "
         f"{len(sequence.observations)} stereo observations, {sequence.motion_kind}, seed {options.seed}"
     )
     return 0

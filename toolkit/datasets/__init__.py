@@ -14,11 +14,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
+
 from toolkit.discovery import MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
 from toolkit.inputs import is_regular, open_input, unreadable
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, check_stated
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -128,7 +130,11 @@ def load_sequence(source: str, seed: int = 0) -> Sequence:
         return built_ins()[source](seed)
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
-    return reader.load_with_seed(path, seed) if isinstance(reader, DrawnFromASeed) else reader.load(path)
+    # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
+    with np.errstate(all="ignore"):
+        sequence = reader.load_with_seed(path, seed) if isinstance(reader, DrawnFromASeed) else reader.load(path)
+        check_stated(sequence)
+    return sequence
 
 
 def is_drawn_from_a_seed(source: str) -> bool:
@@ -151,7 +157,8 @@ def load_references(source: str) -> dict[str, Trajectory]:
         return {}
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
-    return dict(reader.references(path)) if isinstance(reader, BringsReferences) else {}
+    with np.errstate(all="ignore"):
+        return dict(reader.references(path)) if isinstance(reader, BringsReferences) else {}
 
 
 def _reader_of(path: Path, source: str) -> RecordingFormat:

@@ -77,7 +77,7 @@ def save(sequence: Sequence, directory: Path) -> None:
     with replaced_directory(Path(directory), _written_by_us) as partial:
         np.savez_compressed(partial / _ARRAYS, **_to_arrays(sequence))
         text = json.dumps(_to_text(sequence), indent=2, ensure_ascii=False)
-        (partial / _TEXT).write_text(text + "\n", encoding="utf-8")
+        (partial / _TEXT).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def check_folder(directory: Path) -> None:

@@ -6,6 +6,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from toolkit.audit import Audit, Finding, audit
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
@@ -67,7 +69,10 @@ def prepare(recording: Recording) -> Prepared:
 
 def audited_recording(recording: Recording) -> Audit:
     """Load a recording and audit it whole: slow faults (a bias, a lag) show better so. Raises as :func:`prepare`."""
-    return audit(_loaded(recording), recording.keep)
+    sequence = _loaded(recording)
+    # The audit looks for what is not finite: what NumPy would say of it on the way says nothing more.
+    with np.errstate(all="ignore"):
+        return audit(sequence, recording.keep)
 
 
 @lru_cache(maxsize=1)

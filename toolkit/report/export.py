@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from toolkit.datasets.trajectories import FORMATS, tum
-from toolkit.errors import DataError
+from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
 from toolkit.files import replaced_file
 from toolkit.report.html.run_files import SeedsFiles, read_run
@@ -47,7 +47,7 @@ def _chosen(directory: Path, report: Report, estimator: str | None, output: Outp
         raise DataError(f"{directory} holds several trajectories; choose one with --estimator: {there}")
     name = names[0] if estimator is None else estimator
     if name not in names:
-        raise DataError(f"{directory} has no trajectory of {name}; there are {there}")
+        raise DataError(f"{directory} has no trajectory of {name}{did_you_mean(name, names)}; there are {there}")
     outputs = [given for known, given in files if known == name]
     wanted = outputs[-1] if output is None else output
     if wanted not in outputs:

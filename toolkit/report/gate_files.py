@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from toolkit.documents import to_text
-from toolkit.errors import OutputError
+from toolkit.errors import OutputError, printable
 from toolkit.files import check_parent, replaced_file
 from toolkit.gate.verdict import Check, Verdict
 from toolkit.report.gate_text import about, gate_markdown
@@ -68,11 +68,11 @@ def gate_junit(check: Check) -> str:
 
 
 def _add_suite(root: ElementTree.Element, sequence: str, verdicts: tuple[Verdict, ...]) -> None:
-    suite = ElementTree.SubElement(root, "testsuite", _counts(verdicts), name=sequence)
+    suite = ElementTree.SubElement(root, "testsuite", _counts(verdicts), name=printable(sequence))
     for verdict in verdicts:
-        who = ".".join(filter(None, (sequence, verdict.estimator, verdict.output)))
+        who = printable(".".join(filter(None, (sequence, verdict.estimator, verdict.output))))
         case = ElementTree.SubElement(suite, "testcase", classname=who, name=verdict.metric)
-        message = f"{about(verdict)}: {verdict.words}" if verdict.words else ""
+        message = printable(f"{about(verdict)}: {verdict.words}") if verdict.words else ""
         if verdict.fails:
             ElementTree.SubElement(case, "failure", type=verdict.finding, message=message).text = _numbers(verdict)
         elif message:

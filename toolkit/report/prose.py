@@ -1,13 +1,18 @@
 """Lines of prose for a terminal: wrapped to a width, or whole where they go into a file or a pipe."""
 
+import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator
+
+from toolkit.errors import printable
 
 # Of tables and of prose beside them.
 WIDTH = 100
 Width = int | None
 _LABEL = 7
+# An underscore inside a word is none; a minus, a plus or a number is one only at the beginning of a line.
+_MARKUP = re.compile(r"[\\`*<>\[\]|&]|(?<!\w)_|_(?!\w)|^[#~+-]|^\d+(?=[.)] )")
 
 
 def width_of_output() -> Width:
@@ -17,9 +22,15 @@ def width_of_output() -> Width:
 
 def filled(text: str, width: Width, first: str = "", further: str = "  ") -> str:
     """Return a text in lines no wider than ``width``, behind what its first line and the others begin with."""
+    text = printable(text)
     if width is None:
         return first + text
     return textwrap.fill(text, width, initial_indent=first, subsequent_indent=further)
+
+
+def in_markdown(text: str) -> str:
+    """Return a text in one line that Markdown shows as it is: no markup, no table, no HTML, nothing that acts."""
+    return _MARKUP.sub(r"\\\g<0>", printable(text))
 
 
 def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, remark_lines
+from toolkit.report.prose import in_markdown
 from toolkit.report.table import as_markdown, comparison_table, explained_metrics
 
 _READ_BEFORE = """\
@@ -61,8 +62,8 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
     seeds = f", {len(comparison.seeds)} seeds" if comparison.over_seeds else ""
     how_to_read = _HOW_TO_READ_MANY if comparison.over_seeds else _HOW_TO_READ_ONE
     parts = [
-        f"# {' / '.join(comparison.estimators)} on {comparison.name}{seeds}",
-        *(f"{line}." for line in header_lines(comparison)),
+        f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
+        *(f"{in_markdown(line)}." for line in header_lines(comparison)),
         as_markdown(comparison_table(comparison)),
         *_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
         *_section("Notes", note_lines(comparison)),
@@ -71,11 +72,15 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         *_section("What the audit found in the recording", finding_lines(comparison)),
         *_section("What to know about this recording", comparison.sequence.provenance.facts),
         "## Figures",
-        *(f"![{caption}](figures/{name})\n\n*{caption}*" for name, caption in captions.items()),
+        *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
         "## How to read the table",
         how_to_read.format(metrics=_meanings(comparison)),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _figure(name: str, caption: str) -> str:
+    return f"![{caption}](figures/{name})\n\n*{caption}*"
 
 
 def _meanings(comparison: Comparison) -> str:
@@ -84,7 +89,7 @@ def _meanings(comparison: Comparison) -> str:
 
 
 def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
-    lines = [f"- {entry}" for entry in entries]
+    lines = [f"- {in_markdown(entry)}" for entry in entries]
     if lines:
         yield f"## {title}"
         yield "\n".join(lines)

@@ -10,8 +10,10 @@ from typing import Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
+from toolkit.report.prose import in_markdown
 
 MISSING = "-"
 _WIDEST_NUMBER = 5
@@ -181,17 +183,19 @@ def as_text(table: Table) -> str:
     """
     # Headings as rows, because tabulate makes every column two characters wider than its heading.
     heads = [line for line in zip(*table.headings, strict=True) if any(line)]
-    rows = [*heads, SEPARATING_LINE, *table.rows]
+    rows = [*heads, SEPARATING_LINE, *(tuple(map(printable, row)) for row in table.rows)]
     text = tabulate(rows, tablefmt=_PLAIN_TEXT, colalign=_sides(table), disable_numparse=True)
     lines = [line.rstrip() for line in text.splitlines()]
     if any(table.marks):
         lines = [*lines[: -len(table.rows)], *_marked(lines[-len(table.rows) :], table)]
-    return "\n".join([*lines, *(["", *table.under] if table.under else [])])
+    return "\n".join([*lines, *(["", *map(printable, table.under)] if table.under else [])])
 
 
 def _marked(lines: list[str], table: Table) -> Iterator[str]:
     """Yield the lines of the rows, each followed by its mark if it has one."""
-    names, outputs = (max(len(text) for text in (*table.headings[i], *(row[i] for row in table.rows))) for i in (0, 1))
+    names, outputs = (
+        max(len(printable(text)) for text in (*table.headings[i], *(row[i] for row in table.rows))) for i in (0, 1)
+    )
     indent = " " * (names + outputs + 2 * len(_CELLS.sep))
     for line, mark in zip(lines, table.marks, strict=True):
         yield line
@@ -203,9 +207,10 @@ def as_markdown(table: Table) -> str:
     """Return the table in Markdown; units stand in brackets behind the names."""
     heads = [_in_one_line(lines) for lines in table.headings]
     marks = table.marks or ("",) * len(table.rows)
-    rows = [_with_mark(row, mark) for row, mark in zip(table.rows, marks, strict=True)]
+    labelled = (_with_mark(row, mark) for row, mark in zip(table.rows, marks, strict=True))
+    rows = [(*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in labelled]
     text = tabulate(rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
-    return "\n\n".join(filter(None, (text, "\n".join(f"- {line}" for line in table.under))))
+    return "\n\n".join(filter(None, (text, "\n".join(f"- {in_markdown(line)}" for line in table.under))))
 
 
 def _in_one_line(heading: tuple[str, ...]) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from toolkit.audit import Audit
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, outcome, sequence_line
 from toolkit.report.prose import WIDTH, Width, filled, section
@@ -29,7 +30,7 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
 def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     """Return what the audit found as plain text: fault, count, outcome, and the details below each."""
     findings = audited.findings
-    lines = [sequence_line(audited.sequence), ""]
+    lines = [printable(sequence_line(audited.sequence)), ""]
     if not findings:
         return "\n".join([*lines, "no fault found"])
     headings = (("fault",), ("outcome",), ("count",))

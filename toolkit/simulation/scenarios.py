@@ -24,6 +24,7 @@ from toolkit.sequence import (
     Truth,
     TwistNoise,
 )
+from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, hall, road
 from toolkit.simulation.sensors import Imu, MotionMeasurements, Odometer
@@ -66,8 +67,20 @@ def noise_free(scenario: Scenario) -> Scenario:
     return replace(exact, motion=replace(exact.motion, rate_hz=1000.0)) if isinstance(exact.motion, Imu) else exact
 
 
+# The measurements of an hour take a gigabyte.
+LONGEST_S = 3600.0
+
+
 def simulate(scenario: Scenario, seed: int) -> Sequence:
-    """Return the recording of a scenario under one seed; the same arguments give the same bits."""
+    """Return the recording of a scenario under one seed; the same arguments give the same bits.
+
+    Raises SettingsError for a duration that gives no two frames, or more than an hour.
+    """
+    if not 1.0 / scenario.camera.rate_hz <= scenario.duration_s <= LONGEST_S:
+        raise SettingsError(
+            f"a simulation of {scenario.duration_s:g} s cannot be had; its duration is from "
+            f"{1.0 / scenario.camera.rate_hz:g} to {LONGEST_S:g} s"
+        )
     prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng = (
         np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(5)
     )

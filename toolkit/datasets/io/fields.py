@@ -109,8 +109,12 @@ def check_rigid(path: Path, key: str, T: Array) -> Array:
     """Return T (4, 4), or raise DataError where it is not a rotation and a translation."""
     rotation = T[:3, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (off < _RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0 and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])):
+    if not off < _RIGID_TOLERANCE:
         raise DataError(f"{path}: {key} is not a rotation and a translation (R R^T is off by {off:.2g})")
+    if np.linalg.det(rotation) < 0.0:
+        raise DataError(f"{path}: {key} holds a reflection, not a rotation: the sign of an axis is wrong")
+    if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
+        raise DataError(f"{path}: the last row of {key} is {T[3].tolist()}, expected 0, 0, 0, 1; transpose it?")
     return T
 
 

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from toolkit.datasets.trajectories import euroc, kitti, openvins, tum
 from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.datasets.trajectories.rows import Rows, read_rows
@@ -44,6 +46,7 @@ def read_poses(path: Path) -> PosesFile:
     rows = read_rows(path, _KIND)
     for module in FORMATS.values():
         if module.recognises(rows):
-            return module.parse(rows)
+            with np.errstate(all="ignore"):  # the checks say what is wrong with values, and not NumPy
+                return module.parse(rows)
     kind = "separated by commas" if rows.commas else "separated by blanks"
     raise DataError(f"{path}: {rows.width} columns {kind} are no format that is known; {_KIND}")

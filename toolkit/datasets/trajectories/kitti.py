@@ -32,7 +32,8 @@ def parse(rows: Rows) -> PosesFile:
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     checks = (
         (np.isfinite(matrices).all(axis=(1, 2)), "holds a value that is not finite; write a pose for every frame"),
-        ((off < UNIT_TOLERANCE) & (np.linalg.det(rotations) > 0.0), f"does not hold a rotation; expected {COLUMNS}"),
+        (off < UNIT_TOLERANCE, f"does not hold a rotation; expected {COLUMNS}"),
+        (np.linalg.det(rotations) > 0.0, "holds a reflection, not a rotation: the sign of an axis is wrong"),
     )
     for passed, complaint in checks:
         if not passed.all():

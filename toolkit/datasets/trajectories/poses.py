@@ -75,6 +75,8 @@ def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: A
 def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
     """Raise DataError where the trajectory alone shows that its quaternions are in the other order.
 
+    A trajectory inverted as a whole, or in its rotations alone, is named as such.
+
     A vehicle moves in one direction of its own frame. If that holds in the other order and not as given, the order
     is wrong; where both readings do as well (no turn, or a hand-held camera), a start at the identity decides:
     read in the wrong order it is a start upside down.
@@ -82,7 +84,11 @@ def check_order(path: Path, T_world_imu: Array, other: OtherOrder) -> None:
     positions, R_world_imu = T_world_imu[:, :3, 3], T_world_imu[:, :3, :3]
     reread = other.reread(R_world_imu)
     as_given, otherwise = _concentration(positions, R_world_imu), _concentration(positions, reread)
+    remedy, inverted = max(_inverted(positions, R_world_imu), key=lambda reading: reading[1])
     is_vehicle = otherwise > _VEHICLE_CONCENTRATION and otherwise > as_given + _LEAST_GAIN
+    # Where the vehicle turns about one axis only, the wrong order looks right as well: the likelier mistake is named.
+    if inverted > max(_VEHICLE_CONCENTRATION, as_given + _LEAST_GAIN) and inverted >= otherwise - _LEAST_GAIN:
+        raise DataError(f"{path}: {remedy}")
     starts_at_identity = np.linalg.norm(quaternion_from_rotation(reread[0])[:3]) < _IDENTITY_TOLERANCE
     if is_vehicle or (starts_at_identity and otherwise >= as_given - _LEAST_GAIN):
         raise DataError(f"{path}: {other.remedy}")
@@ -101,6 +107,22 @@ def rows_text(header: str, rows: Iterable[tuple[str, list[float]]], separator: s
         separator.join(([first] if first else []) + [f"{value:.15g}" for value in values]) for first, values in rows
     )
     return "\n".join([*([header] if header else []), *lines]) + "\n"
+
+
+def _inverted(positions: Array, R_world_imu: Array) -> tuple[tuple[str, float], ...]:
+    """Return what to do where poses (N, 3), (N, 3, 3) are inverted, in two ways, and how well each reading fits."""
+    R_imu_world = np.swapaxes(R_world_imu, 1, 2)
+    p_inverted = -np.einsum("nij,nj->ni", R_imu_world, positions)
+    return (
+        (
+            "the poses look like those of the world in the IMU frame: invert each one",
+            _concentration(p_inverted, R_imu_world),
+        ),
+        (
+            "the quaternions look like those of the world to the IMU, as JPL and Hamilton mixed up: conjugate them",
+            _concentration(positions, R_imu_world),
+        ),
+    )
 
 
 def _concentration(positions: Array, R_world_imu: Array) -> float:

@@ -1,8 +1,12 @@
 """The figures of a comparison as PNG files, one module a figure; drawn without a display."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from matplotlib.text import Text
+
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.figures import errors_over_time, frame_times, over_seeds, reprojection, top_view
 from toolkit.report.figures.style import NamedFigure
@@ -14,13 +18,28 @@ _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
 def drawn(comparison: Comparison) -> Iterator[NamedFigure]:
     """Draw every figure the comparison has data for."""
-    return (figure for drawing in (_OVER_SEEDS if comparison.over_seeds else _OF_ONE) for figure in drawing(comparison))
+    drawings = _OVER_SEEDS if comparison.over_seeds else _OF_ONE
+    return (_literal(figure) for drawing in drawings for figure in drawing(comparison))
+
+
+def _literal(drawn_one: NamedFigure) -> NamedFigure:
+    """Return a figure whose words are shown as they are: a name with dollar signs is no formula."""
+    figure = drawn_one.figure
+    of_axes = {text for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for text in axis.findobj(Text)}
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and text not in of_axes:
+            text.set_parse_math(False)
+            text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
+    return drawn_one
 
 
 def save(figures: Iterable[NamedFigure], directory: Path) -> dict[str, str]:
     """Save figures as PNG files; return file name -> caption, in order."""
     captions: dict[str, str] = {}
-    for name, caption, figure in figures:
-        figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
-        captions[f"{name}.png"] = caption
+    with warnings.catch_warnings():
+        # A letter that the font lacks is drawn as a box; of that nothing is to be told.
+        warnings.filterwarnings("ignore", "Glyph")
+        for name, caption, figure in figures:
+            figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
+            captions[f"{name}.png"] = caption
     return captions

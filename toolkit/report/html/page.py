@@ -6,6 +6,8 @@ import re
 from importlib.resources import files
 from typing import Any
 
+from toolkit.errors import printable
+
 # In the order in which they build upon each other; together they are the body of one function.
 SCRIPTS = (
     "dom",
@@ -33,7 +35,7 @@ _ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028",
 def page_text(payload: dict[str, Any]) -> str:
     """Return the page of a payload with its ``title``; refuses NaN and infinity, which are not JSON."""
     parts = {
-        "title": html.escape(payload["title"]),
+        "title": html.escape(printable(payload["title"])),
         "style": _source("style.css"),
         "payload": json_in_html(payload),
         "script": "\n".join(_source(f"scripts/{name}.js") for name in SCRIPTS),
@@ -47,7 +49,8 @@ def json_in_html(value: object) -> str:
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for character, escape in _ESCAPES.items():
         text = text.replace(character, escape)
-    return text
+    # Bytes of a file's name that are no text: their escape is one of JSON's, too.
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _source(name: str) -> str:
