@@ -43,7 +43,7 @@ def test_a_kept_fault_is_found_blocks_and_is_left_alone(plant: Any) -> None:
 
 
 def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[..., Sequence]) -> None:
-    with pytest.raises(VislamError, match="rust; choose from time-order"):
+    with pytest.raises(VislamError, match="no fault is called rust; there are time-order"):
         audit(clean_recording(), keep=frozenset({"rust"}))
 
 
