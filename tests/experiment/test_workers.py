@@ -62,6 +62,14 @@ def is_broken(unit, progress):
 def tells_threads(unit, progress):
     return tuple(os.environ[name] for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"))
 
+def holds_much(unit, progress):
+    if len(kept) == 1:
+        time.sleep(1.1)  # memory is looked at once a second
+    kept.append(b"x" * (350_000_000 if len(kept) == 1 else 1))
+    return os.getpid()
+
+kept = []
+
 def goes_on(unit, progress):
     for done in range(4):
         progress.advance(done, 4)
@@ -166,6 +174,15 @@ def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
     assert by_place(units((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
+
+
+def test_a_process_that_holds_much_memory_goes_on_without_a_word(
+    units: Units, work: ModuleType, recwarn: pytest.WarningsRecorder
+) -> None:
+    """Where psutil is there, loky takes a recording held in memory for a leak, says so and begins the process anew."""
+    pytest.importorskip("psutil")
+    assert len(set(by_place(units((0, 1, 2, 3)), 2, work.holds_much))) <= 2
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -28,7 +28,10 @@ T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T, Progress], R]
 
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
+    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
+}
 _POLL_S = 0.1
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64)])
@@ -90,7 +93,7 @@ class Workers:
         resource_tracker.ensure_running()
         with _interrupts_held_back():
             if self._executor is None:
-                self._executor = ProcessPoolExecutor(self.count, initializer=_begin, env=_ONE_THREAD)
+                self._executor = ProcessPoolExecutor(self.count, initializer=_begin, env=_ENVIRONMENT)
             future: Future[R] = self._executor.submit(work, *arguments)
         return future
 
