@@ -4,6 +4,8 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.text import Text
 
 from toolkit.errors import printable
@@ -25,9 +27,11 @@ def drawn(comparison: Comparison) -> Iterator[NamedFigure]:
 def _literal(drawn_one: NamedFigure) -> NamedFigure:
     """Return a figure whose words are shown as they are: a name with dollar signs is no formula."""
     figure = drawn_one.figure
-    of_axes = {text for axes in figure.axes for axis in (axes.xaxis, axes.yaxis) for text in axis.findobj(Text)}
-    for text in figure.findobj(Text):
-        if isinstance(text, Text) and text not in of_axes:
+    parts = [part for part in figure.get_children() if not isinstance(part, Axes)]
+    # Not the axes' ticks: they are numbers, and asking for them would make them.
+    parts += [part for axes in figure.axes for part in axes.get_children() if not isinstance(part, Axis)]
+    for text in {found for part in parts for found in part.findobj(Text)}:
+        if isinstance(text, Text):
             text.set_parse_math(False)
             text.set_text("\n".join(map(printable, text.get_text().split("\n"))))
     return drawn_one
