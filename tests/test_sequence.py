@@ -193,8 +193,13 @@ def test_an_extrinsic_written_with_few_decimals_is_made_a_rotation():
     "rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.zeros((3, 3)), np.full((3, 3), np.nan)]
 )
 def test_an_extrinsic_that_is_no_rigid_motion_is_refused(rotation):
-    with pytest.raises(DataError, match=r"not a rigid motion|holds a reflection"):
+    with pytest.raises(DataError, match=r"T_imu_cam (is not a rotation and a translation|holds a reflection)"):
         replace(RIG, T_imu_cam=se3(rotation, np.zeros(3)))
+
+
+def test_a_transposed_extrinsic_is_refused():
+    with pytest.raises(DataError, match=r"T_imu_cam: the last row is \[1.0, 2.0, 3.0, 1.0\].*transpose it"):
+        replace(RIG, T_imu_cam=se3(np.eye(3), np.array([1.0, 2.0, 3.0])).T)
 
 
 def test_noise_of_another_kind_than_the_motion_is_refused():

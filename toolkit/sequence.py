@@ -12,6 +12,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from toolkit.arrays import check_rigid, freeze_arrays, rotation_defect
 from toolkit.errors import DataError
 from toolkit.files import content_digest
 from toolkit.geometry import (
@@ -33,37 +34,17 @@ LONGEST_NAME = 200
 _MOST_ROTATION_DEFECT, _ORTHONORMAL = 5e-3, 1e-14
 
 
-def _freeze(value: object, **shapes: tuple[int | None, ...]) -> None:
-    """Make the named array fields of a frozen dataclass read-only and check their shapes (None = any)."""
-    for name, shape in shapes.items():
-        given = getattr(value, name)
-        if given is None:
-            continue
-        integer = name.endswith(("_ns", "_id", "_ids", "frame"))
-        array = read_only(given, np.int64 if integer else np.float64)
-        matches = array.ndim == len(shape) and all(w in (None, s) for s, w in zip(array.shape, shape, strict=True))
-        if not matches:
-            wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
-            raise DataError(f"{type(value).__name__}.{name} has shape {array.shape}, expected {wanted}")
-        object.__setattr__(value, name, array)
-
-
-def _rigid(T_imu_cam: Array) -> Array:
+def _orthonormal(T_imu_cam: Array) -> Array:
     """Return an extrinsic with its rotation made orthonormal: files write it with few decimals.
 
     Raises DataError where it is no rigid motion at all.
     """
     if T_imu_cam.shape != (4, 4):
         return T_imu_cam
-    rotation = T_imu_cam[:3, :3]
-    defect = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if defect < _MOST_ROTATION_DEFECT and np.linalg.det(rotation) < 0.0:
-        raise DataError("T_imu_cam holds a reflection, not a rotation: the sign of an axis is wrong")
-    if not defect < _MOST_ROTATION_DEFECT:
-        raise DataError("T_imu_cam is not a rigid motion: its rotation is not orthonormal; check the calibration")
-    if defect < _ORTHONORMAL:
+    check_rigid("T_imu_cam", T_imu_cam, _MOST_ROTATION_DEFECT)
+    if rotation_defect(T_imu_cam) < _ORTHONORMAL:
         return T_imu_cam
-    return se3(rotation_from_quaternion(quaternion_from_rotation(rotation)), T_imu_cam[:3, 3])
+    return se3(rotation_from_quaternion(quaternion_from_rotation(T_imu_cam[:3, :3])), T_imu_cam[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +65,8 @@ class StereoRig:
     cov_uv_px2: Array
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "T_imu_cam", _rigid(np.asarray(self.T_imu_cam, dtype=float)))
-        _freeze(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
+        object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))
+        freeze_arrays(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +81,7 @@ class TwistNoise:
     gyro_random_walk: Array
 
     def __post_init__(self) -> None:
-        _freeze(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
+        freeze_arrays(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
 
 
 @dataclass(frozen=True)
@@ -133,7 +114,7 @@ class TwistSamples:
     pairing: Pairing = "start"
 
     def __post_init__(self) -> None:
-        _freeze(self, t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3))
+        freeze_arrays(self, t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3))
 
     @property
     def values(self) -> Array:
@@ -150,7 +131,7 @@ class ImuSamples:
     gyro_radps: Array
 
     def __post_init__(self) -> None:
-        _freeze(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
+        freeze_arrays(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
 
     @property
     def values(self) -> Array:
@@ -170,7 +151,7 @@ class Observations:
     uv_px: Array
 
     def __post_init__(self) -> None:
-        _freeze(self, frame=(None,), track_id=(None,), uv_px=(None, 3))
+        freeze_arrays(self, frame=(None,), track_id=(None,), uv_px=(None, 3))
 
     def __len__(self) -> int:
         return self.frame.size
@@ -201,7 +182,7 @@ class Truth:
     independent: bool = True
 
     def __post_init__(self) -> None:
-        _freeze(self, t_ns=(None,), T_world_imu=(None, 4, 4), v_world=(None, 3), bias=(None, 6))
+        freeze_arrays(self, t_ns=(None,), T_world_imu=(None, 4, 4), v_world=(None, 3), bias=(None, 6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +201,7 @@ class Prior:
     source: str
 
     def __post_init__(self) -> None:
-        _freeze(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
+        freeze_arrays(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +276,7 @@ class Sequence:
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
 
     def __post_init__(self) -> None:
-        _freeze(self, frames_t_ns=(None,), gravity_world=(3,))
+        freeze_arrays(self, frames_t_ns=(None,), gravity_world=(3,))
         if isinstance(self.motion, TwistSamples) != isinstance(self.noise, TwistNoise):
             raise DataError(f"{self.name}: the motion noise is not of the kind of the motion samples")
 

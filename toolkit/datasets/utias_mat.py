@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rigid, observations, stamps_ns
+from toolkit.datasets.io.fields import Fields, check_frame_count, observations, rigid, stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.inputs import is_regular, open_input, read_input
@@ -92,7 +92,7 @@ def _rows(fields: Fields, key: str, frame_count: int) -> Array:
 
 def _rig(fields: Fields, cov_uv_px2: Array) -> StereoRig:
     R_imu_cam = fields.constant("C_c_v", 3, 3).T
-    T_imu_cam = check_rigid(fields.path, "C_c_v", se3(R_imu_cam, fields.constant("rho_v_c_v", 3, 1)[:, 0]))
+    T_imu_cam = rigid(fields.path, "C_c_v", se3(R_imu_cam, fields.constant("rho_v_c_v", 3, 1)[:, 0]))
     fu, fv, b = (fields.positive(key) for key in ("fu", "fv", "b"))
     return StereoRig(fu, fv, fields.number("cu"), fields.number("cv"), b, T_imu_cam, cov_uv_px2)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_rigid
+from toolkit.datasets.io.fields import Fields, rigid
 from toolkit.datasets.io.opencv_yaml import read_fields
 from toolkit.errors import DataError
 from toolkit.geometry import Array, se3_inverse
@@ -93,7 +93,7 @@ def read_calibration(mav0: Path) -> Calibration:
 def extrinsic(sensor: Fields) -> Array:
     """Return T_body_sensor (4, 4) of a sensor.yaml."""
     sensor.require("T_BS.data")
-    return check_rigid(sensor.path, "T_BS", sensor.constant("T_BS.data", 16).reshape(4, 4))
+    return rigid(sensor.path, "T_BS", sensor.constant("T_BS.data", 16).reshape(4, 4))
 
 
 def _in_flight(stated: ImuNoise) -> ImuNoise:

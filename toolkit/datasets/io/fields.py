@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from toolkit.arrays import check_rigid, check_shape
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
 from toolkit.resampling import NS_PER_S
@@ -48,7 +49,7 @@ class Fields:
         """Return a numeric array of the given shape (None = any length) as float64, NaN included."""
         array = self.arrays[key]
         check_numeric(self.path, key, array.dtype)
-        check_shape(self.path, key, array.shape, shape)
+        check_shape(f"{self.path}: {key}", array.shape, shape)
         return array.astype(np.float64)
 
     def first_of(self, *keys: str) -> str:
@@ -86,7 +87,7 @@ class Fields:
 
     def rigid(self, key: str) -> Array:
         """Return a rigid motion (4, 4)."""
-        return check_rigid(self.path, key, self.constant(key, 4, 4))
+        return rigid(self.path, key, self.constant(key, 4, 4))
 
 
 def check_numeric(path: Path, key: str, dtype: np.dtype[np.generic]) -> None:
@@ -97,24 +98,9 @@ def check_numeric(path: Path, key: str, dtype: np.dtype[np.generic]) -> None:
         raise DataError(f"{path}: {key} holds {dtype}, expected real numbers")
 
 
-def check_shape(path: Path, key: str, shape: tuple[int, ...], expected: tuple[int | None, ...]) -> None:
-    """Raise DataError unless the shape is the expected one (None = any length)."""
-    fits = len(shape) == len(expected) and all(w in (None, s) for s, w in zip(shape, expected, strict=True))
-    if not fits:
-        wanted = ", ".join("any" if w is None else str(w) for w in expected)
-        raise DataError(f"{path}: {key} has shape {shape}, expected ({wanted})")
-
-
-def check_rigid(path: Path, key: str, T: Array) -> Array:
+def rigid(path: Path, key: str, T: Array) -> Array:
     """Return T (4, 4), or raise DataError where it is not a rotation and a translation."""
-    rotation = T[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not off < _RIGID_TOLERANCE:
-        raise DataError(f"{path}: {key} is not a rotation and a translation (R R^T is off by {off:.2g})")
-    if np.linalg.det(rotation) < 0.0:
-        raise DataError(f"{path}: {key} holds a reflection, not a rotation: the sign of an axis is wrong")
-    if not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
-        raise DataError(f"{path}: the last row of {key} is {T[3].tolist()}, expected 0, 0, 0, 1; transpose it?")
+    check_rigid(f"{path}: {key}", T, _RIGID_TOLERANCE)
     return T
 
 

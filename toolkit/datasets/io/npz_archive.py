@@ -17,7 +17,8 @@ from typing import IO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import Fields, check_numeric, check_shape
+from toolkit.arrays import check_shape
+from toolkit.datasets.io.fields import Fields, check_numeric
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
 from toolkit.inputs import is_regular, open_input
@@ -66,7 +67,7 @@ class NpzArchive:
         with self.archive.open(f"{key}.npy") as stream:
             header = self._header(key, stream)
             check_numeric(self.path, key, header.dtype)
-            check_shape(self.path, key, header.shape, shape)
+            check_shape(f"{self.path}: {key}", header.shape, shape)
             size, position, value = _kept_entries(stream, header.dtype, filler)
         if size != math.prod(header.shape):
             raise DataError(f"{self.path}: {key} ends after {size} of {math.prod(header.shape)} values; save it again")
