@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from toolkit.datasets import is_drawn_from_a_seed, load_references
@@ -134,10 +135,11 @@ def comparisons(
     An estimator that fails is a row that says so. Raises DataError where a recording cannot be had under a seed.
     """
     entries = find_all(plan.estimators)
-    units = [unit for case in cases for unit in _units(plan, case, entries)]
-    owner = [i for i, case in enumerate(cases) for _ in _units(plan, case, entries)]
+    by_case = [list(_units(plan, case, entries)) for case in cases]
+    units = list(chain.from_iterable(by_case))
+    owner = [i for i, of_case in enumerate(by_case) for _ in of_case]
     outcomes: list[list[Outcome]] = [[] for _ in cases]
-    missing, shown = [owner.count(i) for i in range(len(cases))], 0
+    missing, shown = [len(of_case) for of_case in by_case], 0
     label = f"{', '.join(dict.fromkeys(case.name for case in cases))}: {len(units)} runs"
     with progress_for(label) as progress, closing(workers.results(units, run_unit, progress)) as coming:
         for place, result in coming:
