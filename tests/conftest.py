@@ -2,8 +2,11 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -26,6 +29,37 @@ PROJECT = Path(__file__).parents[1]
 _OF_ONE_MACHINE = re.compile(
     r"(?:file://|(?<![\w.:/~-]))/(?:home|Users|root|tmp|var|private|mnt|media)/[\w.~-]+|\b[A-Z]:\\+Users\\+"
 )
+
+
+def pytest_configure() -> None:
+    """Let interrupts be tested also where the tests run in the background, to which a shell gives none."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def starts_group() -> Iterator[Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]]:
+    """Start Python, with arguments, a directory and variables, in a group of processes that the test's end ends."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(arguments: tuple[str, ...], cwd: Path, variables: Mapping[str, str]) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, *arguments],
+            cwd=cwd,
+            env={**os.environ, **variables},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
 
 
 @pytest.fixture(scope="session")

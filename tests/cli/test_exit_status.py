@@ -17,6 +17,7 @@ from toolkit import runner
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
+StartsGroup = Callable[..., subprocess.Popen[str]]
 ROOT = Path(__file__).parents[2]
 QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
 
@@ -176,17 +177,11 @@ def test_the_place_of_a_defect_is_shown_when_asked_for(
 
 
 @pytest.mark.parametrize("signals", [("SIGINT", "SIGINT"), ("SIGTERM",), ("SIGHUP",), ("SIGTERM", "SIGINT", "SIGHUP")])
-def test_signals_leave_no_file_and_no_process(tmp_path: Path, signals: tuple[str, ...]) -> None:
+def test_signals_leave_no_file_and_no_process(
+    tmp_path: Path, starts_group: StartsGroup, signals: tuple[str, ...]
+) -> None:
     words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "deep/down")
-    running = subprocess.Popen(
-        [sys.executable, "-m", "toolkit.cli", *words],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
     _wait_until(lambda: len(_group(running.pid)) > 2)
     for name in signals:
         os.kill(running.pid, getattr(signal, name))

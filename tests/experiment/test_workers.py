@@ -2,12 +2,12 @@
 
 import os
 import signal
-import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from subprocess import Popen
 from types import ModuleType
 from typing import Any
 
@@ -22,6 +22,7 @@ from toolkit.metrics import cost
 from toolkit.progress import SILENT
 
 Units = Callable[..., list[Unit]]
+StartsGroup = Callable[..., Popen[str]]
 
 _WORK = """
 import os, signal, time
@@ -204,7 +205,9 @@ def test_progress_is_that_of_all_units_and_never_goes_back(units: Units, work: M
 
 # While the processes start, and while the units run.
 @pytest.mark.parametrize("delay_s", [0.2, 3.0])
-def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp_path: Path, delay_s: float) -> None:
+def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(
+    tmp_path: Path, starts_group: StartsGroup, delay_s: float
+) -> None:
     program = textwrap.dedent("""
         import sys
         from toolkit.cli import main
@@ -217,15 +220,7 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(tmp
         words = ["--seeds", "50", "--estimators", "ekf,batch", "--workers", "2", "--out", "run"]
         sys.exit(main(["compare", "drive", *words]))
     """)
-    vislam = subprocess.Popen(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    vislam = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
     assert vislam.stdout is not None
     assert vislam.stdout.readline() == "starting\n"
     time.sleep(delay_s)
