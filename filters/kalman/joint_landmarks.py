@@ -107,9 +107,9 @@ def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearise
     count, window = linearised.residuals.shape[:2]
     H_point = linearised.H_point.reshape(count, 3 * window, 3)
     cov_each = np.linalg.inv(np.swapaxes(H_point, 1, 2) @ H_point)
-    pull = (-cov_each @ np.swapaxes(H_point, 1, 2)).reshape(count, 3, window, 3)
+    pull = -cov_each @ np.swapaxes(H_point, 1, 2)
     jacobian = np.zeros((3 * count, joint.cov.shape[0]))
-    blocks = np.einsum("fiwj,fwjk->fiwk", pull, linearised.H_pose)
+    blocks = np.swapaxes(multiview.by_pose(pull) @ linearised.H_pose, 1, 2)
     jacobian[:, joint.clone_columns] = blocks.reshape(3 * count, 6 * window)
     cov = np.zeros((count, 3, count, 3))
     cov[np.arange(count), :, np.arange(count), :] = cov_each

@@ -61,7 +61,8 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
 def _seen_from(poses: Array, points: Array, rig: StereoRig) -> stereo.StereoPrediction:
     """Predict points (F, 3) from each pose (W, 4, 4), all with leading axes (F, W)."""
     T_imu_world = se3_inverse(poses)
-    points_imu = np.einsum("wij,fj->fwi", T_imu_world[:, :3, :3], points) + T_imu_world[:, :3, 3]
+    rotated = points @ np.swapaxes(T_imu_world[:, :3, :3], 1, 2)
+    points_imu = np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
     return stereo.linearise(points_imu, poses[:, :3, :3], rig)
 
 
@@ -87,9 +88,14 @@ def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
     tracks, window = seen.shape
     basis = null_space(linearised)
     residuals = (basis @ linearised.residuals.reshape(tracks, 3 * window, 1))[..., 0]
-    blocks = basis.reshape(tracks, 3 * window - 3, window, 3)
-    H = np.einsum("frwi,fwij->frwj", blocks, linearised.H_pose).reshape(tracks, 3 * window - 3, 6 * window)
+    H = np.swapaxes(by_pose(basis) @ linearised.H_pose, 1, 2).reshape(tracks, 3 * window - 3, 6 * window)
     return Constraints(residuals, H, 3 * seen.sum(axis=1) - 3)
+
+
+def by_pose(rows: Array) -> Array:
+    """Return the columns of rows (F, n, 3W) that belong to each pose, (F, W, n, 3)."""
+    tracks, count, columns = rows.shape
+    return np.swapaxes(rows.reshape(tracks, count, columns // 3, 3), 1, 2)
 
 
 def null_space(linearised: Linearised) -> Array:

@@ -17,7 +17,7 @@ from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR
+from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
 
 
@@ -68,34 +68,36 @@ class TrackGate:
         sightings, points = sightings.select(reliable), points[reliable]
         linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
         constraints = multiview.without_landmark(linearised, sightings.seen)
-        precision = self._precision(constraints)
-        nis = np.einsum("fi,fij,fj->f", constraints.residuals, precision, constraints.residuals)
+        covs = self._covs(constraints)
+        nis = mahalanobis_squared(constraints.residuals, covs)
         accepted = gate.accepts(nis, constraints.dof)
         tracks = AcceptedTracks(sightings.track_ids, sightings.seen, points, linearised, constraints)
         mismatched = np.asarray(nis > MISMATCHED_TRACK_FACTOR * gate.bound(constraints.dof))
-        worst = _worst_sighting(tracks.select(mismatched), precision[mismatched], sightings.seen[mismatched])
+        worst = _worst_sighting(tracks.select(mismatched), covs[mismatched])
         seen = sightings.seen[mismatched].copy()
         seen[np.arange(len(worst)), worst] = False
         return tracks.select(accepted), sightings.select(mismatched)._replace(seen=seen)
 
-    def _precision(self, constraints: Constraints) -> Array:
-        """Return the inverse of the covariance (F, 3W - 3, 3W - 3) of each track's residuals."""
+    def _covs(self, constraints: Constraints) -> Array:
+        """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals."""
         P = self._joint.cov[self._joint.clone_columns, self._joint.clone_columns]
         spread = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
-        return np.asarray(np.linalg.inv(spread + np.eye(spread.shape[1])))
+        return np.asarray(spread + np.eye(spread.shape[1]))
 
 
-def _worst_sighting(tracks: AcceptedTracks, precision: Array, seen: BoolArray) -> IntArray:
+def _worst_sighting(tracks: AcceptedTracks, covs: Array) -> IntArray:
     """Return the sighting (F,) of each track without which its NIS would be least.
 
-    Leaving out a sighting is letting it be anything: with ``W`` the precision of all coordinates and ``r`` their
-    residuals, the NIS falls by ``(W r)_j^T W_jj^-1 (W r)_j``.
+    ``covs`` (F, 3W - 3, 3W - 3) are those of the tracks' residuals. Leaving out a sighting is letting it be anything:
+    with ``W`` the precision of all coordinates and ``r`` their residuals, the NIS falls by
+    ``(W r)_j^T W_jj^-1 (W r)_j``.
     """
+    seen = tracks.seen
     count, window = seen.shape
     basis = multiview.null_space(tracks.linearised)
-    weighted = np.einsum("frw,frs,fs->fw", basis, precision, tracks.constraints.residuals).reshape(count, window, 3)
-    blocks = basis.reshape(count, 3 * window - 3, window, 3)
-    own = np.einsum("frwi,frs,fswj->fwij", blocks, precision, blocks)
+    informed = np.linalg.solve(covs, np.concatenate([basis, tracks.constraints.residuals[..., None]], axis=2))
+    weighted = (np.swapaxes(basis, 1, 2) @ informed[..., -1:]).reshape(count, window, 3)
+    own = np.swapaxes(multiview.by_pose(basis), 2, 3) @ multiview.by_pose(informed[..., :-1])
     own = np.where(seen[..., None, None], own, np.eye(3))
-    fall = np.einsum("fwi,fwi->fw", weighted, np.linalg.solve(own + 1e-12 * np.eye(3), weighted[..., None])[..., 0])
+    fall = (weighted * np.linalg.solve(own + 1e-12 * np.eye(3), weighted[..., None])[..., 0]).sum(axis=2)
     return np.asarray(np.argmax(np.where(seen, fall, -1.0), axis=1))

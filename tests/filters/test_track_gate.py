@@ -13,6 +13,7 @@ from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TrackGate
 from filters.kalman.triangulation import triangulate
 from toolkit.models import stereo
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, simulate
 
@@ -84,7 +85,7 @@ def test_the_fall_predicted_is_what_leaving_the_sighting_out_brings(scene):
 
     def nis(linearised, seen):
         constraints = multiview.without_landmark(linearised, seen)
-        return float(constraints.residuals[0] @ gate._precision(constraints)[0] @ constraints.residuals[0])
+        return float(mahalanobis_squared(constraints.residuals, gate._covs(constraints))[0])
 
     assert nis(with_it, np.ones((1, WINDOW), dtype=bool)) > 50.0 * nis(alone, without.seen)
     accepted, _ = gated(scene, bad)
