@@ -100,11 +100,13 @@ def _residuals(
     frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig
 ) -> Iterator[tuple[StereoFrame, Array, Array]]:
     """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
+    ids = seen_ids(frames)
+    points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
     for k, frame in enumerate(frames):
-        points = np.array([values.atPoint3(L(i)) for i in frame.track_ids.tolist()]).reshape(-1, 3)
-        predicted = stereo.predict(points, values.atPose3(X(k)).matrix(), rig)
+        seen = points[np.searchsorted(ids, frame.track_ids)]
+        predicted = stereo.predict(seen, values.atPose3(X(k)).matrix(), rig)
         residuals_px = frame.uvs_px - predicted.uv_px
-        covs_px2 = np.broadcast_to(rig.cov_uv_px2, (len(points), 3, 3))
+        covs_px2 = np.broadcast_to(rig.cov_uv_px2, (len(seen), 3, 3))
         yield frame, mahalanobis_squared(residuals_px, covs_px2), predicted.depth_m
 
 

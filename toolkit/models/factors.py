@@ -29,10 +29,11 @@ class StereoFactors:
 
     def of(self, frame: StereoFrame, k: int) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the factors between the pose X(k) and the landmarks L(track id) the frame shows."""
+        pose = X(k)
         for track_id, uv_px in zip(frame.track_ids.tolist(), frame.uvs_px.tolist(), strict=True):
             measured = gtsam.StereoPoint2(*uv_px)
             yield gtsam.GenericStereoFactor3D(
-                measured, self._noise, X(k), L(track_id), self._calibration, self._T_imu_cam
+                measured, self._noise, pose, L(track_id), self._calibration, self._T_imu_cam
             )
 
 
