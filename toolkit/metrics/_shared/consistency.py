@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
 from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.association import finite_poses, median_period_ns, truth_at
 from toolkit.metrics._shared.evaluation import Evaluation
@@ -28,18 +28,33 @@ _OTHER_WORLD = 1e-6
 class BodyErrors:
     """T_estimate^-1 T_truth (n, 4, 4) at the estimate's stamps (n,), which are its ``rows`` (n,).
 
-    ``placed`` is True where the estimate has its own world frame and was aligned with the truth's by its first pose.
+    ``T_world_imu`` (n, 4, 4) are the estimated poses in the truth's world. ``placed`` is True where the estimate has
+    its own world frame and was aligned with the truth's by its first pose.
     """
 
     t_ns: IntArray
     rows: IntArray
     T_estimate_truth: Array
+    T_world_imu: Array
     placed: bool
 
     @property
     def distance_m(self) -> Array:
         """Distances (n,) m between estimated and true positions."""
         return np.asarray(np.linalg.norm(self.T_estimate_truth[:, :3, 3], axis=1))
+
+    def select(self, kept: BoolArray) -> "BodyErrors":
+        """Return some of the errors."""
+        errors, poses = self.T_estimate_truth[kept], self.T_world_imu[kept]
+        return BodyErrors(self.t_ns[kept], self.rows[kept], errors, poses, self.placed)
+
+
+@dataclass(frozen=True, eq=False)
+class StatedErrors:
+    """The n errors whose covariance the estimate states, and these covariances (n, d, d)."""
+
+    errors: BodyErrors
+    cov: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +154,7 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
             raise Unavailable("the estimate has its own world frame, and the truth has no pose for its first one")
         place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
         poses = place(true_poses[0], poses[0]).apply(poses)
-    return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, placed)
+    return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, poses, placed)
 
 
 def starts_in_the_truths_world(sequence: Sequence) -> bool:
@@ -151,11 +166,11 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
     if not reached.any():
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
-    return float(_normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - _OTHER_WORLD, POSE_DOF)
+    return float(normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - _OTHER_WORLD, POSE_DOF)
 
 
-def nees_over_time(evaluation: Evaluation) -> Nees:
-    """Return the NEES of every pose that has a covariance and a true pose.
+def stated_errors(evaluation: Evaluation) -> StatedErrors:
+    """Return the errors of every pose that has a covariance and a true pose.
 
     Raises Unavailable where there is none, where the truth is not independent of the measurements, or where a
     stated covariance is not positive definite.
@@ -168,24 +183,31 @@ def nees_over_time(evaluation: Evaluation) -> Nees:
     if cov is None:
         raise Unavailable("the estimator states no covariance")
     errors = body_errors(evaluation)
-    stated = np.isfinite(cov[errors.rows, :POSE_DOF, :POSE_DOF]).all(axis=(1, 2))
+    stated = np.asarray(np.isfinite(cov[errors.rows, :POSE_DOF, :POSE_DOF]).all(axis=(1, 2)))
     if not stated.any():
         raise Unavailable("no pose with a true one has a finite covariance")
-    pose_cov = cov[errors.rows[stated], :POSE_DOF, :POSE_DOF]
-    indefinite = int((np.linalg.eigvalsh(pose_cov)[:, 0] <= 0.0).sum())
+    covs = cov[errors.rows[stated]]
+    indefinite = int((np.linalg.eigvalsh(covs[:, :POSE_DOF, :POSE_DOF])[:, 0] <= 0.0).sum())
     if indefinite:
-        raise Unavailable(f"the covariance of {indefinite} of {len(pose_cov)} poses is not positive definite")
-    xi = se3_log(errors.T_estimate_truth[stated])
+        raise Unavailable(f"the covariance of {indefinite} of {len(covs)} poses is not positive definite")
+    return StatedErrors(errors.select(stated), covs)
+
+
+def nees_over_time(evaluation: Evaluation) -> Nees:
+    """Return the NEES of every pose that has a covariance and a true pose. Raises as :func:`stated_errors`."""
+    stated = stated_errors(evaluation)
+    errors, pose_cov = stated.errors, stated.cov[:, :POSE_DOF, :POSE_DOF]
+    xi = se3_log(errors.T_estimate_truth)
     return Nees(
-        errors.t_ns[stated],
-        _normalised(xi, pose_cov) / POSE_DOF,
-        _normalised(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
-        _normalised(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
+        errors.t_ns,
+        normalised(xi, pose_cov) / POSE_DOF,
+        normalised(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
+        normalised(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
         errors.placed,
     )
 
 
-def _normalised(errors: Array, cov: Array) -> Array:
+def normalised(errors: Array, cov: Array) -> Array:
     """Return e^T P^-1 e (n,) of errors (n, d) with covariances (n, d, d)."""
     solved = np.linalg.solve(cov, errors[:, :, None])[:, :, 0]
     return np.asarray(np.einsum("ni,ni->n", errors, solved))
