@@ -12,7 +12,7 @@ import numpy as np
 from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import SlidingWindowFilter
-from filters.smoothing.covariance_recovery import with_covariances
+from filters.smoothing.indeterminate import with_covariances
 from filters.smoothing.robust import seen_ids, solve_robustly, worth_smoothing
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup

@@ -13,9 +13,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from filters.smoothing.covariance_recovery import with_covariances
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
-from filters.smoothing.indeterminate import Recovery, behind_camera
+from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory

@@ -83,12 +83,25 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.0
 
 
+class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
+    """Metrics that take long and are computed on request alone."""
+
+    bound: Annotated[
+        bool, Meta(description="the Cramér-Rao bound and what each estimator loses against it, on simulations")
+    ] = False
+
+    def requested(self) -> tuple[str, ...]:
+        """Return the names of those that are asked for."""
+        return tuple(name for name in self.__struct_fields__ if getattr(self, name))
+
+
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole record, by section. ``estimators`` holds options of single estimators by name, as they define them."""
 
     outliers: Outliers = Outliers()
     window: Window = Window()
     noise: Noise = Noise()
+    metrics: Metrics = Metrics()
     start: Annotated[
         Literal["measurements", "truth"], Meta(description="where the first state comes from; the truth is labelled")
     ] = "measurements"

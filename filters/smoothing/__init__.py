@@ -2,5 +2,5 @@
 
 Incremental smoothers: ``graph_builder`` (what a packet adds) with ``outlier_check``, then ``fixed_lag_tree`` and
 ``isam2_tree``, which use ``indeterminate`` and ``cached_linearisation``. Smart factors: ``smart_factors``,
-``smart_window``, ``smart_solver``. Batch: ``robust``, ``levenberg_marquardt``, ``covariance_recovery``.
+``smart_window``, ``smart_solver``. Batch: ``robust``, ``levenberg_marquardt``.
 """

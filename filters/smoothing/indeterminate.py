@@ -7,12 +7,17 @@ landmark would be indeterminate.
 """
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
+from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, se3_inverse, transform
+from toolkit.models.motion import MotionModel
+from toolkit.models.state_covariances import state_covs
 from toolkit.sequence import StereoRig
 
 # What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
@@ -55,3 +60,15 @@ def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGr
         if factors.exists(slot):
             compact.add(factors.at(slot))
     return compact
+
+
+def with_covariances(
+    trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Return the trajectory with the covariance of every state, or as it is and the reason."""
+    try:
+        covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
+    except RuntimeError as refusal:
+        name = gtsam.Symbol(variable_named(refusal)).string()
+        return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)
+    return replace(trajectory, cov=covs), ()

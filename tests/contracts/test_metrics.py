@@ -41,10 +41,19 @@ CONTRACT = [
     "cpu_s",
     "peak_rss_mb",
 ]
-# Every key in the order of tables: beside those of the contract, what later versions added.
-_ADDED = ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"]
-_BEHIND = CONTRACT.index("nees_pose_in_band_percent") + 1
-KEYS = [*CONTRACT[:_BEHIND], *_ADDED, *CONTRACT[_BEHIND:], "frame_cpu_ms_mean"]
+# What later versions added, each behind a key of the contract in the order of tables.
+_BLOCKS = ("variance", "pose", "vel", "bias")
+ADDED = {
+    "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"],
+    "pairs": [
+        "efficiency_percent",
+        "bound_position_m",
+        "bound_rotation_deg",
+        *(f"{kind}_{block}" for kind in ("excess", "claimed") for block in _BLOCKS),
+    ],
+    "peak_rss_mb": ["frame_cpu_ms_mean"],
+}
+KEYS = [key for known in CONTRACT for key in (known, *ADDED.get(known, ()))]
 
 
 T_NS = np.array([0, 100_000_000, 200_000_000])

@@ -71,7 +71,11 @@ def add_to(subcommands: Subcommands) -> None:
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
     )
     parser.add_argument(
-        "--columns", metavar="NAME,...", type=names, default=(), help="of the table: metrics by key or name, or all"
+        "--columns",
+        metavar="NAME,...",
+        type=names,
+        default=(),
+        help="of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
     )
     add_settings_arguments(parser)
     add_workers_argument(parser)
@@ -117,6 +121,7 @@ def _columns(names: tuple[str, ...]) -> Columns:
 def _configuration(options: argparse.Namespace) -> Configuration:
     """Return what is to be compared and how: the file of --config, over it --set, over that the other arguments."""
     from toolkit.experiment.configuration import configuration, read_configuration
+    from toolkit.metrics import requests_of
     from toolkit.settings import with_assignments
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
@@ -133,6 +138,8 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
     settings = with_assignments(settings, options.set)
     settings |= {key: value for key, value in named.items() if value is not None}
+    switches = () if options.columns == ("all",) else requests_of(options.columns)
+    settings = with_assignments(settings, [f"metrics.{switch}=true" for switch in switches])
     return configuration(request, settings, place)
 
 

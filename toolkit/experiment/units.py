@@ -72,7 +72,8 @@ def run_unit(unit: Unit, progress: Progress) -> Outcome:
     Raises DataError where the recording cannot be had, EstimatorError where the estimator cannot be used.
     """
     prepared = prepared_of(unit)
-    outcome = outcome_of(run_estimator(unit, prepared, progress), prepared.sequence, unit.seed)
+    requested = unit.settings.metrics.requested()
+    outcome = outcome_of(run_estimator(unit, prepared, progress), prepared.sequence, unit.seed, requested)
     return outcome if unit.keep_run else replace(outcome, run=None)
 
 
@@ -87,18 +88,18 @@ def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
     return runner.run(unit.estimator, build, prepared.sequence, prepared.prior, progress, unit.settings)
 
 
-def outcome_of(run: Run, sequence: Sequence, seed: int) -> Outcome:
-    """Score every output of a run."""
+def outcome_of(run: Run, sequence: Sequence, seed: int, requested: tuple[str, ...] = ()) -> Outcome:
+    """Score every output of a run; ``requested`` names the metrics on request that are asked for."""
     given = [output for output in OUTPUTS if run.trajectory(output) is not None]
     if run.final_is_causal:
-        causal = _scored(run, "causal", sequence)
+        causal = _scored(run, "causal", sequence, requested)
         outputs: dict[Output, Scored] = {"causal": causal, "final": replace(causal, scores=repeated(causal.scores))}
     else:
-        outputs = {output: _scored(run, output, sequence) for output in given}
+        outputs = {output: _scored(run, output, sequence, requested) for output in given}
     return Outcome(seed, run.estimator, run.status, outputs, run.log, sequence.content_hash(), run.final_is_causal, run)
 
 
-def _scored(run: Run, output: Output, sequence: Sequence) -> Scored:
+def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, ...]) -> Scored:
     evaluation = Evaluation(run, output, sequence)
     nees_pose, position_m = (np.full(sequence.frame_count, np.nan) for _ in range(2))
     with np.errstate(all="ignore"):  # a diverged run overflows, as in score_run
@@ -109,7 +110,7 @@ def _scored(run: Run, output: Output, sequence: Sequence) -> Scored:
             _put(nees_pose, sequence.frames_t_ns, nees.t_ns, nees.pose)
         except Unavailable:
             pass  # the scores have the reason
-    return Scored(score_run(run, output, sequence), nees_pose, position_m, _nis_dof(evaluation))
+    return Scored(score_run(run, output, sequence, requested), nees_pose, position_m, _nis_dof(evaluation))
 
 
 def _nis_dof(evaluation: Evaluation) -> float | None:

@@ -2,13 +2,15 @@
 
 A metric file defines ``METRICS`` (a :class:`Metric` record for each of its metrics, with all that tables and files
 say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation) -> Scores``; ``CAUSAL_ONLY`` says why
-its metrics belong to the causal output alone, where they do.
+its metrics belong to the causal output alone, where they do. ``GROUP`` is a name that stands for all of them where a
+table's columns are asked for. ``ON_REQUEST`` names the setting ``metrics.<name>`` without which metrics that take long
+are not computed.
 Read :mod:`toolkit.metrics._shared.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import cache
 from typing import NamedTuple, Protocol, cast
 
@@ -33,6 +35,7 @@ __all__ = [
     "known_metrics",
     "metrics_called",
     "repeated",
+    "requests_of",
     "score_run",
     "unavailable",
 ]
@@ -106,24 +109,34 @@ def contract_keys() -> tuple[str, ...]:
 
 
 def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
-    """Return the metrics of the given keys or names ("ate_se3_m" or "ATE SE(3)"), in the given order.
+    """Return the metrics of the given keys, names or groups ("ate_se3_m", "ATE SE(3)", "bound"), in the given order.
 
     Raises VislamError for a name that no metric has, with the nearest one.
     """
-    known = known_metrics()
-    by_name = {metric.name: metric for metric in known} | {metric.key: metric for metric in known}
+    files = _found().files
+    known = [metric for file in files for metric in file.METRICS]
+    by_name = {metric.name: (metric,) for metric in known} | {metric.key: (metric,) for metric in known}
+    by_name |= {file.GROUP: file.METRICS for file in files if hasattr(file, "GROUP")}
     chosen = tuple(names)
     for name in chosen:
         if name not in by_name:
             close = did_you_mean(name, by_name)
             raise VislamError(f"no metric is called {name}{close}; 'vislam list' names them all, by key")
-    return tuple(by_name[name] for name in chosen)
+    return tuple(metric for name in chosen for metric in by_name[name])
 
 
-def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
+def requests_of(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the settings ``metrics.<name>`` without which the metrics of some keys or names are not computed."""
+    asked = set(metrics_called(names))
+    switches = (_on_request(file) for file in _found().files if asked.intersection(file.METRICS))
+    return tuple(sorted({switch for switch in switches if switch}))
+
+
+def score_run(run: Run, output: Output, sequence: Sequence, requested: Collection[str] = ()) -> Scores:
     """Score one output of a run against its sequence, with every key of :func:`describe`.
 
-    A metric that cannot be computed, or is not finite, is None and has its reason in the notes. Raises
+    ``requested`` names the switches of metrics that are computed on request alone. A metric that cannot be computed, or
+    is not finite, is None and has its reason in the notes. Raises
     ValueError where the run has no output of that kind; an error inside a metric is a defect and passes through.
     """
     evaluation = Evaluation(run, output, sequence)
@@ -131,7 +144,7 @@ def score_run(run: Run, output: Output, sequence: Sequence) -> Scores:
     notes: dict[str, str] = {}
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
         for file in _found().files:
-            scores = _score_file(file, evaluation)
+            scores = _score_file(file, evaluation, requested)
             declared = [metric.key for metric in file.METRICS]
             if list(scores.values) != declared:
                 raise ValueError(f"{file} scored {list(scores.values)}, it declares {declared}")
@@ -151,9 +164,11 @@ def repeated(causal: Scores) -> Scores:
     return Scores(values, notes)
 
 
-def _score_file(file: MetricFile, evaluation: Evaluation) -> Scores:
+def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[str]) -> Scores:
     """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
     try:
+        if (switch := _on_request(file)) and switch not in requested:
+            raise Unavailable(f"computed on request: --set metrics.{switch}=true")
         if evaluation.output != "causal" and (reason := _causal_only(file)):
             raise Unavailable(reason)
         return file.score(evaluation)
@@ -165,3 +180,8 @@ def _score_file(file: MetricFile, evaluation: Evaluation) -> Scores:
 def _causal_only(file: MetricFile) -> str:
     """Return why a file's metrics belong to the causal output alone; nothing where they do not."""
     return str(getattr(file, "CAUSAL_ONLY", ""))
+
+
+def _on_request(file: MetricFile) -> str:
+    """Return the switch without which a file's metrics are not computed; nothing where they always are."""
+    return str(getattr(file, "ON_REQUEST", ""))

@@ -8,27 +8,12 @@ each state, which takes a hundred times as long.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.indeterminate import variable_named
-from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, IntArray
 from toolkit.models.motion import MotionModel
-
-
-def with_covariances(
-    trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel
-) -> tuple[Trajectory, tuple[str, ...]]:
-    """Return the trajectory with the covariance of every state, or as it is and the reason."""
-    try:
-        covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
-    except RuntimeError as refusal:
-        name = gtsam.Symbol(variable_named(refusal)).string()
-        return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)
-    return replace(trajectory, cov=covs), ()
 
 
 def state_covs(

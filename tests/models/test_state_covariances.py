@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.smoothing import covariance_recovery
-from filters.smoothing.covariance_recovery import state_covs
+from filters.smoothing import indeterminate
 from toolkit.models.motion import state_cov
+from toolkit.models.state_covariances import state_covs
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
@@ -23,7 +23,7 @@ def test_every_state_has_gtsams_marginal(scenario, run_estimator, monkeypatch):
         calls.append((linear, motion, poses))
         return state_covs(linear, landmark_keys, motion, poses)
 
-    monkeypatch.setattr(covariance_recovery, "state_covs", spy)
+    monkeypatch.setattr(indeterminate, "state_covs", spy)
     run = run_estimator("batch", simulate(SHORT[scenario], 3))
     (linear, motion, poses) = calls[0]
     tree = linear.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(linear))

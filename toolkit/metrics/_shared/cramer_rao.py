@@ -1,0 +1,259 @@
+"""The Cramér-Rao bound of a recording, and the estimate that attains it, at every frame.
+
+No unbiased estimator has a smaller covariance than the inverse of Fisher's information (Van Trees, "Detection,
+estimation and modulation theory", part I, 1968, section 2.4). For Gaussian measurements that is the information of
+all factors linearised at the truth: the factors, the noise, the prior and the tracks are those the estimators have.
+Here it is had without any of them: the causal bound by a forward information filter over the state and the landmarks
+that are still to be seen (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao bounds for discrete-time
+nonlinear filtering"), the final one by eliminating the whole graph.
+
+Beside the bound stands the efficient estimate, one linear step from the truth on the same measurements. The error of
+any unbiased estimator is that of the efficient one plus a part that is not correlated with it: what is left after the
+efficient error is taken off is the estimator's own loss, without the draw of noise that both share.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import gtsam
+import numpy as np
+
+from toolkit.estimate import Output
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
+from toolkit.metrics._shared.consistency import starts_in_the_truths_world
+from toolkit.metrics._shared.scores import Unavailable
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors
+from toolkit.models.gating import chi2_bound
+from toolkit.models.motion import MotionModel, motion_model
+from toolkit.models.state import POSE, Belief, Layout
+from toolkit.models.state_covariances import state_covs
+from toolkit.sequence import Packet, Sequence, StereoFrame, StereoRig
+
+# A sighting whose residual at the truth is this improbable is a mismatch and informs nobody.
+_MISMATCH_PROBABILITY = 1e-6
+_POINT_ITERATIONS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Efficient:
+    """The bound at every frame (K, d, d), and the errors (K, d) of the efficient estimate.
+
+    In the order and on the side of an Estimate's covariance; an error is what takes the estimate to the truth.
+    """
+
+    layout: Layout
+    covs: Array
+    errors: Array
+
+
+@lru_cache(maxsize=2)
+def efficient(sequence: Sequence, output: Output) -> Efficient:
+    """Return the efficient estimate of a sequence: from what is known at each frame, or from all of it.
+
+    Raises Unavailable where the truth lacks what the state has, or the sequence has no start drawn about it.
+    """
+    problem = _problem(sequence)
+    return _causal(problem) if output == "causal" else _final(problem)
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The true states, the packets without mismatches, and the landmarks (M, 3) of tracks (M,), by ascending id."""
+
+    rig: StereoRig
+    model: MotionModel
+    prior: Belief
+    states: tuple[Belief, ...]
+    packets: tuple[Packet, ...]
+    track_ids: IntArray
+    points: Array
+
+    def rows(self, frame: StereoFrame) -> IntArray:
+        """Return the rows (N,) of the landmarks that a frame shows."""
+        return np.searchsorted(self.track_ids, frame.track_ids)
+
+
+@lru_cache(maxsize=1)
+def _problem(sequence: Sequence) -> _Problem:
+    truth, prior = sequence.truth, sequence.prior
+    if truth is None:
+        raise Unavailable("the sequence has no ground truth")
+    if prior is None or not starts_in_the_truths_world(sequence):
+        raise Unavailable("the bound needs a start that was drawn about the truth, as a simulation's")
+    lacking = [name for name in ("v_world", "bias") if getattr(truth, name) is None]
+    if lacking:
+        raise Unavailable(f"the ground truth lacks {' and '.join(lacking)}")
+    assert truth.v_world is not None and truth.bias is not None
+    rows = np.minimum(np.searchsorted(truth.t_ns, sequence.frames_t_ns), truth.t_ns.size - 1)
+    if not np.array_equal(truth.t_ns[rows], sequence.frames_t_ns):
+        raise Unavailable("the bound needs a truth at every frame's stamp")
+    model, poses = motion_model(sequence.noise, sequence.gravity_world), truth.T_world_imu[rows]
+    start = model.initial_belief(prior)
+    each = zip(poses, truth.v_world[rows], truth.bias[rows], strict=True)
+    states = tuple(Belief(start.layout, *state, start.cov) for state in each)
+    packets, track_ids, points = _without_mismatches(tuple(sequence.packets()), poses, sequence.rig)
+    return _Problem(sequence.rig, model, start, states, packets, track_ids, points)
+
+
+def _without_mismatches(
+    packets: tuple[Packet, ...], poses: Array, rig: StereoRig
+) -> tuple[tuple[Packet, ...], IntArray, Array]:
+    """Return the packets without sightings that chance does not explain, and the landmarks (M,), (M, 3) of the rest."""
+    kept = packets
+    for _ in range(2):
+        track_ids, points = _landmarks(kept, poses, rig)
+        sound = [_explained(p.frame, track_ids, points, pose, rig) for p, pose in zip(kept, poses, strict=True)]
+        kept = tuple(Packet(p.index, p.motion, f) for p, f in zip(kept, sound, strict=True))
+    return kept, *_landmarks(kept, poses, rig)
+
+
+def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Array, rig: StereoRig) -> StereoFrame:
+    seen = stereo.predict(points[np.searchsorted(track_ids, frame.track_ids)], pose, rig)
+    whitened = (frame.uvs_px - seen.uv_px) @ stereo.whitener(rig).T
+    likely = np.square(whitened).sum(axis=1) < chi2_bound(3, 1.0 - _MISMATCH_PROBABILITY)
+    return frame.select(likely & (seen.depth_m > 0.0))
+
+
+def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tuple[IntArray, Array]:
+    """Return the tracks (M,) and the points (M, 3) that explain their sightings from the true poses best."""
+    frames = [packet.frame for packet in packets]
+    ids, uvs_px = np.concatenate([f.track_ids for f in frames]), np.concatenate([f.uvs_px for f in frames])
+    pose = np.repeat(np.arange(len(frames)), [f.track_ids.size for f in frames])
+    # By track, the widest disparity, which tells the depth best, first.
+    order = np.lexsort((-stereo.disparity_px(uvs_px), ids))
+    uvs_px, seen_from = uvs_px[order], poses[pose[order]]
+    track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
+    points = stereo.triangulate_world(uvs_px[first], seen_from[first], rig)
+    whitener = stereo.whitener(rig)
+    for _ in range(_POINT_ITERATIONS):
+        seen = stereo.predict(points[track], seen_from, rig)
+        H, residuals = whitener @ seen.d_uv_d_point, (uvs_px - seen.uv_px) @ whitener.T
+        H_transposed = np.swapaxes(H, 1, 2)
+        information = np.add.reduceat(H_transposed @ H, first)
+        score = np.add.reduceat((H_transposed @ residuals[..., None])[..., 0], first)
+        points = points + np.linalg.solve(information, score[..., None])[..., 0]
+    return track_ids, points
+
+
+def offset(state: Belief, truth: Belief) -> Array:
+    """Return the error (d,) that takes a state to the truth, in the layout's order and in the body frame."""
+    layout, error = state.layout, np.zeros(state.layout.size)
+    error[POSE] = se3_log(se3_inverse(state.T_world_imu) @ truth.T_world_imu)
+    if layout.velocity is not None:
+        error[layout.velocity] = state.T_world_imu[:3, :3].T @ (truth.v_world - state.v_world)
+    if layout.accel_bias is not None:
+        error[layout.accel_bias] = truth.bias[:3] - state.bias[:3]
+    error[layout.gyro_bias] = truth.bias[3:] - state.bias[3:]
+    return error
+
+
+def _causal(problem: _Problem) -> Efficient:
+    """Carry the information of state and landmarks forward; a landmark leaves it with its last sighting."""
+    last_seen = np.zeros(problem.track_ids.size, dtype=np.int64)
+    for packet in problem.packets:
+        last_seen[problem.rows(packet.frame)] = packet.index
+    known = _Information(problem)
+    covs, errors = [], []
+    for packet in problem.packets:
+        if packet.motion is not None:
+            known.predict(packet)
+        known.update(packet.frame, problem.states[packet.index].T_world_imu)
+        cov, mean = known.state()
+        covs.append(cov)
+        errors.append(-mean)
+        known.forget(np.asarray(last_seen <= packet.index))
+    return Efficient(problem.prior.layout, np.array(covs), np.array(errors))
+
+
+class _Information:
+    """The information matrix and vector of the state's and the landmarks' offsets from the truth, the state first."""
+
+    def __init__(self, problem: _Problem) -> None:
+        self._problem, self._size = problem, problem.prior.layout.size
+        self._matrix = np.asarray(np.linalg.inv(problem.prior.cov))
+        self._vector: Array = self._matrix @ offset(problem.states[0], problem.prior)
+        self._landmarks = np.empty(0, dtype=np.int64)  # rows of the problem's landmarks
+
+    def predict(self, packet: Packet) -> None:
+        """Bring in the next state by the measured motion, and let the one before it go."""
+        problem, d, k = self._problem, self._size, packet.index
+        assert packet.motion is not None
+        before, now = problem.states[k - 1], problem.states[k]
+        increment = problem.model.integrate(packet.motion, before.bias)
+        prediction = increment.predict(before)
+        # At the true end, not at the predicted one: what nothing measures stays unmeasured.
+        at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
+        transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
+        # The measured motion says that the next state's offset is F x + r, but for its noise.
+        r = offset(now, before.predicted(prediction))
+        weighted = transition.T @ precision
+        to_next = np.concatenate([-weighted, self._matrix[:d, d:]], axis=1)
+        score = self._vector[:d] - weighted @ r
+        gain = np.linalg.solve(self._matrix[:d, :d] + weighted @ transition, np.column_stack([to_next, score]))
+        self._matrix[:d], self._matrix[:, :d], self._matrix[:d, :d] = 0.0, 0.0, precision
+        self._matrix -= to_next.T @ gain[:, :-1]
+        self._vector = np.concatenate([precision @ r, self._vector[d:]]) - to_next.T @ gain[:, -1]
+
+    def update(self, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Take the sightings of a frame in; landmarks seen for the first time join."""
+        problem, rows = self._problem, self._problem.rows(frame)
+        self._join(rows[~np.isin(rows, self._landmarks)])
+        seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
+        whitener = stereo.whitener(problem.rig)
+        H = np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
+        residuals = (frame.uvs_px - seen.uv_px) @ whitener.T
+        place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]
+        own = self._size + 3 * place[:, None] + np.arange(3)
+        columns = np.concatenate([np.broadcast_to(np.arange(6), (len(rows), 6)), own], axis=1)
+        H_transposed = np.swapaxes(H, 1, 2)
+        np.add.at(self._matrix, (columns[:, :, None], columns[:, None, :]), H_transposed @ H)
+        np.add.at(self._vector, columns, (H_transposed @ residuals[..., None])[..., 0])
+
+    def state(self) -> tuple[Array, Array]:
+        """Return the covariance (d, d) and the mean (d,) of the state's offset."""
+        d = self._size
+        inner = np.linalg.solve(self._matrix[d:, d:], np.column_stack([self._matrix[d:, :d], self._vector[d:]]))
+        cov = np.linalg.inv(self._matrix[:d, :d] - self._matrix[:d, d:] @ inner[:, :d])
+        return 0.5 * (cov + cov.T), cov @ (self._vector[:d] - self._matrix[:d, d:] @ inner[:, d])
+
+    def forget(self, gone: BoolArray) -> None:
+        """Let landmarks go that are not seen again: ``gone`` (M,) of the problem's."""
+        leaving = gone[self._landmarks]
+        if not leaving.any():
+            return
+        out = np.concatenate([np.zeros(self._size, dtype=bool), np.repeat(leaving, 3)])
+        across = self._matrix[np.ix_(out, ~out)]
+        gain = np.linalg.solve(self._matrix[np.ix_(out, out)], np.column_stack([across, self._vector[out]]))
+        self._matrix = self._matrix[np.ix_(~out, ~out)] - across.T @ gain[:, :-1]
+        self._vector = self._vector[~out] - across.T @ gain[:, -1]
+        self._landmarks = self._landmarks[~leaving]
+
+    def _join(self, rows: IntArray) -> None:
+        grown = len(self._matrix) + 3 * len(rows)
+        matrix, vector = np.zeros((grown, grown)), np.zeros(grown)
+        matrix[: len(self._matrix), : len(self._matrix)], vector[: len(self._vector)] = self._matrix, self._vector
+        self._matrix, self._vector = matrix, vector
+        self._landmarks = np.concatenate([self._landmarks, rows])
+
+
+def _final(problem: _Problem) -> Efficient:
+    """Solve the whole graph linearised at the truth."""
+    model, values = problem.model, gtsam.Values()
+    graph = model.hold(problem.prior, 0)
+    maker = StereoFactors(problem.rig)
+    for packet, state in zip(problem.packets, problem.states, strict=True):
+        model.insert(values, state.estimate(packet.frame.t_ns), packet.index)
+        if packet.motion is not None:
+            bias = problem.states[packet.index - 1].bias
+            graph.push_back(model.integrate(packet.motion, bias).factors(packet.index))
+        for factor in maker.of(packet.frame, packet.index):
+            graph.add(factor)
+    for track_id, point in zip(problem.track_ids.tolist(), problem.points, strict=True):
+        values.insert(L(track_id), point)
+    linear = graph.linearize(values)
+    poses = np.stack([state.T_world_imu for state in problem.states])
+    covs = state_covs(linear, [L(i) for i in problem.track_ids.tolist()], model, poses)
+    moved = values.retract(linear.optimize())
+    errors = [offset(state.at(model.read(moved, k, 0)), state) for k, state in enumerate(problem.states)]
+    return Efficient(problem.prior.layout, covs, np.array(errors))

@@ -1,0 +1,94 @@
+"""How close to the limit: the Cramér-Rao bound of the recording, and what the estimator loses against it.
+
+Van Trees, "Detection, estimation and modulation theory", part I (1968), section 2.4; how bound and efficient estimate
+are had is in :mod:`toolkit.metrics._shared.cramer_rao`. The error of an unbiased estimator is that of the efficient one
+on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P and that of
+d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
+"""
+
+import numpy as np
+
+from toolkit.geometry import Array
+from toolkit.metrics._shared.consistency import normalised, stated_errors
+from toolkit.metrics._shared.cramer_rao import efficient
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.scores import Metric, Scores
+from toolkit.metrics._shared.state_errors import NO_SUCH_BLOCK, state_errors
+from toolkit.models.state import POSE, POSITION, ROTATION, Layout
+
+ORDER = 85
+GROUP = ON_REQUEST = "bound"
+_BLOCKS = {"variance": "whole state", "pose": "pose", "vel": "velocity", "bias": "biases"}
+
+
+def _metric(key: str, meaning: str, heading: tuple[str, str], decimals: int = 3, unit: str = "1") -> Metric:
+    return Metric(key, meaning, unit, heading, decimals=decimals, best="", over_seeds=True)
+
+
+METRICS = (
+    Metric(
+        "efficiency_percent",
+        "bound_position_m over the RMS position error to be expected of the estimator (percent)",
+        "%",
+        ("effi-", "ciency"),
+        name="efficiency",
+        decimals=1,
+        best="most",
+        over_seeds=True,
+    ),
+    _metric("bound_position_m", "least RMS position error of any unbiased estimator (m)", ("bound", "pos"), 4, "m"),
+    _metric("bound_rotation_deg", "the same of the rotation (deg)", ("bound", "rot"), 3, "deg"),
+    *(
+        _metric(
+            f"excess_{key}",
+            f"variance of the {what} beyond the bound, over the bound: mean of d^T P^-1 d over its degrees of freedom",
+            ("excess", key[:8]),
+        )
+        for key, what in _BLOCKS.items()
+    ),
+    *(
+        _metric(
+            f"claimed_{key}",
+            f"stated variance of the {what} over the bound: mean trace of P^-1 times it over its degrees of freedom",
+            ("claimed", key[:8]),
+        )
+        for key, what in _BLOCKS.items()
+    ),
+)
+
+
+def score(evaluation: Evaluation) -> Scores:
+    """Score an output against the bound of what it could know: at each frame, or from the whole recording."""
+    best, stated = efficient(evaluation.sequence, evaluation.output), stated_errors(evaluation)
+    frames = np.searchsorted(evaluation.sequence.frames_t_ns, stated.errors.t_ns)
+    excess, bound = state_errors(evaluation, stated) - best.errors[frames], best.covs[frames]
+    position_m = _rms(bound, POSITION)
+    lost_m = float(np.sqrt(np.square(excess[:, POSITION]).sum(axis=1).mean()))
+    values: dict[str, float | None] = {
+        "efficiency_percent": 100.0 * position_m / float(np.hypot(position_m, lost_m)),
+        "bound_position_m": position_m,
+        "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION))),
+    }
+    blocks = _blocks(best.layout)
+    for key, block in blocks.items():
+        values[f"excess_{key}"] = None if block is None else _excess(excess, bound, block)
+    for key, block in blocks.items():
+        values[f"claimed_{key}"] = None if block is None else _claimed(stated.cov, bound, block)
+    return Scores(values, {key: NO_SUCH_BLOCK for key, value in values.items() if value is None})
+
+
+def _blocks(layout: Layout) -> dict[str, slice | None]:
+    return dict(zip(_BLOCKS, (slice(0, layout.size), POSE, layout.velocity, layout.biases), strict=True))
+
+
+def _rms(bound: Array, block: slice) -> float:
+    return float(np.sqrt(np.mean(np.trace(bound[:, block, block], axis1=1, axis2=2))))
+
+
+def _excess(excess: Array, bound: Array, block: slice) -> float:
+    return float(np.mean(normalised(excess[:, block], bound[:, block, block]))) / float(block.stop - block.start)
+
+
+def _claimed(stated: Array, bound: Array, block: slice) -> float:
+    ratio = np.linalg.solve(bound[:, block, block], stated[:, block, block])
+    return float(np.mean(np.trace(ratio, axis1=1, axis2=2))) / float(block.stop - block.start)
