@@ -10,7 +10,7 @@ The shipped baseline may have more tests than the pool: they are filled up with 
 Intervals are the central 95 % of the rates of pools drawn from the pool (bootstrap over seeds), each with its own
 checks; they hold the chance of the pool as well as of the checks.
 
-    python tests/benchmarks/bench_gate_power.py fill POOL [SEEDS [ESTIMATOR ...]]
+    python tests/benchmarks/bench_gate_power.py fill POOL [SEEDS [PROCESSES [ESTIMATOR ...]]]
     python tests/benchmarks/bench_gate_power.py rates POOL [TESTS [SEEDS_OF_A_CHECK ...]]
 """
 
@@ -34,8 +34,8 @@ import gate_pool
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE
 from toolkit.gate.paired import Pairs, Where, rejected, worse_p
 
-CASES = {"flight": 2.5, "drive": 5.0}
-ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "batch")
+CASES = {"flight": 2.5, "drive": 25.0}
+ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "batch")
 POOLS, CHECKS = 60, 100
 ATE = ("ate_se3_m", "ate_yaw_m")
 Table = np.ndarray[Any, np.dtype[np.float64]]
@@ -174,8 +174,8 @@ def main(words: list[str]) -> None:
         sys.exit(__doc__)
     path = Path(words[1])
     if words[0] == "fill":
-        count = int(words[2]) if len(words) > 2 else 60
-        gate_pool.fill(path, CASES, range(count), tuple(words[3:]) or ESTIMATORS)
+        count, processes = (int(word) for word in (*words[2:4], *("60", "2")[len(words[2:4]) :]))
+        gate_pool.fill(path, CASES, range(count), tuple(words[4:]) or ESTIMATORS, processes)
         return
     pool = list(gate_pool.read(path))
     print_spreads(pool)

@@ -36,6 +36,11 @@ def add_to(subcommands: Subcommands) -> None:
     add_workers_argument(parser)
     for name, what in _FILES.items():
         parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
+    parser.add_argument(
+        "--accept-better",
+        action="store_true",
+        help="let results that moved pass unless they are worse, as after a change that is meant to move them",
+    )
     parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")
     parser.add_argument(
         "--allow-other-releases",
@@ -50,6 +55,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline_file import check_releases, load_baseline
     from toolkit.gate.checking import How, check
+    from toolkit.gate.judging import Terms
     from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, write_check
     from toolkit.report.gate_text import gate_text
@@ -61,7 +67,8 @@ def command(options: argparse.Namespace) -> int:
     baseline = load_baseline(options.baseline)
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
-    how = How(options.workers or usable_cpus(), speed=not options.skip_speed)
+    terms = Terms(speed=not options.skip_speed, accept_better=options.accept_better)
+    how = How(options.workers or usable_cpus(), terms)
     checked = check(baseline, str(options.baseline), how, of_this_process())
     write_check(checked, files)
     print(gate_text(checked, width_of_output()))

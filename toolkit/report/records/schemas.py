@@ -19,7 +19,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "report-over-seeds-1": SeedsReport,
     "manifest-1": Manifest,
     "baseline-1": BaselineRecord,
-    "check-1": CheckDocument,
+    "check-2": CheckDocument,
 }
 
 
