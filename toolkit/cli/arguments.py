@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
+    from toolkit.gate.trajectory_check import Truths
     from toolkit.settings import Settings
 
 _EXIT_STATUSES = """\
@@ -99,6 +100,17 @@ def named_file(text: str) -> tuple[str, Path]:
     if not (equals and name.strip() and file):
         raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
     return name.strip(), Path(file)
+
+
+def truths_given(given: Iterable[str]) -> "Truths":
+    """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
+    from toolkit.gate.trajectory_check import Truths
+
+    named = [text.partition("=") for text in given if "=" in text and not Path(text).is_dir()]
+    folders = [Path(text) for text in given if "=" not in text or Path(text).is_dir()]
+    if len(folders) > 1:
+        raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
+    return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})
 
 
 def at_least(least: int) -> Callable[[str], int]:

@@ -105,7 +105,7 @@ def note_lines(check: Check) -> Iterator[str]:
     if check.tests:
         blind = [v for v in check.verdicts if v.seen_percent is not None and v.seen_percent > 10.0 and not v.fails]
         yield (
-            f"{check.tests} paired tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
+            f"{check.tests} tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
             "'sees' is the change each of them finds with 95 % power, from how much it scatters"
         )
         if blind:
@@ -116,7 +116,7 @@ def note_lines(check: Check) -> Iterator[str]:
             "baseline makes it the answer to come"
         )
     releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
-    yield f"{releases}; {check.seconds:.0f} s"
+    yield "; ".join(filter(None, (releases, f"{check.seconds:.0f} s")))
 
 
 def gate_text(check: Check, width: Width = WIDTH) -> str:
