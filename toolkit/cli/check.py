@@ -58,6 +58,12 @@ def add_to(subcommands: Subcommands) -> None:
     )
     parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")
     parser.add_argument(
+        "--speed-against",
+        metavar="REVISION|WHEEL",
+        help="judge time by runs in turn with another version of the code: a git revision of the checkout you stand "
+        "in, or a wheel; sees 15 %%, on any machine",
+    )
+    parser.add_argument(
         "--allow-other-releases",
         action="store_true",
         help="compare although GTSAM or NumPy is another release than the baseline's",
@@ -87,13 +93,15 @@ def _of_estimators(options: argparse.Namespace) -> Check:
     from toolkit.gate.judging import Terms
     from toolkit.progress import of_this_process
 
+    if options.speed_against and options.skip_speed:
+        raise UsageError("--speed-against and --skip-speed exclude each other")
     if options.truth:
         raise UsageError("--truth goes with --trajectories; a baseline of estimators names its own truth")
     baseline = load_baseline(options.baseline)
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
     terms = Terms(speed=not options.skip_speed, accept_better=options.accept_better)
-    how = How(options.workers or usable_cpus(), terms)
+    how = How(options.workers or usable_cpus(), terms, speed_against=options.speed_against)
     return check(baseline, str(options.baseline), how, of_this_process())
 
 
@@ -101,6 +109,8 @@ def _of_trajectories(options: argparse.Namespace) -> Check:
     from toolkit.gate.trajectory_baseline import load_trajectory_baseline
     from toolkit.gate.trajectory_check import check_trajectories
 
+    if options.speed_against:
+        raise UsageError("--speed-against times estimators; with --trajectories nothing runs")
     baseline, truths = load_trajectory_baseline(options.baseline), truths_given(options.truth)
     accept = options.accept_better
     return check_trajectories(baseline, str(options.baseline), options.trajectories, truths, accept_better=accept)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from toolkit.estimator import find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured
+from toolkit.gate.interleaved import compare_speed
 from toolkit.gate.judging import USUAL_TERMS, Judged, Terms, judge_case
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.paired import judge_pairs
@@ -18,11 +19,15 @@ from toolkit.settings import DEFAULTS, Settings
 
 @dataclass(frozen=True)
 class How:
-    """How to run: so many processes, with which settings, and on which terms to judge."""
+    """How to run: so many processes, with which settings, and on which terms to judge.
+
+    ``speed_against`` names another version of the code, a git revision or a wheel, to take turns with for speed.
+    """
 
     workers: int
     terms: Terms = USUAL_TERMS
     settings: Settings = DEFAULTS
+    speed_against: str | None = None
 
 
 def new_baseline(
@@ -47,9 +52,17 @@ def new_baseline(
 
 
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
-    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error."""
+    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error.
+
+    Raises BaselineError where another version of the code is asked for and cannot be had or timed.
+    """
     began, how = time.monotonic(), replace(how, settings=baseline.settings)
     judged = Judged()
+    if how.speed_against is not None:
+        speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
+        judged.verdicts += speeds.verdicts
+        judged.notes += speeds.notes
+        how = replace(how, terms=replace(how.terms, speed=False))
     for case, before in baseline.cases:
         now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
         one = judge_case(case, before, now, baseline.bounds, how.terms)
