@@ -53,6 +53,14 @@ class Timed:
         return logs[:, 1] - logs[:, 0]
 
 
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """What was timed, and what to know beside it."""
+
+    timed: tuple[Timed, ...]
+    notes: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Speeds:
     """What became of the comparison: a verdict for each estimator and case, and what to know beside them."""
@@ -63,10 +71,16 @@ class Speeds:
 
 
 def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
-    """Time the estimators of a baseline, the installed code against another version of it.
+    """Judge the time of a baseline's estimators, the installed code's against another version's.
 
     Raises BaselineError where the version cannot be had or cannot be timed.
     """
+    turns = timed_in_turn(baseline, version, progress_for)
+    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes, len(turns.timed))
+
+
+def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
+    """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
     found: list[Timed] = []
@@ -83,7 +97,7 @@ def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: P
                     progress.advance(done, len(present))
                     timed = _time(sides, case.source, name)
                     (found if isinstance(timed, Timed) else notes).append(timed)  # type: ignore[arg-type]
-    return Speeds(tuple(judge_speeds(found, version, rate)), tuple(notes), len(found))
+    return Turns(tuple(found), tuple(notes))
 
 
 def judge_speeds(found: Sequence[Timed], version: str, rate: float) -> Iterator[Verdict]:
@@ -99,7 +113,7 @@ def judge_speeds(found: Sequence[Timed], version: str, rate: float) -> Iterator[
         seen = 100.0 * float(np.expm1(_seen(timed.differences, rate / len(found))))
         yield Verdict(
             timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else words, was, is_,
-            100.0 * (ratio - 1.0), 100.0 * MARGIN, p, seen,
+            100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
         )  # fmt: skip
 
 
