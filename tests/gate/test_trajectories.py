@@ -123,6 +123,13 @@ def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_judged(vislam, capsy
     assert "not in the baseline, and not judged: new" in told
 
 
+def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
+    Path("results/lap\x1b[31m.tum").write_text("spoilt")
+    Path("results/maze/\x1b]0;0.tum").write_text("spoilt")
+    assert failures(vislam) == [("maze", "sequence", "missing")]
+    assert "\x1b" not in capsys.readouterr().out
+
+
 def test_another_clock_is_told_with_both_ranges(vislam, capsys):
     write(Path("results/lap.tum"), stamps(10.0, 3600.0, 3660.0))
     assert failures(vislam) == [("lap", "sequence", "missing")]

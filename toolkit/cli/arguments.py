@@ -23,7 +23,7 @@ exit status:
   0    everything ran and ended well
   1    an estimator diverged or failed (the results are written and say so),
        check-data found a fault that is not repaired, or check found that
-       something got worse than the baseline or is missing
+       something got worse than the baseline, moved or is missing
   2    the command line is wrong
   3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written

@@ -1,4 +1,4 @@
-"""``vislam check``: has anything got worse than a baseline?"""
+"""``vislam check``: has anything got worse than a baseline, or moved from it?"""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ def add_to(subcommands: Subcommands) -> None:
     """Add the subcommand."""
     parser = subcommands.add_parser(
         "check",
-        help="fail if accuracy, consistency or speed got worse than a baseline",
+        help="fail if accuracy, consistency or speed are not a baseline's",
         description="Run again what a baseline lists, on the same measurements, and fail where accuracy, "
-        "consistency, held-out reprojection or speed got worse, or anything is missing. See docs/gate.md.",
+        "consistency, held-out reprojection or speed got worse, an answer moved, or anything is missing. With "
+        "--trajectories, judge files of another system in the same way. See docs/gate.md.",
         epilog=epilog(
             "vislam baseline drive --estimators dead-reckoning --seeds 5 --duration 2 --out baseline.json",
             "vislam check --baseline baseline.json --skip-speed",
@@ -72,7 +73,7 @@ def add_to(subcommands: Subcommands) -> None:
 
 
 def command(options: argparse.Namespace) -> int:
-    """Check, print and return 1 where anything got worse or is missing."""
+    """Check, print and return 1 where anything fails."""
     from toolkit.report.gate_files import check_writable, write_check
     from toolkit.report.gate_text import gate_text
     from toolkit.report.prose import width_of_output
@@ -90,7 +91,6 @@ def _of_estimators(options: argparse.Namespace) -> Check:
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline_file import check_releases, load_baseline
     from toolkit.gate.checking import How, check
-    from toolkit.gate.judging import Terms
     from toolkit.progress import of_this_process
 
     if options.speed_against and options.skip_speed:
@@ -100,8 +100,12 @@ def _of_estimators(options: argparse.Namespace) -> Check:
     baseline = load_baseline(options.baseline)
     if not options.allow_other_releases:
         check_releases(baseline, str(options.baseline))
-    terms = Terms(speed=not options.skip_speed, accept_better=options.accept_better)
-    how = How(options.workers or usable_cpus(), terms, speed_against=options.speed_against)
+    how = How(
+        options.workers or usable_cpus(),
+        speed=not options.skip_speed,
+        accept_better=options.accept_better,
+        speed_against=options.speed_against,
+    )
     return check(baseline, str(options.baseline), how, of_this_process())
 
 

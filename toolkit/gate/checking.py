@@ -19,15 +19,22 @@ from toolkit.settings import DEFAULTS, Settings
 
 @dataclass(frozen=True)
 class How:
-    """How to run: so many processes, with which settings, and on which terms to judge.
+    """How to run: so many processes, whether time counts, with which settings, and what passes.
 
-    ``speed_against`` names another version of the code, a git revision or a wheel, to take turns with for speed.
+    ``accept_better`` lets what moved pass unless it is worse; ``speed_against`` names another version of the code, a
+    git revision or a wheel, to take turns with for speed.
     """
 
     workers: int
-    terms: Terms = USUAL_TERMS
+    speed: bool = True
     settings: Settings = DEFAULTS
+    accept_better: bool = False
     speed_against: str | None = None
+
+    @property
+    def terms(self) -> Terms:
+        """On which terms each case is judged; time that is told otherwise is not judged twice."""
+        return Terms(self.speed and self.speed_against is None, self.accept_better)
 
 
 def new_baseline(
@@ -62,7 +69,6 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
         speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
         judged.verdicts += speeds.verdicts
         judged.notes += speeds.notes
-        how = replace(how, terms=replace(how.terms, speed=False))
     for case, before in baseline.cases:
         now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
         one = judge_case(case, before, now, baseline.bounds, how.terms)

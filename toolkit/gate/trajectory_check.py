@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.bounded import judge_recorded
 from toolkit.gate.measuring import DATA_ROOT
@@ -69,7 +69,7 @@ def check_trajectories(
         try:
             now = _now(sequence, before, there.get(sequence, ()), truths, baseline.scoring)
         except DataError as error:
-            verdicts.append(Verdict(sequence, "", "", _SEQUENCE, "missing", " ".join(str(error).split())))
+            verdicts.append(Verdict(sequence, "", "", _SEQUENCE, "missing", printable(" ".join(str(error).split()))))
             continue
         verdicts += _coverage(sequence, before, now, baseline.coverage_points)
         for key, percent in baseline.bounds.items():

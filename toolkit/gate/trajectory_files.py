@@ -15,9 +15,10 @@ import numpy as np
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import range_s
 from toolkit.datasets.trajectories.poses import check_order
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 from toolkit.files import content_digest
 from toolkit.geometry import Array, IntArray
+from toolkit.inputs import unreadable
 from toolkit.metrics import Unavailable
 from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_sim3, fit_yaw
 from toolkit.metrics._shared.association import Matched, distance_along, median_period_ns, poses_at
@@ -66,9 +67,9 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
     if not folder.is_dir():
         raise DataError(f"{folder}: it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum")
     found: dict[str, tuple[Path, ...]] = {}
-    for path in sorted(folder.iterdir()):
-        files = _files_in(path) if path.is_dir() else (path,) if _is_file(path) else ()
-        name = path.name if path.is_dir() else path.stem
+    for path in _entries(folder):
+        files = tuple(filter(_is_file, _entries(path))) if path.is_dir() else (path,) if _is_file(path) else ()
+        name = printable(path.name if path.is_dir() else path.stem)
         if files and name in found:
             raise DataError(f"{folder}: {name} is there twice, as {found[name][0].name} and {path.name}; leave one")
         if files:
@@ -78,8 +79,11 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
     return found
 
 
-def _files_in(folder: Path) -> tuple[Path, ...]:
-    return tuple(path for path in sorted(folder.iterdir()) if _is_file(path))
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir())
+    except OSError as error:
+        raise DataError(unreadable(folder, error)) from error
 
 
 def _is_file(path: Path) -> bool:
