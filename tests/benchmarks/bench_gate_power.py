@@ -45,7 +45,7 @@ from toolkit.progress import silent
 CASES = {"flight": 2.5, "drive": 25.0}
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "batch")
 POOLS, CHECKS = 60, 100
-MOST_TIMED = 80
+MOST_TIMED = 40
 Table = np.ndarray[Any, np.dtype[np.float64]]
 Rows = np.ndarray[Any, np.dtype[np.int64]]
 Fails = np.ndarray[Any, np.dtype[np.bool_]]

@@ -24,7 +24,6 @@ class Timer:
 
     def where(self, asked: Json) -> Json:
         """Return where the toolkit and each estimator come from; an estimator that is not there has no file."""
-        import toolkit
         from toolkit.errors import VislamError
         from toolkit.estimator import find
 
@@ -34,7 +33,7 @@ class Timer:
                 files[name] = sys.modules[find(name).load().__module__].__file__
             except VislamError:
                 files[name] = None
-        return {"toolkit": toolkit.__file__, "files": files}
+        return {"toolkit": sys.modules["toolkit"].__file__, "files": files}
 
     def prepare(self, asked: Json) -> Json:
         """Make a recording ready."""
