@@ -8,7 +8,7 @@ and the place in it. Fields a record does not know are passed over, for a later 
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -20,6 +20,7 @@ from toolkit.inputs import read_input
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
+Older = Mapping[str, Callable[[Json], Json]]
 
 # What msgspec calls a type, in JSON's words.
 _KINDS = {
@@ -49,9 +50,14 @@ def to_line(record: msgspec.Struct) -> str:
 
 
 def read(
-    path: Path, record: type[Record], *, remedy: str = "make it again", error: type[VislamError] = DataError
+    path: Path,
+    record: type[Record],
+    *,
+    remedy: str = "make it again",
+    error: type[VislamError] = DataError,
+    older: Older | None = None,
 ) -> Record:
-    """Read the record in a file.
+    """Read the record in a file; ``older`` has what brings documents of earlier versions up to the present one.
 
     Raises ``error`` where the file cannot be read or breaks the contract: one line with the file, the place in the
     document, what is wrong there, and ``remedy``.
@@ -63,18 +69,20 @@ def read(
             raise error(f"{path} is missing; {remedy}") from None
         raise error(str(why)) from why
     try:
-        return parse(content, record)
+        return parse(content, record, older)
     except DataError as why:
         raise error(f"{path} {why}; {remedy}") from why
 
 
-def parse(content: bytes | str, record: type[Record]) -> Record:
+def parse(content: bytes | str, record: type[Record], older: Older | None = None) -> Record:
     """Return the record in the text of a document; raises DataError, which names the place of what is wrong."""
     try:
         document = _decoded(content)
     except _NOT_JSON as why:
         raise DataError(f"cannot be read as JSON ({why})") from why
     wanted, given = schema_name(record), _schema_of(document)
+    if older and isinstance(document, dict) and isinstance(given, str) and given in older:
+        document, given = {**older[given](document), "schema": wanted}, wanted
     if given != wanted:
         what = "it has none" if given is None else f"its schema is {given!r}"
         raise DataError(f"has not the schema {wanted}, which this version reads: {what}")

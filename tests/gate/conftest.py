@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series
 from toolkit.gate.checking import judge_all
-from toolkit.gate.judging import Judged, judge_case
+from toolkit.gate.judging import Judged, Terms, judge_case
 from toolkit.gate.releases import installed
 from toolkit.gate.verdict import Check
 
@@ -60,15 +60,15 @@ def edited(measured: Measured, edit: Edit) -> Measured:
     return replace(measured, runs=runs)
 
 
-def judged(baseline: Baseline, now: list[Measured], *, speed: bool = True) -> Check:
+def judged(baseline: Baseline, now: list[Measured], *, speed: bool = True, accept_better: bool = False) -> Check:
     """Judge measurements that were never made against a baseline."""
-    every = Judged()
+    every, terms = Judged(), Terms(speed, accept_better)
     for (case, before), after in zip(baseline.cases, now, strict=True):
-        one = judge_case(case, before, after, baseline.bounds, speed=speed)
+        one = judge_case(case, before, after, baseline.bounds, terms)
         every.verdicts += one.verdicts
         every.tests += one.tests
         every.notes += one.notes
-    return judge_all(every, baseline, "made-up.json", 1.0)
+    return judge_all(every, baseline, "made-up.json", 1.0, terms)
 
 
 def as_measured(baseline: Baseline) -> list[Measured]:
@@ -86,9 +86,20 @@ def planted(percent: float, seed: int, estimator: str = "two", metric: str = "at
     return edit
 
 
+def as_another_trajectory(measured: Measured) -> Measured:
+    """Return what is measured with every metric moved by a hundred-thousandth, as by poses that are not the same."""
+    return edited(measured, lambda _name, _key, values: values * (1.0 + 1e-5))
+
+
 @pytest.fixture
 def gate() -> SimpleNamespace:
     """Return the ways to change what is measured, and to judge it."""
     return SimpleNamespace(
-        as_measured=as_measured, edited=edited, estimators=ESTIMATORS, judged=judged, planted=planted, seeds=SEEDS
+        as_measured=as_measured,
+        another=as_another_trajectory,
+        edited=edited,
+        estimators=ESTIMATORS,
+        judged=judged,
+        planted=planted,
+        seeds=SEEDS,
     )

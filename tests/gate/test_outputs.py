@@ -54,7 +54,7 @@ def test_json_has_every_verdict_and_no_number_that_is_none(check, tmp_path):
     write_check(check, {"json": tmp_path / "deep" / "gate.json"})
     document = json.loads((tmp_path / "deep" / "gate.json").read_text(), parse_constant=pytest.fail)
     assert read_check(tmp_path / "deep" / "gate.json") == check_document(check)
-    assert document["schema"] == "vislam.check/1"
+    assert document["schema"] == "vislam.check/2"
     assert document["passed"] is check.passed
     assert document["failures"] == len(check.failures)
     assert [v["fails"] for v in document["verdicts"]] == [v.fails for v in check.verdicts]
@@ -84,7 +84,7 @@ def test_the_text_says_what_got_worse_by_how_much_and_how_sure(failed):
     assert "flight, two causal: position error (ATE, SE(3)) got worse: +" in text
     assert "over 24 seeds, and chance explains that with p = " in text
     assert "data/drive_small, three: estimator is missing: it needs" in text
-    assert text.endswith("the gate fails: of 33 comparisons with made-up.json, 1 got worse, 1 missing")
+    assert text.endswith("the gate fails: of 36 comparisons with made-up.json, 1 got worse, 1 missing")
 
 
 def test_the_text_of_a_check_that_passes_says_so_last(passed):

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
+    from toolkit.gate.trajectory_check import Truths
     from toolkit.settings import Settings
 
 _EXIT_STATUSES = """\
@@ -22,7 +23,7 @@ exit status:
   0    everything ran and ended well
   1    an estimator diverged or failed (the results are written and say so),
        check-data found a fault that is not repaired, or check found that
-       something got worse than the baseline or is missing
+       something got worse than the baseline, moved or is missing
   2    the command line is wrong
   3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written
@@ -99,6 +100,17 @@ def named_file(text: str) -> tuple[str, Path]:
     if not (equals and name.strip() and file):
         raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
     return name.strip(), Path(file)
+
+
+def truths_given(given: Iterable[str]) -> "Truths":
+    """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
+    from toolkit.gate.trajectory_check import Truths
+
+    named = [text.partition("=") for text in given if "=" in text and not Path(text).is_dir()]
+    folders = [Path(text) for text in given if "=" not in text or Path(text).is_dir()]
+    if len(folders) > 1:
+        raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
+    return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})
 
 
 def at_least(least: int) -> Callable[[str], int]:

@@ -17,6 +17,7 @@ from toolkit.cli.arguments import (
     epilog,
     positive_seconds,
     settings_asked,
+    truths_given,
 )
 from toolkit.errors import printable
 
@@ -43,7 +44,7 @@ def add_to(subcommands: Subcommands) -> None:
     parser.add_argument(
         "sequences",
         metavar="SEQUENCE",
-        nargs="+",
+        nargs="*",
         help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
     )
     add_estimators_argument(parser, "what to measure, see 'vislam list'")
@@ -69,15 +70,42 @@ def add_to(subcommands: Subcommands) -> None:
         metavar="SEQUENCE=FILE.tum",
         action="append",
         default=[],
-        help="ground truth of a recorded sequence, from the same places; may be given several times",
+        help="ground truth of a recorded sequence, from the same places; may be given several times; with "
+        "--trajectories also a folder that has SEQUENCE.tum",
     )
+    _add_trajectories_arguments(parser)
     add_settings_arguments(parser)
     add_workers_argument(parser)
     parser.set_defaults(command=command)
 
 
+def _add_trajectories_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("baselines of another system's trajectories")
+    group.add_argument(
+        "--trajectories",
+        metavar="DIR",
+        type=Path,
+        help="run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against --truth",
+    )
+    group.add_argument(
+        "--align",
+        choices=("se3", "yaw", "sim3"),
+        help="what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
+    )
+    group.add_argument(
+        "--gap",
+        metavar="S",
+        type=positive_seconds,
+        help="the longest time between two keyframes that counts as covered (default: 5)",
+    )
+
+
 def command(options: argparse.Namespace) -> int:
     """Measure, write and return 1 where an estimator diverged or failed; the baseline is written then, too."""
+    if options.trajectories is not None:
+        return _of_trajectories(options)
+    if options.align or options.gap:
+        raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
     from toolkit.experiment.workers import usable_cpus
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
@@ -95,6 +123,25 @@ def command(options: argparse.Namespace) -> int:
     ends = list(_bad_ends(made))
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
     return 1 if ends else 0
+
+
+def _of_trajectories(options: argparse.Namespace) -> int:
+    from toolkit.gate.trajectory_baseline import to_text
+    from toolkit.gate.trajectory_check import new_trajectory_baseline
+    from toolkit.gate.trajectory_files import Scoring
+    from toolkit.report.gate_files import check_writable, made_here, write_text
+
+    if options.sequences or options.estimators or options.duration or options.set or options.config:
+        raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
+    out = options.out or Path("trajectory-baseline.json")
+    check_writable(out)
+    scoring = Scoring(options.align or Scoring.align, options.gap or Scoring.gap_s)
+    made_by = made_here(command_to_keep(options.command_line))
+    made = new_trajectory_baseline(options.trajectories, truths_given(options.truth), scoring, made_by)
+    write_text(out, to_text(made))
+    runs = sum(len(one.files) for one in made.sequences.values())
+    print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))
+    return 0
 
 
 def command_to_keep(words: list[str]) -> str:
@@ -118,6 +165,8 @@ def _cases(options: argparse.Namespace) -> list[Case]:
     from toolkit.gate.baseline import Case
     from toolkit.gate.measuring import located
 
+    if not options.sequences:
+        raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")
     estimators = tuple(find_all(options.estimators or defaults()))
     truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
     cases = []

@@ -50,6 +50,7 @@ DEFAULT_BOUNDS = Bounds(
         "ate_se3_m": Criterion("larger", 0.5),
         "ate_yaw_m": Criterion("larger", 0.5),
         "nees_pose_mean": Criterion("away from 1", 1.0),
+        "nis_mean": Criterion("away from 1", 1.0),
         "heldout_reproj_median_px": Criterion("larger", 0.5),
     },
     recorded={

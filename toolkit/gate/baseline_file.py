@@ -134,7 +134,7 @@ def check_releases(baseline: Baseline, name: str) -> None:
 
 def to_text(baseline: Baseline) -> str:
     """Return the document; refuses NaN and infinity, which are not JSON."""
-    return _text(to_builtins(document(baseline)), "") + "\n"
+    return json_text(to_builtins(document(baseline)))
 
 
 def document(baseline: Baseline) -> BaselineRecord:
@@ -223,6 +223,11 @@ def _series(record: SeriesRecord) -> Series:
     if record.final is not UNSET:
         outputs["final"] = record.final
     return Series(record.status, record.speed, outputs)
+
+
+def json_text(value: object) -> str:
+    """Return JSON for people to review: a list of numbers or of short words is one line."""
+    return _text(value, "") + "\n"
 
 
 def _text(value: object, indent: str) -> str:

@@ -1,7 +1,7 @@
 """Judged against a bound instead of by a test: recorded sequences, coverage, speed, and whether anything is there.
 
 A recording is the same every time and so is what is computed from it, up to rounding: any change is real. It is shown
-from one part in a million on, and fails beyond its bound.
+from one part in a million on, and fails beyond its bound in either direction.
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Criterion, Series, Values
 from toolkit.gate.paired import Where
-from toolkit.gate.verdict import Finding, Verdict
+from toolkit.gate.verdict import FAILURES, Finding, Verdict
 
 SHOWN = 1e-6
 # Fewer timed runs than this scatter too much to be judged (docs/gate.md).
@@ -19,16 +19,23 @@ FEWEST_TIMED = 16
 _SPEED = "speed"
 
 
-def judge_recorded(where: Where, criterion: Criterion, before: float, after: float) -> Verdict:
-    """Judge one value of a recorded sequence."""
+def judge_recorded(
+    where: Where, criterion: Criterion, before: float, after: float, *, accept_better: bool = False
+) -> Verdict:
+    """Judge one value of a recorded sequence; a move by more than the bound fails either way, unless accepted."""
     worse = _worsening(criterion, before, after)
     bound = criterion.percent / 100.0
     finding: Finding = "same"
     if not math.isclose(after, before, rel_tol=SHOWN, abs_tol=0.0):
-        finding = "regressed" if worse > bound else "worse" if worse > 0.0 else "better"
+        finding = "worse" if worse > 0.0 else "better"
+        if worse > bound:
+            finding = "regressed"
+        elif _distance(before, after) > bound and not accept_better:
+            finding = "moved"
     words = "" if finding == "same" else f"{before:.7g} became {after:.7g}"
-    if finding == "regressed":
-        words += f", {100.0 * worse:.3g} % worse, and {criterion.percent:g} % is allowed"
+    if finding in FAILURES:
+        by = f"{100.0 * worse:.3g} % worse" if finding == "regressed" else f"{100.0 * _distance(before, after):.3g} %"
+        words += f", {by}, and {criterion.percent:g} % is allowed"
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, words,
         before, after, 100.0 * (after / before - 1.0) if before else None, criterion.percent,
@@ -42,6 +49,13 @@ def _worsening(criterion: Criterion, before: float, after: float) -> float:
     if min(before, after) <= 0.0:
         return math.inf * (after != before)
     return math.expm1(abs(math.log(after)) - abs(math.log(before)))
+
+
+def _distance(before: float, after: float) -> float:
+    """Return how far a value moved, up or down, as a fraction."""
+    if min(before, after) <= 0.0:
+        return math.inf * (after != before)
+    return math.expm1(abs(math.log(after / before)))
 
 
 def judge_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:

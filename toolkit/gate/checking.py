@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from toolkit.estimator import find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured
-from toolkit.gate.judging import Judged, judge_case
+from toolkit.gate.interleaved import compare_speed
+from toolkit.gate.judging import USUAL_TERMS, Judged, Terms, judge_case
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.paired import judge_pairs
 from toolkit.gate.releases import installed
@@ -18,11 +19,22 @@ from toolkit.settings import DEFAULTS, Settings
 
 @dataclass(frozen=True)
 class How:
-    """How to run: so many processes, whether time counts, with which settings."""
+    """How to run: so many processes, whether time counts, with which settings, and what passes.
+
+    ``accept_better`` lets what moved pass unless it is worse; ``speed_against`` names another version of the code, a
+    git revision or a wheel, to take turns with for speed.
+    """
 
     workers: int
     speed: bool = True
     settings: Settings = DEFAULTS
+    accept_better: bool = False
+    speed_against: str | None = None
+
+    @property
+    def terms(self) -> Terms:
+        """On which terms each case is judged; time that is told otherwise is not judged twice."""
+        return Terms(self.speed and self.speed_against is None, self.accept_better)
 
 
 def new_baseline(
@@ -47,21 +59,28 @@ def new_baseline(
 
 
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
-    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error."""
+    """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error.
+
+    Raises BaselineError where another version of the code is asked for and cannot be had or timed.
+    """
     began, how = time.monotonic(), replace(how, settings=baseline.settings)
     judged = Judged()
+    if how.speed_against is not None:
+        speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
+        judged.verdicts += speeds.verdicts
+        judged.notes += speeds.notes
     for case, before in baseline.cases:
         now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
-        one = judge_case(case, before, now, baseline.bounds, speed=how.speed)
+        one = judge_case(case, before, now, baseline.bounds, how.terms)
         judged.verdicts += one.verdicts
         judged.tests += one.tests
         judged.notes += one.notes
-    return judge_all(judged, baseline, name, time.monotonic() - began)
+    return judge_all(judged, baseline, name, time.monotonic() - began, how.terms)
 
 
-def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float) -> Check:
+def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float, terms: Terms = USUAL_TERMS) -> Check:
     """Test what awaits its test, all at once, and put the verdicts together."""
-    tested = judge_pairs(judged.tests, baseline.false_alarm_rate)
+    tested = judge_pairs(judged.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {
         (case.source, name): (i, k)
         for i, (case, before) in enumerate(baseline.cases)
@@ -69,7 +88,14 @@ def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float) -> 
     }
     verdicts = sorted([*judged.verdicts, *tested], key=lambda v: (places[v.sequence, v.estimator], v.output))
     return Check(
-        name, tuple(verdicts), tuple(judged.notes), baseline.false_alarm_rate, len(tested), installed(), seconds
+        name,
+        tuple(verdicts),
+        tuple(judged.notes),
+        baseline.false_alarm_rate,
+        len(tested),
+        installed(),
+        seconds,
+        terms.accept_better,
     )
 
 

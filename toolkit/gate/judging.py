@@ -6,14 +6,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from toolkit.estimate import Status
-from toolkit.gate.baseline import Bounds, Case, Criterion, Measured, Series, Values
+from toolkit.gate.baseline import Bounds, Case, Measured, Series, Values
 from toolkit.gate.bounded import SHOWN, judge_coverage, judge_recorded, judge_speed
+from toolkit.gate.changed_metric import changed_metrics
 from toolkit.gate.paired import Pairs, Where
 from toolkit.gate.verdict import Verdict
 from toolkit.geometry import Array
 
 _NOTHING = ("", "")
 _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
+
+
+@dataclass(frozen=True)
+class Terms:
+    """On which terms to judge: whether time counts, and whether what moved passes unless it is worse."""
+
+    speed: bool = True
+    accept_better: bool = False
+
+
+USUAL_TERMS = Terms()
 
 
 @dataclass
@@ -25,8 +37,8 @@ class Judged:
     notes: list[str] = field(default_factory=list)
 
 
-def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, *, speed: bool) -> Judged:
-    """Judge one case; ``speed`` says whether its time counts."""
+def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, terms: Terms = USUAL_TERMS) -> Judged:
+    """Judge one case on the terms given."""
     judged = Judged()
     if now.unreadable:
         judged.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
@@ -44,8 +56,8 @@ def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, *, s
             why = now.absent.get(estimator, "it was not run")
             judged.verdicts.append(_missing(case, estimator, "", "estimator", why))
         else:
-            _judge_series(case, estimator, was, now.runs[estimator], bounds, judged)
-            if speed:
+            _judge_series(case, estimator, was, now.runs[estimator], judged, bounds, terms)
+            if terms.speed:
                 judged.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
     return judged
 
@@ -65,9 +77,11 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
     return f"other measurements than the baseline's{which}: the two cannot be compared, make a new baseline"
 
 
-def _judge_series(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds, judged: Judged) -> None:
+def _judge_series(
+    case: Case, estimator: str, before: Series, now: Series, judged: Judged, bounds: Bounds, terms: Terms
+) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
-    judged.verdicts += _ends(case, estimator, before, now, judged)
+    judged.verdicts += _ends(case, estimator, before, now, judged, terms)
     usable = [i for i, (was, is_) in enumerate(zip(before.status, now.status, strict=True)) if was == is_ == "ok"]
     if not usable:
         judged.notes.append(f"{case.source}: {estimator} has no run that ended well on both sides, nothing is compared")
@@ -75,40 +89,56 @@ def _judge_series(case: Case, estimator: str, before: Series, now: Series, bound
     criteria = bounds.simulated if case.simulated else bounds.recorded
     for output, metrics in before.outputs.items():
         given = now.outputs.get(output, {})
-        for key, values in metrics.items():
+        lost = {key: why for key, values in metrics.items() if (why := _lost(values, given.get(key), usable))}
+        judged.verdicts += [_missing(case, estimator, output, key, why) for key, why in lost.items()]
+        shared = {key: _shared(values, given[key], usable) for key, values in metrics.items() if key not in lost}
+        changed = changed_metrics(shared)
+        for key in criteria:
             where = Where(case.source, estimator, output, key)
-            lost = _lost(values, given.get(key), usable)
-            if lost:
-                judged.verdicts.append(_missing(case, estimator, output, key, lost))
-            elif key in criteria:
-                _judge_metric(case, where, criteria[key], _shared(values, given[key], usable), judged)
+            if key in changed:
+                judged.verdicts.append(_changed(where, shared[key], changed[key]))
+            elif key in shared and shared[key][0].size:
+                _judge_metric(case, Pairs(where, criteria[key], *shared[key]), judged, terms)
     judged.verdicts += judge_coverage(case, estimator, before, now, bounds)
 
 
-def _judge_metric(case: Case, where: Where, criterion: Criterion, values: tuple[Array, Array], judged: Judged) -> None:
-    """Put a metric's values before and now (n,) among the tests, or hold them to their bound."""
-    was, is_ = values
-    if not was.size:
-        return
+def _judge_metric(case: Case, pairs: Pairs, judged: Judged, terms: Terms) -> None:
+    """Put a metric among the tests, or hold it to its bound."""
     if case.simulated:
-        judged.tests.append(Pairs(where, criterion, was, is_))
+        judged.tests.append(pairs)
         return
-    if np.ptp(is_) > SHOWN * np.abs(is_).max():
+    where, now = pairs.where, pairs.after
+    if np.ptp(now) > SHOWN * np.abs(now).max():
         judged.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
-    judged.verdicts.append(judge_recorded(where, criterion, float(np.median(was)), float(np.median(is_))))
+    was, is_ = float(np.median(pairs.before)), float(np.median(now))
+    judged.verdicts.append(judge_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
 
 
-def _ends(case: Case, estimator: str, before: Series, now: Series, judged: Judged) -> Iterator[Verdict]:
-    """Fail where runs end worse than they did; note where they end well that did not."""
+def _changed(where: Where, values: tuple[Array, Array], witness: str) -> Verdict:
+    was, is_ = (float(np.median(side)) for side in values)
+    return Verdict(
+        where.sequence, where.estimator, where.output, where.metric, "changed metric",
+        f"{was:.7g} became {is_:.7g} while {witness} is the same in every run: the poses did not change, "
+        "but how this is computed from them; make a new baseline if that is meant",
+        was, is_, 100.0 * (is_ / was - 1.0) if was else None,
+    )  # fmt: skip
+
+
+def _ends(case: Case, estimator: str, before: Series, now: Series, judged: Judged, terms: Terms) -> Iterator[Verdict]:
+    """Fail where runs end otherwise than they did; where that is accepted, note those that end well now."""
     pairs = list(zip(case.seeds, before.status, now.status, strict=True))
     worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
     if worse:
         runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if case.simulated else ""
         words = f"{worse[0][1]} {runs}".strip() + (f": {now.why}" if now.why else "")
         yield Verdict(case.source, estimator, "", "status", "regressed", words)
-    better = [seed for seed, was, is_ in pairs if is_ == "ok" and was != "ok"]
+    better = [seed for seed, was, is_ in pairs if _SEVERITY[is_] < _SEVERITY[was]]
     if better:
-        judged.notes.append(f"{case.source}: {estimator} ends well in {len(better)} runs in which it did not before")
+        words = f"ends better in {len(better)} runs than before"
+        if worse or terms.accept_better:
+            judged.notes.append(f"{case.source}: {estimator} {words}")
+        else:
+            yield Verdict(case.source, estimator, "", "status", "moved", words)
 
 
 def _lost(before: Values, now: Values | None, usable: list[int]) -> str:

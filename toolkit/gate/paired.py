@@ -1,10 +1,12 @@
 """Paired tests on simulated sequences: under each seed both sides read the same measurements.
 
-What is compared is the logarithm of a metric, so that a mean difference is a ratio. A NEES is worse the farther its
-mean over the seeds is outside the chi-square band of as many runs, on either side; a move within the band is none
-(Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4).
+What is compared is the logarithm of a metric, so that a mean difference is a ratio. Two questions are asked of each.
+Has it *moved*, up or down, by more than another processor's rounding moves it? And has it become *worse* by more than
+its margin? A NEES is worse the farther its mean over the seeds is outside the chi-square band of as many runs, on
+either side (Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section
+5.4); a NIS, the farther it is from 1. Whatever became worse has moved as well: both questions share one rate.
 
-Student's one-sided paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
+Student's paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
 section 2.5; the correction is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
 Statistics 6 (1979). Arrays are tested along their last axis, so that a benchmark can judge thousands of checks at once.
 """
@@ -15,11 +17,15 @@ import numpy as np
 from scipy.special import stdtr, stdtrit
 
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.verdict import Finding, Verdict
+from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array, BoolArray
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
+# Its mean over runs scatters by chance; a NIS is a mean over so many innovations that it does not.
+_WITH_BAND = ("nees_pose_mean",)
+# Another processor's rounding moves a metric by less than this, relative (docs/gate.md).
+ROUNDING = 1e-6
 # Below this a value is one of rounding, and its logarithm says nothing.
 _LEAST = 1e-12
 
@@ -59,20 +65,34 @@ def log_of(values: Array) -> Array:
     return np.log(np.maximum(values, _LEAST))
 
 
+def moved_p(pairs: Pairs) -> Array:
+    """Return the p-value (...) of having moved by more than rounding, two-sided."""
+    up, down = (paired_p(sign * pairs.differences, ROUNDING) for sign in (1.0, -1.0))
+    return np.asarray(np.minimum(1.0, 2.0 * np.minimum(up, down)))
+
+
 def worse_p(pairs: Pairs) -> Array:
     """Return the p-value (...) of having become worse by more than the margin; 1 where what changed is not worse."""
     if pairs.criterion.worse == "larger":
         return paired_p(pairs.differences, pairs.margin)
-    return _away_p(log_of(pairs.before), log_of(pairs.after), pairs.margin)
+    return _away_p(log_of(pairs.before), log_of(pairs.after), pairs.margin, _band(pairs))
 
 
-def _away_p(before: Array, after: Array, margin: float) -> Array:
+def _band(pairs: Pairs) -> tuple[float, float]:
+    """Return between which logarithms the mean over the seeds is as it should be."""
+    if pairs.where.metric not in _WITH_BAND:
+        return 0.0, 0.0
+    low, high = (float(log_of(np.array(edge))) for edge in nees_band(POSE_DOF, pairs.before.shape[-1]))
+    return low, high
+
+
+def _away_p(before: Array, after: Array, margin: float, band: tuple[float, float]) -> Array:
     """Return the p-value (...) of log values (..., n) having moved away from their band, two-sided.
 
     Twice the one-sided value, for the side is chosen after looking. From one side of the band to the other, the new
     distance has to exceed the old one as well.
     """
-    low, high = (float(log_of(np.array(edge))) for edge in nees_band(POSE_DOF, before.shape[-1]))
+    low, high = band
     # The band is for the mean of the values themselves, not of their logarithms.
     was, now = (np.log(np.exp(x).mean(axis=-1)) for x in (before, after))
     side = np.where(now > high, 1.0, -1.0)
@@ -83,35 +103,48 @@ def _away_p(before: Array, after: Array, margin: float) -> Array:
     return np.where((low <= now) & (now <= high), 1.0, np.minimum(1.0, 2.0 * p))
 
 
-def better_p(pairs: Pairs) -> Array:
-    """Return the p-value of having become better: the same test with the sides exchanged."""
-    return worse_p(Pairs(pairs.where, pairs.criterion, pairs.after, pairs.before))
+def judge_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False) -> list[Verdict]:
+    """Judge all paired metrics of a check; the chance of any false alarm among them is at most ``rate``.
 
-
-def judge_pairs(tests: list[Pairs], rate: float) -> list[Verdict]:
-    """Judge all paired metrics of a check; the chance of any false alarm among them is at most ``rate``."""
+    A movement may go up or down and a worsening has one side, so that half of the rate belongs to each side. With
+    ``accept_better`` what moved passes unless it is worse.
+    """
     if not tests:
         return []
-    worse, better = (holm(np.array([float(p(pairs)) for pairs in tests])) for p in (worse_p, better_p))
-    return [_verdict(*one, rate, len(tests)) for one in zip(tests, worse.tolist(), better.tolist(), strict=True)]
+    moved, worse = (holm(np.array([float(p(pairs)) for pairs in tests])).tolist() for p in (moved_p, worse_p))
+    verdicts = []
+    for pairs, p, p_worse in zip(tests, moved, worse, strict=True):
+        finding: Finding = "regressed" if p_worse <= rate / 2.0 else "moved" if p <= rate else "same"
+        if finding == "moved" and accept_better:
+            finding = "better" if _is_nearer(pairs) else "worse"
+        margin = pairs.margin if accept_better else ROUNDING
+        seen = smallest_seen(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
+        verdicts.append(_verdict(pairs, finding, p_worse if finding == "regressed" else p, seen))
+    return verdicts
 
 
-def _verdict(pairs: Pairs, p: float, p_better: float, rate: float, tests: int) -> Verdict:
-    finding: Finding = "regressed" if p <= rate else "better" if p_better <= rate else "same"
+def _is_nearer(pairs: Pairs) -> bool:
+    """Say whether a metric is nearer to what it should be than it was."""
+    was, is_ = float(log_of(pairs.before).mean()), float(log_of(pairs.after).mean())
+    return is_ < was if pairs.criterion.worse == "larger" else abs(is_) < abs(was)
+
+
+def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
     change = 100.0 * float(np.expm1(pairs.differences.mean()))
-    sides = 1 if pairs.criterion.worse == "larger" else 2
-    seen = smallest_seen(pairs.differences, rate / tests / sides, POWER) + pairs.margin
-    words = {
-        "regressed": f"{change:+.1f} % over {pairs.before.size} seeds, and chance explains that with p = {p:.2g}",
-        "better": f"{change:+.1f} % over {pairs.before.size} seeds",
-        "same": "",
-    }
+    words = "" if finding == "same" else f"{told_percent(change)} over {pairs.before.size} seeds"
+    if finding in FAILURES:
+        words += f", and chance explains that with p = {p:.2g}"
     where = pairs.where
     return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, finding, words[finding],
+        where.sequence, where.estimator, where.output, where.metric, finding, words,
         before=_mean(pairs.before), after=_mean(pairs.after), change_percent=change,
         allowed_percent=pairs.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
     )  # fmt: skip
+
+
+def told_percent(change: float) -> str:
+    """Return a change in percent, with so many digits that one which counts is not printed as none."""
+    return f"{change:+.1f} %" if abs(change) >= 0.1 else f"{change:+.1g} %"
 
 
 def _mean(values: Array) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.metrics._shared.alignment import Alignment, fit_sim3, fit_yaw
+from toolkit.metrics._shared.association import Matched
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.residuals import angles_deg, lengths, rmse
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
@@ -62,11 +63,11 @@ def score(evaluation: Evaluation) -> Scores:
     """Score the four position errors and the rotation error."""
     scores = evaluate(
         {
-            "ate_none_m": lambda: rmse(_distances(evaluation, evaluation.placed)),
-            "ate_se3_m": lambda: _position_rmse(evaluation, evaluation.se3_alignment),
-            "ate_yaw_m": lambda: _position_rmse(evaluation, fit_yaw(*_positions(evaluation))),
-            "ate_sim3_m": lambda: _position_rmse(evaluation, fit_sim3(*_positions(evaluation))),
-            "ate_se3_deg": lambda: _rotation_rmse_deg(evaluation),
+            "ate_none_m": lambda: rmse(_distances(evaluation.compared, evaluation.placed)),
+            "ate_se3_m": lambda: position_rmse(evaluation.compared, evaluation.se3_alignment),
+            "ate_yaw_m": lambda: position_rmse(evaluation.compared, fit_yaw(*_positions(evaluation))),
+            "ate_sim3_m": lambda: position_rmse(evaluation.compared, fit_sim3(*_positions(evaluation))),
+            "ate_se3_deg": lambda: rotation_rmse_deg(evaluation.compared, evaluation.se3_alignment),
         }
     )
     if scores.values["ate_se3_m"] is not None and not evaluation.se3_alignment.rotation_is_unique:
@@ -92,17 +93,22 @@ def _positions(evaluation: Evaluation) -> tuple[Array, Array]:
     return evaluation.compared.truth[:, :3, 3], evaluation.compared.estimate[:, :3, 3]
 
 
-def _distances(evaluation: Evaluation, poses: Array) -> Array:
-    return lengths(poses[:, :3, 3] - evaluation.compared.truth[:, :3, 3])
+def _distances(matched: Matched, poses: Array) -> Array:
+    return lengths(poses[:, :3, 3] - matched.truth[:, :3, 3])
 
 
-def _position_rmse(evaluation: Evaluation, alignment: Alignment) -> float:
-    return rmse(_distances(evaluation, alignment.apply(evaluation.compared.estimate)))
+def position_rmse(matched: Matched, alignment: Alignment) -> float:
+    """Return the root mean square of the distances between true and aligned positions, in metres."""
+    return rmse(_distances(matched, alignment.apply(matched.estimate)))
 
 
-def _rotation_rmse_deg(evaluation: Evaluation) -> float:
-    if not evaluation.se3_alignment.rotation_is_unique:
+def rotation_rmse_deg(matched: Matched, alignment: Alignment) -> float:
+    """Return the root mean square of the angles between true and aligned rotations, in degrees.
+
+    Raises Unavailable where the alignment leaves a rotation open.
+    """
+    if not alignment.rotation_is_unique:
         raise Unavailable(_ON_A_LINE)
-    aligned = evaluation.se3_alignment.apply(evaluation.compared.estimate)
-    error = np.swapaxes(evaluation.compared.truth[:, :3, :3], 1, 2) @ aligned[:, :3, :3]
+    aligned = alignment.apply(matched.estimate)
+    error = np.swapaxes(matched.truth[:, :3, :3], 1, 2) @ aligned[:, :3, :3]
     return rmse(angles_deg(error))

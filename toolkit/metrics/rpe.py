@@ -3,7 +3,6 @@
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -54,17 +53,21 @@ def score(evaluation: Evaluation) -> Scores:
     """Score drift over one second and over 100 m."""
     return evaluate(
         {
-            "rpe_1s_m": lambda: rmse(lengths(_errors(evaluation, _one_second)[:, :3, 3])),
-            "rpe_1s_deg": lambda: rmse(angles_deg(_errors(evaluation, _one_second)[:, :3, :3])),
-            "rpe_100m_percent": lambda: (
-                rmse(lengths(_errors(evaluation, _hundred_metres)[:, :3, 3])) / INTERVAL_M * 100.0
-            ),
+            "rpe_1s_m": lambda: rmse(lengths(_errors_of_a_second(evaluation)[:, :3, 3])),
+            "rpe_1s_deg": lambda: rmse(angles_deg(_errors_of_a_second(evaluation)[:, :3, :3])),
+            "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.compared),
         }
     )
 
 
-def _errors(evaluation: Evaluation, choose: Callable[[Matched], _Intervals]) -> Array:
-    return relative_errors(evaluation.compared, *choose(evaluation.compared))
+def hundred_metres_percent(matched: Matched) -> float:
+    """Return the RMSE of the translation error over 100 m of true path, in percent; may raise Unavailable."""
+    errors = relative_errors(matched, *_hundred_metres(matched))
+    return rmse(lengths(errors[:, :3, 3])) / INTERVAL_M * 100.0
+
+
+def _errors_of_a_second(evaluation: Evaluation) -> Array:
+    return relative_errors(evaluation.compared, *_one_second(evaluation.compared))
 
 
 def _one_second(matched: Matched) -> _Intervals:

@@ -19,7 +19,7 @@ from toolkit.report.records.check import CheckDocument, VerdictRecord
 def check_document(check: Check) -> CheckDocument:
     """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
     return CheckDocument(
-        schema="vislam.check/1",
+        schema="vislam.check/2",
         baseline=check.baseline,
         passed=check.passed,
         failures=len(check.failures),
@@ -27,6 +27,7 @@ def check_document(check: Check) -> CheckDocument:
         tests=check.tests,
         releases=dict(check.releases),
         seconds=check.seconds,
+        accept_better=check.accept_better,
         notes=check.notes,
         verdicts=tuple(_verdict(verdict) for verdict in check.verdicts),
     )

@@ -1,14 +1,22 @@
 """A check of the gate for people: the verdict in one line, a table of everything, what failed and why, what to know."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 
 from toolkit.gate.bounded import SHOWN
-from toolkit.gate.verdict import Check, Verdict
+from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import known_metrics
 from toolkit.report.prose import WIDTH, Width, section
 from toolkit.report.table import Table, as_markdown, as_text, number
 
 _MISSING = "-"
+_FAILED: Mapping[Finding, str] = {
+    "regressed": "got worse",
+    "moved": "moved",
+    "changed metric": "computed otherwise",
+    "missing": "missing",
+}
+_STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
 _NUMBERS = (
     ("before", "", ""),
@@ -67,9 +75,8 @@ def headline(check: Check) -> str:
     judged = len(check.verdicts)
     if check.passed:
         return f"the gate passes: nothing got worse than {check.baseline} ({judged} comparisons)"
-    missing = sum(verdict.finding == "missing" for verdict in check.failures)
-    parts = [(len(check.failures) - missing, "got worse"), (missing, "missing")]
-    counts = ", ".join(f"{count} {what}" for count, what in parts if count)
+    found = Counter(verdict.finding for verdict in check.failures)
+    counts = ", ".join(f"{found[finding]} {words}" for finding, words in _FAILED.items() if found[finding])
     return f"the gate fails: of {judged} comparisons with {check.baseline}, {counts}"
 
 
@@ -84,9 +91,8 @@ def about(verdict: Verdict) -> str:
     who = f"{verdict.estimator} {verdict.output}".strip()
     what = _gate_name(verdict.metric)
     on = f"{verdict.sequence}, {who}" if who else verdict.sequence
-    if verdict.finding == "missing":
-        return f"{on}: {what} is missing"
-    return f"{on}: {what} got worse" if verdict.finding == "regressed" else f"{on}: {what}"
+    found = _FAILED.get(verdict.finding, "")
+    return f"{on}: {what} {'is ' if verdict.finding in _STATES else ''}{found}".strip()
 
 
 def _gate_name(key: str) -> str:
@@ -99,13 +105,18 @@ def note_lines(check: Check) -> Iterator[str]:
     if check.tests:
         blind = [v for v in check.verdicts if v.seen_percent is not None and v.seen_percent > 10.0 and not v.fails]
         yield (
-            f"{check.tests} paired tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
-            "'sees' is the worsening each of them finds with 95 % power, from how much the change scatters"
+            f"{check.tests} tests share a false-alarm rate of {100.0 * check.false_alarm_rate:g} % (Holm); "
+            "'sees' is the change each of them finds with 95 % power, from how much it scatters"
         )
         if blind:
             yield f"{len(blind)} of them would not have seen 10 %: the change scatters too much for so few seeds"
+    if any(verdict.finding == "moved" for verdict in check.failures):
+        yield (
+            "what moved is another answer than the baseline's, and no worse: --accept-better lets it pass, and a new "
+            "baseline makes it the answer to come"
+        )
     releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
-    yield f"{releases}; {check.seconds:.0f} s"
+    yield "; ".join(filter(None, (releases, f"{check.seconds:.0f} s")))
 
 
 def gate_text(check: Check, width: Width = WIDTH) -> str:

@@ -7,7 +7,7 @@ How they are read and written is :mod:`toolkit.documents`; :mod:`toolkit.report.
 from pathlib import Path
 
 from toolkit.documents import read
-from toolkit.report.records.check import CheckDocument
+from toolkit.report.records.check import OLDER, CheckDocument
 from toolkit.report.records.manifest import Manifest
 from toolkit.report.records.metrics import Metrics
 from toolkit.report.records.report import Report, SeedsReport
@@ -58,4 +58,4 @@ def read_manifest(path: Path) -> Manifest:
 
 def read_check(path: Path) -> CheckDocument:
     """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
-    return read(path, CheckDocument, remedy="repeat vislam check")
+    return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER)

@@ -1,9 +1,10 @@
-"""What ``vislam check --json`` writes, the contract ``vislam.check/1`` (docs/gate.md)."""
+"""What ``vislam check --json`` writes, the contract ``vislam.check/2`` (docs/gate.md)."""
 
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from toolkit.documents import Json, Older
 from toolkit.gate.verdict import FAILURES, Finding
 
 
@@ -18,10 +19,10 @@ class VerdictRecord(Struct, frozen=True, kw_only=True):
     words: str
     before: Annotated[float | None, Meta(description="the baseline's value, the mean over the seeds")]
     after: Annotated[float | None, Meta(description="the value now, the mean over the seeds")]
-    change_percent: Annotated[float | None, Meta(description="how much worse it got")]
+    change_percent: Annotated[float | None, Meta(description="how much it grew")]
     allowed_percent: float | None
     p: Annotated[float | None, Meta(description="adjusted for all tests of the check")]
-    seen_percent: Annotated[float | None, Meta(description="the worsening this test sees with 95 % power")]
+    seen_percent: Annotated[float | None, Meta(description="the change this test sees with 95 % power")]
     fails: Annotated[bool, Meta(description="whether the check fails for this")]
 
     def __post_init__(self) -> None:
@@ -32,7 +33,7 @@ class VerdictRecord(Struct, frozen=True, kw_only=True):
 class CheckDocument(Struct, frozen=True, kw_only=True):
     """Every verdict of a check, and how it was made."""
 
-    schema: Literal["vislam.check/1"]
+    schema: Literal["vislam.check/2"]
     baseline: Annotated[str, Meta(description="the file or folder that was given")]
     passed: bool
     failures: Annotated[int, Meta(description="how many verdicts fail", ge=0)]
@@ -40,6 +41,7 @@ class CheckDocument(Struct, frozen=True, kw_only=True):
     tests: Annotated[int, Meta(description="how many statistical tests there were", ge=0)]
     releases: Annotated[dict[str, str], Meta(description="what it ran with")]
     seconds: Annotated[float, Meta(ge=0)]
+    accept_better: Annotated[bool, Meta(description="whether what moved passed unless it was worse")]
     notes: tuple[str, ...]
     verdicts: tuple[VerdictRecord, ...]
 
@@ -48,3 +50,11 @@ class CheckDocument(Struct, frozen=True, kw_only=True):
             raise ValueError("failures does not count the verdicts that fail")
         if self.passed != (self.failures == 0):
             raise ValueError("passed does not fit failures")
+
+
+def _from_1(document: Json) -> Json:
+    """Return a document of version 1, in which what got better always passed and no other finding is missing."""
+    return {**document, "accept_better": True}
+
+
+OLDER: Older = {"vislam.check/1": _from_1}

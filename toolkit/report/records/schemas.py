@@ -9,6 +9,7 @@ import msgspec
 
 from toolkit.documents import schema
 from toolkit.gate.baseline_file import BaselineRecord
+from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
 
 # By the name of the schema's file, without its ending.
@@ -19,7 +20,8 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "report-over-seeds-1": SeedsReport,
     "manifest-1": Manifest,
     "baseline-1": BaselineRecord,
-    "check-1": CheckDocument,
+    "trajectory-baseline-1": TrajectoryBaselineRecord,
+    "check-2": CheckDocument,
 }
 
 

@@ -1,0 +1,161 @@
+"""``vislam check --speed-against``: old and new code in turn, and what of their times is told."""
+
+import os
+import subprocess
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.cli import main
+from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series
+from toolkit.gate.baseline_file import to_text
+from toolkit.gate.interleaved import (
+    FEWEST_PAIRS,
+    MARGIN,
+    MOST_PAIRS,
+    Timed,
+    compare_speed,
+    judge_speeds,
+    pairs_needed,
+    timers,
+)
+from toolkit.gate.other_code import unpacked
+from toolkit.gate.releases import installed
+from toolkit.progress import silent
+
+PROJECT = Path(__file__).parents[2]
+# Times of single runs on a machine that others use, too: a few percent, and now and then much more.
+SPREAD, INTERRUPTED, SLOWED = 0.04, 0.1, 0.5
+
+
+def timed(ratio: float, rng: np.random.Generator, count: int = 0) -> Timed:
+    """Return pairs of an estimator that takes ``ratio`` times as long as it did; so many, or as many as are needed."""
+    noise = np.exp(SPREAD * rng.standard_normal((MOST_PAIRS, 2)))
+    noise *= np.where(rng.random(noise.shape) < INTERRUPTED, 1.0 + SLOWED * rng.random(noise.shape), 1.0)
+    every = Timed("drive", "ekf", 0.1 * noise * np.array([1.0, ratio]))
+    count = count or pairs_needed(every.differences[:FEWEST_PAIRS])
+    return Timed("drive", "ekf", every.cpu_s[:count])
+
+
+def findings(ratio: float, checks: int, seed: int) -> list[list[str]]:
+    """Return what is found of eight estimators in each of some checks, the first of them slower."""
+    rng = np.random.default_rng(seed)
+    return [
+        [v.finding for v in judge_speeds([timed(ratio if i == 0 else 1.0, rng) for i in range(8)], "v1", 0.05)]
+        for _ in range(checks)
+    ]
+
+
+@pytest.mark.parametrize(("ratio", "least", "most"), [(1.0, 0.0, 0.05), (1.0 + MARGIN, 0.0, 0.05), (1.2, 0.95, 1.0)])
+def test_what_is_slower_by_a_fifth_is_seen_and_by_a_twentieth_is_not(ratio, least, most):
+    checks = 40
+    failed = sum(one[0] == "regressed" for one in findings(ratio, checks, 1))
+    assert least * checks <= failed <= most * checks
+
+
+def test_what_takes_as_long_raises_no_alarm():
+    assert sum("regressed" in one for one in findings(1.0, 40, 2)) <= 2
+
+
+def test_a_run_that_was_interrupted_spoils_nothing():
+    rng = np.random.default_rng(5)
+    one = timed(1.0, rng, 20)
+    one.cpu_s[3, 1] *= 50.0
+    (verdict,) = judge_speeds([one], "v1", 0.05)
+    assert verdict.finding == "same"
+    assert abs(verdict.change_percent) < 5.0
+
+
+def test_the_more_the_times_scatter_the_more_pairs_are_run():
+    rng = np.random.default_rng(6)
+    counts = [pairs_needed(spread * rng.standard_normal(40)) for spread in (0.001, 0.05, 0.1, 1.0)]
+    assert counts[0] == FEWEST_PAIRS
+    assert counts[-1] == MOST_PAIRS
+    assert counts == sorted(counts)
+
+
+def wheel_of_this_code(path: Path, *, runner: str = "") -> None:
+    """Write a wheel of the code under test, with some lines more at the end of its runner."""
+    with zipfile.ZipFile(path, "w") as wheel:
+        for file in sorted((*(PROJECT / "toolkit").rglob("*.py"), *(PROJECT / "filters").rglob("*.py"))):
+            name = file.relative_to(PROJECT).as_posix()
+            wheel.writestr(name, file.read_text() + (runner if name == "toolkit/runner.py" else ""))
+
+
+# Three quarters of the processor time go nowhere.
+SLOWLY = """
+_fast = _run
+def _run(*given):
+    done = _fast(*given)
+    _until = time.process_time() + 3.0 * done.timings.cpu_s
+    while time.process_time() < _until:
+        pass
+    return replace(done, timings=replace(done.timings, cpu_s=4.0 * done.timings.cpu_s))
+"""
+
+
+def baseline_of_a_drive() -> Baseline:
+    """Return a baseline that was not measured: what is timed needs to know the cases alone."""
+    case = Case("drive", True, (0,), ("dead-reckoning",), 1.0)
+    series = Series(("ok",), (1.0,), {"causal": {}})
+    return Baseline(installed(), ((case, Measured(("hash",), ("print",), {"dead-reckoning": series})),))
+
+
+def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path):
+    wheel = tmp_path / "slow-1.0-py3-none-any.whl"
+    wheel_of_this_code(wheel, runner=SLOWLY)
+    speeds = compare_speed(baseline_of_a_drive(), str(wheel), 0.05, silent)
+    (speed,) = speeds.verdicts
+    assert (speed.estimator, speed.metric, speed.finding) == ("dead-reckoning", "speed", "better")
+    assert -85.0 < speed.change_percent < -60.0
+    assert "processor time of" in speed.words
+    assert speeds.notes == ()
+
+
+def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    git = ("git", "-c", "user.name=nobody", "-c", "user.email=nobody@nowhere.invalid")
+    Path("estimator.py").write_text("old")
+    for words in (("init", "-q"), ("add", "-A"), ("commit", "-q", "-m", "old")):
+        subprocess.run([*git, *words], check=True)
+    Path("estimator.py").write_text("new")
+    Path("deeper").mkdir()
+    monkeypatch.chdir("deeper")
+    with unpacked("HEAD") as (folder,):
+        assert (folder / "estimator.py").read_text() == "old"
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("version", "told"),
+    [
+        ("v9", "it is not known here; name a revision"),
+        ("--help", "it is not known here; name a revision"),
+        ("no.whl", "no.whl: it is no wheel that can be read"),
+        ("empty.whl", "empty.whl brings no code of what runs here"),
+    ],
+)
+def test_a_version_that_cannot_be_had_is_told(tmp_path, monkeypatch, capsys, version, told):
+    monkeypatch.chdir(tmp_path)
+    subprocess.run(["git", "init", "-q"], check=True)
+    zipfile.ZipFile("empty.whl", "w").close()
+    Path("base.json").write_text(to_text(baseline_of_a_drive()))
+    assert main(["check", "--baseline", "base.json", f"--speed-against={version}"]) == 3
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert told in said
+
+
+@pytest.mark.parametrize("words", [("--skip-speed",), ("--trajectories", os.curdir)])
+def test_speed_goes_with_runs_only(capsys, words):
+    assert main(["check", "--baseline", "base.json", "--speed-against", "HEAD", *words]) in (2, 3)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_version_that_cannot_run_is_told(tmp_path):
+    (tmp_path / "toolkit").mkdir()
+    (tmp_path / "toolkit" / "__init__.py").write_text("raise ValueError('of another time')")
+    with timers((tmp_path,), ()) as (old, _), pytest.raises(BaselineError, match=r"timed: ValueError: of another time"):
+        old.ask("where", estimators=[])

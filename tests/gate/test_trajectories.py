@@ -1,0 +1,192 @@
+"""``vislam check --trajectories``: files of a system that is not run here, against a baseline of such files."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.cli import main
+from toolkit.datasets.trajectories import tum
+from toolkit.estimate import Trajectory
+from toolkit.gate.trajectory_baseline import load_trajectory_baseline, to_text
+from toolkit.gate.trajectory_files import TIME_COVERAGE, time_coverage_percent
+from toolkit.gate.unpaired import Spread
+from toolkit.geometry import se3, se3_exp, so3_exp
+
+START_NS, S = 1_700_000_000 * 10**9, 10**9
+CHECK = ("check", "--trajectories", "results", "--baseline", "base.json")
+BASELINE = ("baseline", "--trajectories", "results", "--truth", "truth", "--out", "base.json")
+
+
+def truth_at(t_ns: np.ndarray) -> np.ndarray:
+    """A body on a wavy circle of 40 m that looks where it goes (N, 4, 4), a lap a minute."""
+    angle = 2.0 * np.pi * (t_ns - START_NS) / S / 60.0
+    turned = so3_exp(np.stack([0.05 * np.sin(3.0 * angle), np.zeros_like(angle), angle + np.pi / 2.0], axis=-1))
+    return se3(turned, np.stack([20.0 * np.cos(angle), 20.0 * np.sin(angle), np.sin(2.0 * angle)], axis=-1))
+
+
+def stamps(rate_hz: float, begin_s: float = 0.0, end_s: float = 60.0) -> np.ndarray:
+    return START_NS + np.arange(round(begin_s * S), round(end_s * S), round(S / rate_hz), dtype=np.int64)
+
+
+def write(path: Path, t_ns: np.ndarray, error: float = 0.0, seed: int = 0) -> None:
+    """Write what a system with an error of so many metres and centiradians says of its pose, in its own world."""
+    rng = np.random.default_rng(seed)
+    errors = error * rng.standard_normal((t_ns.size, 6)) * np.repeat([0.01, 1.0], 3)
+    own_world = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([3.0, -2.0, 1.0]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(tum.text(Trajectory(t_ns, own_world @ truth_at(t_ns) @ se3_exp(errors))))
+
+
+@pytest.fixture
+def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Two sequences, every frame of one and keyframes of the other in five runs, and their baseline."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("lap", "maze"):
+        write(Path(f"truth/{name}.tum"), stamps(20.0))
+    write(Path("results/lap.tum"), stamps(10.0), 0.1)
+    for run in range(5):
+        write(Path(f"results/maze/{run}.txt"), stamps(1.1, 2.0 + run), 0.2, seed=run)
+    assert main(BASELINE) == 0
+    return lambda *words: main(words)
+
+
+def failures(vislam: Callable[..., int], *words: str) -> list[tuple[str, str, str]]:
+    status = vislam(*CHECK, *words, "--json", "check.json")
+    verdicts = json.loads(Path("check.json").read_text())["verdicts"]
+    failed = [(v["sequence"], v["metric"], v["finding"]) for v in verdicts if v["fails"]]
+    assert status == (1 if failed else 0)
+    return failed
+
+
+def test_the_same_files_pass_and_need_no_other_word_than_the_folder(vislam, capsys):
+    assert failures(vislam) == []
+    told = capsys.readouterr()
+    assert told.err == ""
+    assert "the gate passes" in told.out
+
+
+def test_a_baseline_of_trajectories_is_read_back(vislam):
+    text = Path("base.json").read_text()
+    assert to_text(load_trajectory_baseline(Path("base.json"))) == text
+    lap = load_trajectory_baseline(Path("base.json")).sequences["lap"]
+    # 600 poses of independent errors of 0.1 m an axis.
+    assert lap.scores["ate_se3_m"][0] == pytest.approx(0.1 * np.sqrt(3.0), rel=0.05)
+    assert lap.scores["ate_se3_deg"][0] == pytest.approx(np.degrees(0.001 * np.sqrt(3.0)), rel=0.15)
+
+
+@pytest.mark.parametrize(("error", "finding"), [(0.11, "regressed"), (0.09, "moved"), (0.102, "")])
+def test_one_run_is_held_to_the_bound_either_way(vislam, error, finding):
+    write(Path("results/lap.tum"), stamps(10.0), error)
+    expected = [("lap", key, finding) for key in ("ate_se3_m", "ate_se3_deg", "rpe_100m_percent")] if finding else []
+    assert sorted(failures(vislam)) == sorted(expected)
+    assert failures(vislam, "--accept-better") == (expected if finding == "regressed" else [])
+
+
+@pytest.mark.parametrize(("error", "fails"), [(0.2, False), (0.3, True)])
+def test_repeated_runs_are_judged_by_their_own_spread(vislam, error, fails):
+    for run in range(5):
+        write(Path(f"results/maze/{run}.txt"), stamps(1.1, 2.0 + run), error, seed=10 + run)
+    found = failures(vislam)
+    assert (("maze", "ate_se3_m", "regressed") in found) is fails
+    assert bool(found) is fails
+
+
+def test_a_track_that_is_lost_fails_however_good_the_rest(vislam):
+    kept = np.concatenate([stamps(10.0, 0.0, 30.0), stamps(10.0, 36.0)])
+    write(Path("results/lap.tum"), kept, 0.095)
+    assert ("lap", TIME_COVERAGE, "regressed") in failures(vislam)
+
+
+def test_keyframes_cover_the_time_between_them_and_a_gap_does_not():
+    truth = stamps(100.0)
+    span_s = (truth[-1] - truth[0]) / S
+    keyframes = np.concatenate([stamps(0.5, 4.0, 20.0), stamps(0.5, 30.0, 50.1)])
+    assert time_coverage_percent(keyframes, truth, 5.0) == pytest.approx(100.0 * (14.0 + 20.0) / span_s)
+    assert time_coverage_percent(keyframes, truth, 12.0) == pytest.approx(100.0 * (14.0 + 12.0 + 20.0) / span_s)
+    assert time_coverage_percent(keyframes, truth, 1.0) == 0.0
+    beyond = stamps(1.0, -10.0, 80.0)
+    assert time_coverage_percent(beyond, truth, 5.0) == pytest.approx(100.0)
+
+
+def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_judged(vislam, capsys):
+    Path("results/lap.tum").write_text("1.0 2.0 3.0\n")
+    for file in Path("results/maze").iterdir():
+        file.unlink()
+    write(Path("results/new.tum"), stamps(10.0))
+    assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "lap: sequence is missing: results/lap.tum: 3 columns" in told
+    assert "maze: sequence is missing: no trajectory is there; the baseline has maze/0.txt" in told
+    assert "not in the baseline, and not judged: new" in told
+
+
+def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
+    Path("results/lap\x1b[31m.tum").write_text("spoilt")
+    Path("results/maze/\x1b]0;0.tum").write_text("spoilt")
+    assert failures(vislam) == [("maze", "sequence", "missing")]
+    assert "\x1b" not in capsys.readouterr().out
+
+
+def test_another_clock_is_told_with_both_ranges(vislam, capsys):
+    write(Path("results/lap.tum"), stamps(10.0, 3600.0, 3660.0))
+    assert failures(vislam) == [("lap", "sequence", "missing")]
+    assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
+
+
+def test_another_truth_is_not_compared_with(vislam, capsys):
+    write(Path("other/lap.tum"), stamps(20.0), 0.01)
+    assert failures(vislam, "--truth", "lap=other/lap.tum") == [("lap", "sequence", "missing")]
+    assert "another truth than the baseline's" in " ".join(capsys.readouterr().out.split())
+    Path("truth").rename("moved")
+    assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
+    assert failures(vislam, "--truth", "moved") == []
+
+
+def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
+    t_ns = stamps(10.0)
+    poses = truth_at(t_ns)
+    poses[:, :3, 3] *= 0.4
+    Path("results/lap.tum").write_text(tum.text(Trajectory(t_ns, poses)))
+    assert vislam(*BASELINE, "--align", "sim3", "--gap", "3") == 0
+    made = load_trajectory_baseline(Path("base.json"))
+    assert made.scoring.gap_s == 3.0
+    assert made.sequences["lap"].scores["ate_sim3_m"][0] < 1e-6
+    assert failures(vislam) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (("check", "--trajectories", "nowhere", "--baseline", "base.json"), 3, "nowhere: it is no folder"),
+        (("check", "--trajectories", "empty", "--baseline", "base.json"), 3, "no SEQUENCE.tum"),
+        (("check", "--trajectories", "results", "--baseline", "spoilt.json"), 3, "bounds.ate_yaw_m is not among"),
+        (("check", "--trajectories", "results", "--baseline", "truth/lap.tum"), 3, "cannot be read as JSON"),
+        (("check", "--baseline", "base.json", "--truth", "truth"), 2, "--truth goes with --trajectories"),
+        (("baseline", "--trajectories", "results"), 3, "lap: no truth is given; name it with --truth"),
+        (("baseline", "--trajectories", "results", "--truth", "results"), 3, "maze: results has 5 truths for it"),
+        (("baseline", "drive", "--trajectories", "results"), 2, "--trajectories takes no SEQUENCE"),
+        (("baseline", "drive", "--gap", "3"), 2, "--align and --gap go with --trajectories"),
+    ],
+)
+def test_trouble_is_told_in_one_line(vislam, capsys, words, status, told):
+    Path("empty").mkdir()
+    spoilt = json.loads(Path("base.json").read_text())
+    spoilt["bounds"]["ate_yaw_m"] = 5.0
+    Path("spoilt.json").write_text(json.dumps(spoilt))
+    assert vislam(*words) == status
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert told in said
+
+
+def test_runs_without_a_change_raise_an_alarm_no_more_often_than_stated():
+    rng = np.random.default_rng(3)
+    checks = 2000
+    alarms = sum(
+        Spread.of(*np.exp(0.2 * rng.standard_normal((2, 5)))).beyond_p(0.0, 1.0) <= 0.05 for _ in range(checks)
+    )
+    # Welch's test is a little off at five runs; three standard deviations above 5 %.
+    assert 0.03 * checks <= alarms <= 0.05 * checks + 3.0 * np.sqrt(0.05 * checks)

@@ -1,0 +1,233 @@
+"""Is the code slower than it was? Old and new code take turns, run by run, on the same recording and processor.
+
+What else the machine does slows both sides of a pair alike, so that 15 % shows where times measured apart scatter by
+as much. How many pairs are run is decided by how the first ones scatter, not by what they say (Stein, "A two-sample
+test for a linear hypothesis whose power is independent of the variance", Annals of Mathematical Statistics 16, 1945).
+The test is Wilcoxon's signed-rank test, which a run that was interrupted does not spoil.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm, wilcoxon
+
+from toolkit.gate import timing_child
+from toolkit.gate.baseline import Baseline, BaselineError, Case
+from toolkit.gate.measuring import recordings_of
+from toolkit.gate.other_code import unpacked
+from toolkit.gate.paired import POWER, holm
+from toolkit.gate.verdict import Finding, Verdict
+from toolkit.geometry import Array
+from toolkit.progress import ProgressFor
+from toolkit.settings import changes_of
+
+SPEED = "speed"
+# Slower by 5 % is nobody's concern; slower by 15 % must be seen.
+MARGIN, TO_SEE = 0.05, 0.15
+FEWEST_PAIRS, MOST_PAIRS = 16, 60
+# Enough to be timed; a batch smoother's whole drive takes seconds.
+LONGEST_S = 5.0
+_TAILS_PERCENT, _TAILS_OF_NORMAL = (10.0, 90.0), 1.2816
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """One estimator on one case: seconds of processor time of the old and the new code, pair by pair (n, 2)."""
+
+    case: str
+    estimator: str
+    cpu_s: Array
+
+    @property
+    def differences(self) -> Array:
+        """Logarithms (n,) of the new code's time over the old one's."""
+        logs: Array = np.log(self.cpu_s)
+        return logs[:, 1] - logs[:, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """What was timed, and what to know beside it."""
+
+    timed: tuple[Timed, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """What became of the comparison: a verdict for each estimator and case, and what to know beside them."""
+
+    verdicts: tuple[Verdict, ...]
+    notes: tuple[str, ...]
+    tests: int
+
+
+def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
+    """Judge the time of a baseline's estimators, the installed code's against another version's.
+
+    Raises BaselineError where the version cannot be had or cannot be timed.
+    """
+    turns = timed_in_turn(baseline, version, progress_for)
+    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes, len(turns.timed))
+
+
+def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
+    """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
+    cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
+    names = sorted({name for case in cases for name in case.estimators})
+    found: list[Timed] = []
+    notes: list[str] = []
+    with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
+        lacking = _lacking(version, sides, names)
+        if lacking:
+            notes.append(f"{', '.join(lacking)}: only here or only in {version}, and not timed")
+        for case in cases:
+            present = [name for name in case.estimators if name not in lacking]
+            with progress_for(f"{case.source}: speed against {version}") as progress:
+                _prepare(sides, case, baseline)
+                for done, name in enumerate(present):
+                    progress.advance(done, len(present))
+                    timed = _time(sides, case.source, name)
+                    (found if isinstance(timed, Timed) else notes).append(timed)  # type: ignore[arg-type]
+    return Turns(tuple(found), tuple(notes))
+
+
+def judge_speeds(found: Sequence[Timed], version: str, rate: float) -> Iterator[Verdict]:
+    """Yield the verdict on each estimator; the chance of any false alarm among them is at most ``rate``."""
+    slower, faster = (
+        holm(np.array([_beyond_p(sign * timed.differences) for timed in found], dtype=float)).tolist()
+        for sign in (1.0, -1.0)
+    )
+    for timed, p, p_faster in zip(found, slower, faster, strict=True):
+        finding: Finding = "regressed" if p <= rate else "better" if p_faster <= rate else "same"
+        ratio, (was, is_) = float(np.exp(np.median(timed.differences))), np.median(timed.cpu_s, axis=0).tolist()
+        words = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
+        seen = 100.0 * float(np.expm1(_seen(timed.differences, rate / len(found))))
+        yield Verdict(
+            timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else words, was, is_,
+            100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
+        )  # fmt: skip
+
+
+def _beyond_p(differences: Array) -> float:
+    """Return the p-value that the median of differences (n,) exceeds the margin."""
+    excess = differences - np.log1p(MARGIN)
+    return float(wilcoxon(excess, alternative="greater").pvalue) if np.any(excess) else 1.0
+
+
+def _scale(differences: Array) -> float:
+    """Return the standard deviation of differences (n,), from the tenth of them on either side."""
+    return float(np.ptp(np.percentile(differences, _TAILS_PERCENT))) / (2.0 * _TAILS_OF_NORMAL)
+
+
+def _seen(differences: Array, rate: float) -> float:
+    """Return the change that one test at ``rate`` sees with 95 % power; its efficiency is 3/pi of the t-test's."""
+    error = _scale(differences) * np.sqrt(np.pi / 3.0 / differences.size)
+    return float(np.log1p(MARGIN) + (norm.isf(rate) + norm.ppf(POWER)) * error)
+
+
+def pairs_needed(differences: Array) -> int:
+    """Return how many pairs see TO_SEE for certain, by the scatter of the first ones (n,)."""
+    excess = np.log1p(TO_SEE) - np.log1p(MARGIN)
+    # Five standard errors: 3.2 for the test at 0.05 over some 60 of them, 1.6 for the power, and some in hand.
+    needed = np.ceil(np.pi / 3.0 * (5.0 * _scale(differences) / excess) ** 2)
+    return int(np.clip(needed, FEWEST_PAIRS, MOST_PAIRS))
+
+
+class Process:
+    """A version of the code in a process of its own, which is asked in JSON."""
+
+    def __init__(self, process: "subprocess.Popen[str]", what: str) -> None:
+        self._process, self._what = process, what
+
+    def ask(self, do: str, **asked: object) -> dict[str, Any]:
+        """Return the answer; raises BaselineError where there is none."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            self._process.stdin.write(json.dumps({"do": do, **asked}) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        answer: dict[str, Any] = json.loads(line) if line else {"error": "its process ended"}
+        if "error" in answer:
+            raise BaselineError(f"{self._what} cannot be timed: {answer['error']}; name a later one")
+        return answer
+
+
+@contextmanager
+def timers(*paths: Sequence[Path]) -> Iterator[tuple[Process, ...]]:
+    """Start a process for each version, whose path stands first in it; none is left when the context ends."""
+    with ExitStack() as stack:
+        started = []
+        for what, path in zip(("the other version", "this version"), paths, strict=True):
+            process = subprocess.Popen(
+                [sys.executable, "-P", timing_child.__file__],
+                env=_environment(path),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+            stack.callback(_end, process)
+            started.append(Process(process, what))
+        yield tuple(started)
+
+
+def _environment(path: Sequence[Path]) -> dict[str, str]:
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    before = os.environ.get("PYTHONPATH")
+    return {**os.environ, **single, "PYTHONPATH": os.pathsep.join([*map(str, path), *([before] if before else [])])}
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    process.kill()
+    process.communicate()
+
+
+def _lacking(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[str]:
+    """Return the estimators that only one side has; raises BaselineError where both sides are the same code."""
+    found = [side.ask("where", estimators=names) for side in sides]
+    if found[0] == found[1]:
+        raise BaselineError(f"{version} brings no code of what runs here ({found[0]['toolkit']}); name another")
+    return [name for name in names if any(side["files"][name] is None for side in found)]
+
+
+def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
+    recording = recordings_of(case, baseline.settings)[0]
+    for side in sides:
+        side.ask(
+            "prepare",
+            source=recording.source,
+            seed=recording.seed,
+            truth=None if recording.truth is None else str(recording.truth),
+            duration_s=min(LONGEST_S, case.duration_s or LONGEST_S),
+            settings=changes_of(baseline.settings),
+        )
+
+
+def _time(sides: Sequence[Process], source: str, estimator: str) -> Timed | str:
+    """Time both sides in turn; return why that is not possible where a run does not end well."""
+    first = [side.ask("run", estimator=estimator) for side in sides]  # warms up, and is not counted
+    if any(one["status"] != "ok" for one in first):
+        return f"{source}: {estimator} ends {first[0]['status']} there and {first[1]['status']} here, and is not timed"
+    pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
+    more = pairs_needed(Timed(source, estimator, pairs).differences)
+    further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
+    return Timed(source, estimator, np.array([*pairs.tolist(), *further]))
+
+
+def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, float]:
+    """Return the seconds of the old and the new code; every second time the new code goes first."""
+    order: Mapping[int, Process] = dict(enumerate(sides))
+    times = {side: float(order[side].ask("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
+    return times[0], times[1]

@@ -1,0 +1,81 @@
+"""What runs within each of two versions of the code while they are timed in turn; :mod:`toolkit.gate.interleaved`.
+
+It is started as a script with one version first on the path, so that it imports that version's estimators, and does
+what the lines of its standard input ask: JSON there, JSON back. It must get by with what earlier versions have.
+"""
+
+import gc
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+Json = dict[str, Any]
+
+
+class Timer:
+    """One version of the code, with the recording that its estimators are timed on."""
+
+    def __init__(self) -> None:
+        self._prepared: Any = None
+        self._settings: Any = None
+
+    def where(self, asked: Json) -> Json:
+        """Return where the toolkit and each estimator come from; an estimator that is not there has no file."""
+        from toolkit.errors import VislamError
+        from toolkit.estimator import find
+
+        files: dict[str, str | None] = {}
+        for name in asked["estimators"]:
+            try:
+                files[name] = sys.modules[find(name).load().__module__].__file__
+            except VislamError:
+                files[name] = None
+        return {"toolkit": sys.modules["toolkit"].__file__, "files": files}
+
+    def prepare(self, asked: Json) -> Json:
+        """Make a recording ready."""
+        from toolkit.experiment.recording import Recording, prepare
+        from toolkit.settings import settings_of
+
+        self._settings = settings_of(asked["settings"], "the baseline's settings")
+        truth = None if asked["truth"] is None else Path(asked["truth"])
+        noise, start = self._settings.noise, self._settings.start
+        recording = Recording(
+            asked["source"], asked["seed"], truth, start=start, duration_s=asked["duration_s"], noise=noise
+        )
+        self._prepared = prepare(recording)
+        return {}
+
+    def run(self, asked: Json) -> Json:
+        """Run an estimator over the recording; return its seconds of processor time, and how it ended."""
+        from toolkit import runner
+        from toolkit.estimator import find
+        from toolkit.progress import SILENT
+
+        name, prepared = asked["estimator"], self._prepared
+        gc.collect()
+        run = runner.run(name, find(name).load(), prepared.sequence, prepared.prior, SILENT, self._settings)
+        return {"status": run.status, "cpu_s": None if run.timings is None else run.timings.cpu_s}
+
+
+def main() -> None:
+    """Answer until nobody asks."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the one who asks ends this process
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # nothing that is printed shall look like an answer
+    timer = Timer()
+    for line in sys.stdin:
+        asked = json.loads(line)
+        try:
+            answer = getattr(timer, asked["do"])(asked)
+        except Exception as error:
+            answer = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()

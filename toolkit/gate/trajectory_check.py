@@ -1,0 +1,188 @@
+"""Hold a folder of trajectories against a baseline, or make the baseline of one."""
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.errors import DataError, printable
+from toolkit.gate.baseline import Criterion, Values
+from toolkit.gate.bounded import judge_recorded
+from toolkit.gate.measuring import DATA_ROOT
+from toolkit.gate.paired import Where, holm, told_percent
+from toolkit.gate.trajectory_baseline import BOUND_PERCENT, Scored, TrajectoryBaseline
+from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
+from toolkit.gate.unpaired import FEWEST_RUNS, Spread
+from toolkit.gate.verdict import Check, Finding, Verdict
+from toolkit.geometry import Array
+
+_SEQUENCE = "sequence"
+
+
+@dataclass(frozen=True)
+class Truths:
+    """Where the truth of a sequence is: in a file named for it in a folder, or in one that was named."""
+
+    folder: Path | None = None
+    files: Mapping[str, Path] | None = None
+
+    def of(self, sequence: str) -> Path:
+        """Return the truth's file; raises DataError where there is none."""
+        if self.files and sequence in self.files:
+            return self.files[sequence]
+        if self.folder is None:
+            raise DataError(f"{sequence}: no truth is given; name it with --truth {sequence}=FILE.tum or --truth DIR")
+        found = files_by_sequence(self.folder).get(sequence, ())
+        if len(found) != 1:
+            raise DataError(f"{sequence}: {self.folder} has {len(found)} truths for it; give one, {sequence}.tum")
+        return found[0]
+
+
+def new_trajectory_baseline(
+    folder: Path, truths: Truths, scoring: Scoring, made_by: Mapping[str, str]
+) -> TrajectoryBaseline:
+    """Score every trajectory in a folder; raises DataError for the first file that cannot be used."""
+    found = {}
+    for sequence, files in files_by_sequence(folder).items():
+        path = truths.of(sequence)
+        truth = read_stamped(path)
+        names = tuple(str(file.relative_to(folder)) for file in files)
+        found[sequence] = Scored(path.as_posix(), truth.digest, names, _scores_of(files, truth, scoring))
+    bounds = {key: BOUND_PERCENT for key in scoring.metrics if key != TIME_COVERAGE}
+    return TrajectoryBaseline(found, scoring, bounds, made_by=made_by)
+
+
+def check_trajectories(
+    baseline: TrajectoryBaseline, name: str, folder: Path, truths: Truths, *, accept_better: bool = False
+) -> Check:
+    """Score a folder's trajectories and judge them; a file that cannot be used is a verdict, not an error.
+
+    Raises DataError where the folder has no trajectory at all.
+    """
+    began, there = time.monotonic(), files_by_sequence(folder)
+    verdicts: list[Verdict] = []
+    compared: list[_Compared] = []
+    for sequence, before in baseline.sequences.items():
+        try:
+            now = _now(sequence, before, there.get(sequence, ()), truths, baseline.scoring)
+        except DataError as error:
+            verdicts.append(Verdict(sequence, "", "", _SEQUENCE, "missing", printable(" ".join(str(error).split()))))
+            continue
+        verdicts += _coverage(sequence, before, now, baseline.coverage_points)
+        for key, percent in baseline.bounds.items():
+            lost = _lost(before.scores[key], now[key])
+            if lost:
+                verdicts.append(Verdict(sequence, "", "", key, "missing", lost))
+            elif any(value is not None for value in before.scores[key]):
+                sides = _array(before.scores[key]), _array(now[key])
+                compared.append(_Compared(Where(sequence, "", "", key), Criterion("larger", percent), *sides))
+    tested = _judged(compared, baseline.false_alarm_rate, accept_better=accept_better)
+    order = list(baseline.sequences)
+    verdicts = sorted([*verdicts, *tested], key=lambda verdict: order.index(verdict.sequence))
+    unknown = sorted(set(there) - set(order))
+    notes = (f"not in the baseline, and not judged: {', '.join(unknown)}",) if unknown else ()
+    tests = sum(one.is_tested for one in compared)
+    seconds = time.monotonic() - began
+    return Check(name, tuple(verdicts), notes, baseline.false_alarm_rate, tests, {}, seconds, accept_better)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """One metric in the runs of both sides (m,), (n,)."""
+
+    where: Where
+    criterion: Criterion
+    before: Array
+    after: Array
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether there are runs enough to tell chance by."""
+        return min(self.before.size, self.after.size) >= FEWEST_RUNS
+
+    @property
+    def margin(self) -> float:
+        """The growth that is allowed, of the logarithm."""
+        return float(np.log1p(self.criterion.percent / 100.0))
+
+
+def _now(sequence: str, before: Scored, files: tuple[Path, ...], truths: Truths, scoring: Scoring) -> dict[str, Values]:
+    """Return the scores of a sequence's files; raises DataError where one cannot be used, or the truth is another."""
+    if not files:
+        raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files)}")
+    given = truths.folder is not None or sequence in (truths.files or {})
+    truth = read_stamped(truths.of(sequence) if given else _located(before.truth))
+    if truth.digest != before.truth_hash:
+        raise DataError(f"{truth.path} is another truth than the baseline's; make a new baseline")
+    return _scores_of(files, truth, scoring)
+
+
+def _located(truth: str) -> Path:
+    """Return where a baseline's truth is: from here, or from the folder VISLAM_DATA."""
+    root = os.environ.get(DATA_ROOT)
+    places = [Path(truth), *([] if root is None else [Path(root).expanduser() / truth])]
+    return next((place for place in places if place.exists()), places[0])
+
+
+def _scores_of(files: tuple[Path, ...], truth: Poses, scoring: Scoring) -> dict[str, Values]:
+    by_file = [scores(read_stamped(file), truth, scoring) for file in files]
+    return {key: tuple(one[key] for one in by_file) for key in scoring.metrics}
+
+
+def _array(values: Values) -> Array:
+    return np.array([value for value in values if value is not None])
+
+
+def _lost(before: Values, now: Values) -> str:
+    """Say that runs have no value now where the baseline's had one; nothing where none is lost."""
+    had, gone = sum(value is not None for value in before), sum(value is None for value in now)
+    lost = gone and had and (had == len(before) or gone == len(now))
+    return f"it has no value in {gone} of {len(now)} runs" if lost else ""
+
+
+def _coverage(sequence: str, before: Scored, now: Mapping[str, Values], allowed: float) -> Iterator[Verdict]:
+    """Fail where the worst run covers less of the time than the worst one of the baseline did."""
+    was, is_ = (float(_array(side[TIME_COVERAGE]).min()) for side in (before.scores, now))
+    worse = was - is_ > allowed
+    words = f"the least of the runs fell from {was:.1f} to {is_:.1f} percent of the time, {allowed:g} less is allowed"
+    finding: Finding = "regressed" if worse else "same"
+    yield Verdict(sequence, "", "", TIME_COVERAGE, finding, words if worse else "", was, is_)
+
+
+def _judged(compared: list[_Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
+    """Yield a verdict for each metric: by a test where there are runs enough, else by its bound alone."""
+    tested = [one for one in compared if one.is_tested]
+    spreads = [Spread.of(one.before, one.after) for one in tested]
+    up, down = (
+        holm(np.array([spread.beyond_p(one.margin, sign) for spread, one in zip(spreads, tested, strict=True)]))
+        for sign in (1.0, -1.0)
+    )
+    for one, spread, p_up, p_down in zip(tested, spreads, up.tolist(), down.tolist(), strict=True):
+        yield _tested(one, spread, (p_up, p_down), rate / 2.0, rate / len(tested) / 2.0, accept_better=accept_better)
+    for one in compared:
+        if not one.is_tested:
+            was, is_ = float(np.median(one.before)), float(np.median(one.after))
+            yield judge_recorded(one.where, one.criterion, was, is_, accept_better=accept_better)
+
+
+def _tested(
+    one: _Compared, spread: Spread, p_values: tuple[float, float], rate: float, each: float, *, accept_better: bool
+) -> Verdict:
+    worse, better = (p <= rate for p in p_values)
+    finding: Finding = "regressed" if worse else "same"
+    if better:
+        finding = "better" if accept_better else "moved"
+    change = 100.0 * float(np.expm1(spread.change))
+    runs = f"{one.before.size} runs before, {one.after.size} now"
+    p = min(p_values)
+    words = "" if finding == "same" else f"{told_percent(change)}, {runs}; chance explains that with p = {p:.2g}"
+    where = one.where
+    return Verdict(
+        where.sequence, where.estimator, where.output, where.metric, finding, words,
+        before=float(np.exp(np.log(one.before).mean())), after=float(np.exp(np.log(one.after).mean())),
+        change_percent=change, allowed_percent=one.criterion.percent, p=p,
+        seen_percent=100.0 * float(np.expm1(spread.seen(one.margin, each))),
+    )  # fmt: skip
