@@ -282,7 +282,7 @@ variants = {
     "mixed axes": planted.mixed_axes,
     "gyro bias": planted.gyro_bias,
 }
-drive = planted.drive(duration_s=8.0, seed=0)
+drive = planted.drive(duration_s=5.0, seed=0)
 harm = {
     name: compare(plant(drive), ["dead-reckoning", "seed-ekf", "ekf", "batch"], keep=faults())
     for name, plant in variants.items()

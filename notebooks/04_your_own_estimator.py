@@ -166,7 +166,7 @@ print("two-view:", find("two-view").summary())
 # estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
-over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=6, max_frames=40)
+over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=6, max_frames=25)
 over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%

@@ -10,9 +10,11 @@ import pytest
 from toolkit.estimate import Landmarks
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, se3
-from toolkit.report.figures import errors_over_time, frame_times, reprojection, top_view
+from toolkit.report.figures import against_bound, errors_over_time, frame_times, reprojection, top_view
 from toolkit.report.figures.alignment import errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import colour_of, width_of
+from toolkit.settings import Metrics, Settings
+from toolkit.simulation import DRIVE, simulate
 
 ComparisonOf = Callable[..., Comparison]
 
@@ -98,3 +100,21 @@ def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: ob
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)
     assert list(draw(broken)) == []
+
+
+def test_the_bound_is_drawn_where_it_was_asked_for(comparison_of: ComparisonOf, run_estimator) -> None:
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    usual = comparison_of(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
+    assert list(against_bound.draw(usual)) == []
+    asked = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
+    (drawn,) = against_bound.draw(asked)
+    position = drawn.figure.axes[0]
+    lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
+    # Dead reckoning knows less than the bound's measurements tell, so it errs beyond it; both begin with the prior.
+    assert lines["dead-reckoning causal = final"][-1] > position.get_ylim()[0]
+    assert lines["bound causal"][0] == pytest.approx(np.sqrt(np.trace(sequence.prior.cov[3:6, 3:6])), rel=1e-6)
+
+
+def test_a_recording_without_a_bound_has_no_such_figure(without_truth: Comparison) -> None:
+    asked = replace(without_truth, settings=Settings(metrics=Metrics(bound=True)))
+    assert list(against_bound.draw(asked)) == []

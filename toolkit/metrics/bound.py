@@ -6,9 +6,11 @@ on the same measurements and a part ``d`` that is not correlated with it, so its
 d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import normalised, stated_errors
 from toolkit.metrics._shared.cramer_rao import efficient
 from toolkit.metrics._shared.evaluation import Evaluation
@@ -57,23 +59,46 @@ METRICS = (
 )
 
 
-def score(evaluation: Evaluation) -> Scores:
-    """Score an output against the bound of what it could know: at each frame, or from the whole recording."""
+@dataclass(frozen=True, eq=False)
+class AgainstBound:
+    """An output beside its bound at stamps (n,): what it errs beyond the efficient estimate (n, d), what it states.
+
+    ``bound`` and ``stated`` (n, d, d) are covariances in the layout's order.
+    """
+
+    t_ns: IntArray
+    layout: Layout
+    excess: Array
+    bound: Array
+    stated: Array
+
+
+def against_bound(evaluation: Evaluation) -> AgainstBound:
+    """Return an output beside the bound of what it could know: at each frame, or from the whole recording.
+
+    Raises Unavailable where the recording has no bound, or the output no stated covariance of the whole state.
+    """
     best, stated = efficient(evaluation.sequence, evaluation.output), stated_errors(evaluation)
     frames = np.searchsorted(evaluation.sequence.frames_t_ns, stated.errors.t_ns)
-    excess, bound = state_errors(evaluation, stated) - best.errors[frames], best.covs[frames]
-    position_m = _rms(bound, POSITION)
-    lost_m = float(np.sqrt(np.square(excess[:, POSITION]).sum(axis=1).mean()))
+    excess = state_errors(evaluation, stated) - best.errors[frames]
+    return AgainstBound(stated.errors.t_ns, best.layout, excess, best.covs[frames], stated.cov)
+
+
+def score(evaluation: Evaluation) -> Scores:
+    """Score an output against the bound."""
+    found = against_bound(evaluation)
+    position_m = _rms(found.bound, POSITION)
+    lost_m = float(np.sqrt(np.square(found.excess[:, POSITION]).sum(axis=1).mean()))
     values: dict[str, float | None] = {
         "efficiency_percent": 100.0 * position_m / float(np.hypot(position_m, lost_m)),
         "bound_position_m": position_m,
-        "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION))),
+        "bound_rotation_deg": float(np.degrees(_rms(found.bound, ROTATION))),
     }
-    blocks = _blocks(best.layout)
+    blocks = _blocks(found.layout)
     for key, block in blocks.items():
-        values[f"excess_{key}"] = None if block is None else _excess(excess, bound, block)
+        values[f"excess_{key}"] = None if block is None else _excess(found.excess, found.bound, block)
     for key, block in blocks.items():
-        values[f"claimed_{key}"] = None if block is None else _claimed(stated.cov, bound, block)
+        values[f"claimed_{key}"] = None if block is None else _claimed(found.stated, found.bound, block)
     return Scores(values, {key: NO_SUCH_BLOCK for key, value in values.items() if value is None})
 
 

@@ -10,11 +10,17 @@ from matplotlib.text import Text
 
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import errors_over_time, frame_times, over_seeds, reprojection, top_view
+from toolkit.report.figures import against_bound, errors_over_time, frame_times, over_seeds, reprojection, top_view
 from toolkit.report.figures.style import NamedFigure
 
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
-_OF_ONE: tuple[_Drawing, ...] = (top_view.draw, errors_over_time.draw, reprojection.draw, frame_times.draw)
+_OF_ONE: tuple[_Drawing, ...] = (
+    top_view.draw,
+    errors_over_time.draw,
+    against_bound.draw,
+    reprojection.draw,
+    frame_times.draw,
+)
 _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
 

@@ -1,0 +1,84 @@
+"""What each estimator loses against the Cramér-Rao bound over time, beside the bound and what it states."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.geometry import Array
+from toolkit.metrics import Evaluation, Unavailable
+from toolkit.metrics.bound import AgainstBound, against_bound
+from toolkit.models.state import POSITION, ROTATION
+from toolkit.report.figures.style import TRUTH_COLOUR, NamedFigure, colour_of, line_of, new_figure, quiet
+from toolkit.resampling import NS_PER_S
+
+_CAPTION = (
+    "How close to the limit. Black: the Cramér-Rao bound, one standard deviation (dashed: of what was known at the "
+    "time, solid: of the whole recording). In colour, thick: what an estimator errs beyond the efficient estimate on "
+    "the same measurements; well below the bound it loses nothing that matters. Thin: the standard deviation it "
+    "states; below the bound it is too sure."
+)
+_LEAST_SHARE = 1e-3
+
+
+def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure where the bound was asked for and the recording has one."""
+    found = list(_found(comparison)) if comparison.settings.metrics.bound else []
+    if found:
+        yield _figure(comparison, found)
+
+
+def _found(comparison: Comparison) -> Iterator[tuple[Row, AgainstBound]]:
+    for row in comparison.lines:
+        try:
+            yield row, against_bound(Evaluation(row.run, row.output, comparison.sequence))
+        except Unavailable:
+            continue  # the notes under the table say why
+
+
+def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
+    figure = new_figure(9.6, 6.4)
+    position, rotation = figure.subplots(2, 1, sharex=True)
+    for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
+        for row, one in found:
+            _plot_estimator(axes, comparison, row, one, block, scale)
+        _plot_bounds(axes, comparison, found, block, scale)
+    quiet(position, f"{comparison.sequence.name}: position beyond the efficient estimate", "", "position [m]")
+    quiet(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
+    figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
+    return NamedFigure("against_bound", _CAPTION, figure)
+
+
+def _plot_estimator(
+    axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
+) -> None:
+    colour, line, t_s = colour_of(comparison, row.estimator), line_of(row.output), _seconds(comparison, one)
+    label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
+    lost = np.linalg.norm(one.excess[:, block], axis=1)
+    axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
+    axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=0.7)
+
+
+def _plot_bounds(
+    axes: Axes, comparison: Comparison, found: list[tuple[Row, AgainstBound]], block: slice, scale: float
+) -> None:
+    """Draw the bound of each kind of output, and leave room for what is a thousand times below it."""
+    least = np.inf
+    for output in dict.fromkeys(row.output for row, _ in found):
+        one = next(one for row, one in found if row.output == output)
+        sigma = scale * _sigma(one.bound, block)
+        least = min(least, float(sigma.min()))
+        t_s, line = _seconds(comparison, one), line_of(output)
+        axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=_LEAST_SHARE * least)
+
+
+def _seconds(comparison: Comparison, one: AgainstBound) -> Array:
+    return np.asarray((one.t_ns - int(comparison.sequence.frames_t_ns[0])) / NS_PER_S)
+
+
+def _sigma(covs: Array, block: slice) -> Array:
+    """Return the root (n,) of the trace of a block of covariances (n, d, d)."""
+    return np.asarray(np.sqrt(np.trace(covs[:, block, block], axis1=1, axis2=2)))
