@@ -1,12 +1,14 @@
 """Cuts samples at the frame times, once, so that every estimator integrates exactly the same interval."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from toolkit.geometry import Array, IntArray
+from toolkit.arrays import freeze_arrays
+from toolkit.geometry import Array, IntArray, read_only
 
 NS_PER_S = 1_000_000_000
 
@@ -37,3 +39,27 @@ def _paired(t_ns: IntArray, values: Array, knots: IntArray, pairing: Pairing) ->
     relative_s, knots_s = (t_ns - knots[0]) / NS_PER_S, (knots - knots[0]) / NS_PER_S
     at_knots: Array = np.stack([np.interp(knots_s, relative_s, column) for column in values.T], axis=1)
     return 0.5 * (at_knots[:-1] + at_knots[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class Bridges:
+    """Spans (B,) in which nobody measured the motion and samples were put in, which are noisier than the others.
+
+    ``noise_scale`` (B, 2) multiplies the standard deviation of the white noise there, of linear and angular samples.
+    """
+
+    begin_t_ns: IntArray
+    end_t_ns: IntArray
+    noise_scale: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, begin_t_ns=(None,), end_t_ns=(None,), noise_scale=(None, 2))
+
+    def scale_over(self, begin_ns: int, dt_s: Array) -> Array | None:
+        """Return the factors (n, 2) over successive pieces (n,) from a stamp on, or None where all was measured."""
+        middle_t_ns = begin_ns + np.rint((np.cumsum(dt_s) - 0.5 * dt_s) * NS_PER_S).astype(np.int64)
+        inside = (middle_t_ns[:, None] > self.begin_t_ns) & (middle_t_ns[:, None] < self.end_t_ns)  # (n, B)
+        if not inside.any():
+            return None
+        scale: Array = read_only(np.where(inside[:, :, None], self.noise_scale, 1.0).max(axis=1))
+        return scale

@@ -24,10 +24,12 @@ from toolkit.geometry import (
     rotation_from_quaternion,
     se3,
 )
-from toolkit.resampling import NS_PER_S, Pairing, cut_at
+from toolkit.resampling import NS_PER_S, Bridges, Pairing, cut_at
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
+# The fact by which a recording says that it brings no tracks.
+NO_FEATURES = "no image features in this file"
 # Of a recording or a trajectory: names become those of files, of which systems allow 255 bytes.
 LONGEST_NAME = 200
 # A calibration written with three decimals is off by less; a product of doubles is off by no more.
@@ -204,6 +206,7 @@ class Prior:
         freeze_arrays(self, T_world_imu=(4, 4), v_world=(3,), bias=(6,), cov=(15, 15))
 
 
+# In both, ``noise_scale`` (n, 2) multiplies the noise of linear and angular samples; None where all was measured.
 @dataclass(frozen=True, eq=False)
 class TwistMotion:
     """The twists of one interval: durations (n,) s, linear (n, 3) m/s and angular velocity (n, 3) rad/s."""
@@ -211,6 +214,7 @@ class TwistMotion:
     dt_s: Array
     v_mps: Array
     w_radps: Array
+    noise_scale: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +224,7 @@ class ImuMotion:
     dt_s: Array
     accel_mps2: Array
     gyro_radps: Array
+    noise_scale: Array | None = None
 
 
 Motion = TwistMotion | ImuMotion
@@ -261,8 +266,8 @@ class Sequence:
     """One recording: calibration, noise, frame stamps (K,), sightings, motion samples, and truth if there is any.
 
     A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only
-    :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2.
-    """
+    :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2; ``bridges``: where
+    motion samples are put in."""
 
     name: str
     rig: StereoRig
@@ -274,6 +279,7 @@ class Sequence:
     prior: Prior | None = None
     truth: Truth | None = None
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
+    bridges: Bridges | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self, frames_t_ns=(None,), gravity_world=(3,))
@@ -313,7 +319,7 @@ class Sequence:
         """
         check_runnable(self)
         first_row = np.searchsorted(self.visible.frame, np.arange(self.frame_count + 1))
-        motions = _cut(self.motion, self.frames_t_ns)
+        motions = _cut(self.motion, self.frames_t_ns, self.bridges)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
             frame = StereoFrame(int(self.frames_t_ns[k]), self.visible.track_id[rows], self.visible.uv_px[rows])
@@ -332,7 +338,7 @@ class Sequence:
         With ``digits``, of the same rounded (:func:`toolkit.files.content_digest`).
         """
         seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
-        return content_digest((*seen, self.truth, self.prior), digits)
+        return content_digest((*seen, self.truth, self.prior, *filter(None, (self.bridges,))), digits)
 
 
 def is_held_out(track_ids: IntArray) -> BoolArray:
@@ -383,10 +389,12 @@ def check_stated(sequence: Sequence) -> None:
         raise DataError(f"{sequence.name}: rig.cov_uv_px2 is no covariance: its noise must be positive in every axis")
 
 
-def _cut(samples: MotionSamples, frames_t_ns: IntArray) -> Iterator[Motion]:
+def _cut(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None) -> Iterator[Motion]:
     """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
     twist = isinstance(samples, TwistSamples)
     pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
-    for dt_s, rows in cut_at(frames_t_ns, samples.t_ns, samples.values, pairing):
-        part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]))
+    pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, pairing)
+    for begin_ns, (dt_s, rows) in zip(frames_t_ns[:-1].tolist(), pieces, strict=True):
+        scale = None if bridges is None else bridges.scale_over(begin_ns, dt_s)
+        part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]), scale)
         yield TwistMotion(*part) if twist else ImuMotion(*part)

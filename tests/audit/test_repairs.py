@@ -204,7 +204,8 @@ def test_a_standstill_shows_the_gyro_bias_without_a_camera(clean_recording: Make
     v_mps[:80] = 0.001 * rng.standard_normal((80, 3))
     w_radps[:80] = -0.01 + 0.005 * rng.standard_normal((80, 3))
     blind = replace(clean, observations=clean.observations.select(np.zeros(len(clean.observations), dtype=bool)))
-    finding = only_finding(replace(blind, motion=replace(clean.motion, v_mps=v_mps, w_radps=w_radps)))
+    no_sightings, finding = audit(replace(blind, motion=replace(clean.motion, v_mps=v_mps, w_radps=w_radps))).findings
+    assert no_sightings.fault == "no-sightings"
     assert (finding.fault, finding.count) == ("gyro-bias", 3)
     assert "80 samples at standstill" in finding.detail
 

@@ -232,3 +232,54 @@ def test_an_array_shorter_than_its_header_says_is_noticed(course: Course, tmp_pa
         stream.write(features.tobytes()[:-20])
     with pytest.raises(DataError, match="features ends after 57 of 60 values"):
         course_npz.load(path)
+
+
+@pytest.mark.parametrize(
+    "entries, message",
+    [
+        ({(0, 1): 50.0}, "K has a skew of 50 px"),
+        ({(0, 0): -500.0}, "fx in K is -500, expected a positive number"),
+        ({(0, 0): 0.0, (1, 1): 0.0}, "fx in K is 0"),
+        ({(2, 2): 0.0}, "the last row of K is"),
+    ],
+)
+def test_a_camera_matrix_that_is_none_is_refused_by_its_entry(
+    course: Course, tmp_path: Path, entries: dict[tuple[int, int], float], message: str
+) -> None:
+    for place, value in entries.items():
+        course["K"][place] = value
+    with pytest.raises(DataError, match=message.replace("[", r"\[")):
+        course_npz.load(written(tmp_path, course))
+
+
+def test_a_transposed_camera_matrix_is_named(course: Course, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="expected 0, 0, 1; transpose it"):
+        course_npz.load(written(tmp_path, course | {"K": course["K"].T}))
+
+
+def many(u_left: float, v_left: float, u_right: float, v_right: float) -> np.ndarray:
+    """Return features of eight tracks in all five frames, scattered about one place."""
+    corners = np.array([u_left, v_left, u_right, v_right])[:, None, None]
+    return corners + np.random.default_rng(0).normal(0.0, 0.5, (4, 8, 5))
+
+
+@pytest.mark.parametrize(
+    "corners, message",
+    [
+        ((400.0, 200.0, 380.0, 212.0), "vL - vR is -1[12].. px .* rectify the images"),
+        ((200.0, 400.0, 200.0, 380.0), "u and v look exchanged: exchange them"),
+    ],
+)
+def test_rows_that_differ_are_refused(
+    course: Course, tmp_path: Path, corners: tuple[float, float, float, float], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        course_npz.load(written(tmp_path, course | {"features": many(*corners)}))
+    course_npz.load(written(tmp_path, course | {"features": many(400.0, 200.0, 380.0, 200.0)}))
+
+
+def test_features_without_a_sighting_are_not_taken_for_a_file_that_has_none(course: Course, tmp_path: Path) -> None:
+    blind = course_npz.load(written(tmp_path, course | {"features": np.full((4, 3, 5), -1.0)}))
+    assert not blind.provenance.facts
+    del course["features"]
+    assert course_npz.load(written(tmp_path, course)).provenance.facts

@@ -55,6 +55,18 @@ def state() -> State:
     return State(se3_exp(np.array([0.4, -0.8, 1.1, 3.0, -2.0, 5.0])), np.array([3.0, -1.0, 0.5]), BIAS + 0.01)
 
 
+def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) -> None:
+    noise = FLIGHT.motion.noise
+    model = imu.ImuModel(noise, np.array(GRAVITY_WORLD))
+    bridged = model.integrate(replace(motion, noise_scale=np.tile([3.0, 2.0], (20, 1))), BIAS).preintegration
+    larger = replace(
+        noise, accel_noise_density=3.0 * noise.accel_noise_density, gyro_noise_density=2.0 * noise.gyro_noise_density
+    )
+    expected = imu.preintegrate(motion, BIAS, imu.preintegration_params(larger, np.array(GRAVITY_WORLD)))
+    np.testing.assert_allclose(bridged.preintMeasCov(), expected.preintMeasCov(), rtol=1e-12)
+    np.testing.assert_array_equal(bridged.deltaPij(), expected.deltaPij())
+
+
 def predicted(preintegration: imu.Preintegration, start: State) -> State:
     step = imu.predict(preintegration, *start)
     return State(step.T_world_imu, step.v_world, start.bias)

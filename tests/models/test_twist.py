@@ -168,3 +168,13 @@ def test_factor_and_walk_stand_between_the_right_variables():
     values.insert(B(4), np.array([1.0, 2.0, 3.0]))
     values.insert(B(5), np.array([1.5, 2.0, 2.0]))
     np.testing.assert_allclose(walk.unwhitenedError(values), [0.5, 0.0, -1.0], atol=1e-15)
+
+
+def test_noise_over_a_bridge_is_scaled_and_the_step_is_not(motion: TwistMotion) -> None:
+    """Factors of linear and angular noise (3, 2): the covariance is that of a noise stated so much larger."""
+    scale = np.tile([3.0, 2.0], (len(motion.dt_s), 1))
+    bridged = twist.integrate(TwistMotion(motion.dt_s, motion.v_mps, motion.w_radps, scale), BIAS, NOISE)
+    larger = TwistNoise(3.0 * NOISE.velocity_noise_density, 2.0 * NOISE.gyro_noise_density, NOISE.gyro_random_walk)
+    expected = twist.integrate(motion, BIAS, larger)
+    np.testing.assert_allclose(bridged.cov, expected.cov, rtol=1e-12)
+    np.testing.assert_array_equal(bridged.T_start_end, expected.T_start_end)

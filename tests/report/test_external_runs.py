@@ -190,3 +190,12 @@ def test_openvins_own_file_scores_as_the_recordings_reference_does(real: Callabl
     there, here = score_run(reference, "causal", sequence).values, score_run(run, "final", sequence).values
     for key in ("ate_yaw_m", "ate_se3_deg", "pairs", "coverage_percent", "heldout_reproj_median_px"):
         assert here[key] == there[key]
+
+
+def test_positions_in_millimetres_are_named_with_the_ratio(tmp_path: Path, recording: Sequence) -> None:
+    """Against the truth, or without it against the measured speeds, which an IMU has not."""
+    truth = truth_of(recording)
+    far = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], 1000.0 * truth.positions))
+    blind = [replace(recording, truth=None)] if isinstance(recording.motion, TwistSamples) else []
+    for known in (recording, *blind):
+        assert "it is in millimetres: divide its positions by 1000" in refusal(tmp_path, far, known)

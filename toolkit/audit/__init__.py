@@ -6,23 +6,33 @@ Read ``fault``, then ``no_disparity`` for the smallest fault, ``stale_frames`` a
 
 import importlib
 import pkgutil
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from graphlib import TopologicalSorter
 
-from toolkit.audit.fault import Evidence, Fault, Finding, Symptom
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Finding, Symptom, Undecided
 from toolkit.errors import VislamError, no_such
 from toolkit.sequence import Sequence
+
+# Share of the sightings that a repair may drop; frames cut off with theirs do not count, for what stays is whole.
+MOST_LOST = 0.2
 
 __all__ = ["Audit", "Finding", "audit", "faults"]
 
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """The sequence after the audit's repairs, and what was found in it, in the order it was checked."""
+    """The sequence after the audit's repairs, and what was found in it, in the order it was checked.
+
+    ``undecided`` has the faults that the recording does not allow to judge, and why: they may be there or not.
+    """
 
     sequence: Sequence
     findings: tuple[Finding, ...]
+    undecided: Mapping[str, str] = field(default_factory=dict)
 
 
 def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
@@ -33,16 +43,19 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     unknown = keep - faults().keys()
     if unknown:
         raise VislamError(no_such("fault", min(unknown), faults()))
-    evidence, findings = Evidence(sequence), []
+    evidence, findings, undecided = Evidence(sequence), [], {}
     for fault in _ordered():
         symptom = fault.check(evidence)
-        if symptom is None:
-            continue
-        remedy = None if fault.name in keep else symptom.remedy
-        findings.append(_finding(fault, symptom, repaired=remedy is not None))
-        if remedy is not None:
-            evidence = evidence.after(remedy)
-    return Audit(evidence.sequence, tuple(findings))
+        if isinstance(symptom, Undecided):
+            undecided[fault.name] = symptom.why
+        elif symptom is not None:
+            remedy = None if fault.name in keep else symptom.remedy
+            findings.append(_finding(fault, symptom, evidence.sequence, repaired=remedy is not None))
+            if remedy is not None:
+                evidence = evidence.after(remedy)
+            elif symptom.spoils_vision:
+                evidence = Evidence(evidence.sequence, fault.name)
+    return Audit(evidence.sequence, tuple(findings), undecided)
 
 
 def faults() -> dict[str, str]:
@@ -50,12 +63,20 @@ def faults() -> dict[str, str]:
     return {fault.name: fault.summary for fault in _ordered()}
 
 
-def _finding(fault: Fault, symptom: Symptom, repaired: bool) -> Finding:
+def _finding(fault: Fault, symptom: Symptom, before: Sequence, repaired: bool) -> Finding:
     left_alone = symptom.remedy is not None and not repaired
-    outcome = "left as it is" if left_alone else symptom.treatment
-    return Finding(
-        fault.name, symptom.count, repaired, f"{symptom.detail}; {outcome}", symptom.harmful and not repaired
-    )
+    detail = f"{symptom.detail}; {'left as it is' if left_alone else symptom.treatment}"
+    lost = _share_lost(before, symptom.remedy) if repaired and symptom.remedy is not None else 0.0
+    if lost > MOST_LOST:
+        detail += f"; it takes {lost:.0%} of the sightings, with which the recording is another one"
+    blocking = symptom.harmful and (not repaired or lost > MOST_LOST)
+    return Finding(fault.name, symptom.count, repaired, detail, blocking)
+
+
+def _share_lost(before: Sequence, after: Sequence) -> float:
+    """Return the share of the sightings that a repair drops from the frames it keeps."""
+    in_kept_frames = np.isin(before.frames_t_ns, after.frames_t_ns)[before.observations.frame].sum()
+    return 1.0 - len(after.observations) / int(in_kept_frames) if in_kept_frames else 0.0
 
 
 @cache

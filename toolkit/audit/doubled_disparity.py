@@ -96,5 +96,5 @@ FAULT = Fault(
     "tracks whose disparity doubles from their first sighting to the second",
     check,
     # A track through a stale frame, or one that was lost, is no longer the one that was detected.
-    after=("time-order", "returning-tracks", "stale-frames"),
+    after=("time-order", "returning-tracks", "stale-frames", "swapped-coordinates"),
 )

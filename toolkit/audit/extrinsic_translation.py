@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import Array, se3
@@ -28,10 +28,12 @@ LEVER_ARM_SIGMA_M = 0.3
 LOG_ODDS = 3.0
 
 
-def check(evidence: Evidence) -> Symptom | None:
+def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Weigh the translation as given against that of the inverse; replace it where the latter is far likelier."""
-    if evidence.intervals is None or evidence.intervals.v_mps is None:
-        return None
+    if evidence.intervals is None:
+        return evidence.blind
+    if evidence.intervals.v_mps is None:
+        return Undecided("an IMU measures no velocity, which alone shows where the camera is")
     rig = evidence.sequence.rig
     rotation, given = rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3]
     candidate = -rotation.T @ given
@@ -43,6 +45,9 @@ def check(evidence: Evidence) -> Symptom | None:
     log_odds = (share.value**2 - (share.value - 1.0) ** 2) / (2.0 * variance)
     clearly_nearer = share.error < LARGEST_ERROR and share.value - BEYOND_MIDDLE * share.error > 0.5
     explained = abs(share.value - 1.0) < NEAR_CANDIDATE * np.sqrt(variance)
+    if share.error >= LARGEST_ERROR:
+        where = f"{share.value:.1f} +- {share.error:.1f} of the way to where the inverse has it"
+        return Undecided(f"too little rotation: the tracks put the camera {where}")
     if not (clearly_nearer and explained and log_odds > LOG_ODDS):
         return None
     return Symptom(

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
-from toolkit.audit.parts.intervals import Intervals, compare, is_comparable
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.vision import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -29,7 +29,8 @@ class Symptom:
     """What a check found: a count, a description, and the sequence without the fault.
 
     ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
-    the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks.
+    the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks. One
+    that ``spoils_vision`` and is not repaired leaves nothing to conclude from the tracks.
     """
 
     count: int
@@ -37,13 +38,25 @@ class Symptom:
     treatment: str
     remedy: Sequence | None
     harmful: bool = True
+    spoils_vision: bool = False
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """That a check could not tell whether its fault is there, and why; one that has nothing to look at says None."""
+
+    why: str
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The sequence as it stands when a fault is checked, with what several checks derive from it."""
+    """The sequence as it stands when a fault is checked, with what several checks derive from it.
+
+    ``spoilt_by`` names a fault that is still there and leaves nothing to conclude from the tracks.
+    """
 
     sequence: Sequence
+    spoilt_by: str = ""
 
     @cached_property
     def camera_motion(self) -> CameraMotion:
@@ -51,15 +64,33 @@ class Evidence:
         return camera_motion(self.sequence)
 
     @cached_property
+    def blind(self) -> Undecided:
+        """Why the motion samples cannot be compared with the camera, where ``intervals`` is None."""
+        if self.spoilt_by:
+            return Undecided(f"{self.spoilt_by} must be mended before the tracks show anything")
+        if not is_comparable(self.sequence):
+            return Undecided("time, or the motion samples' reach or values, do not allow a comparison with the camera")
+        known, intervals = int(self.camera_motion.known.sum()), max(self.sequence.frame_count - 1, 0)
+        if not len(self.sequence.observations):
+            return Undecided("there are no sightings to compare with")
+        per_frame = len(self.sequence.observations) / self.sequence.frame_count
+        return Undecided(
+            f"the tracks ({per_frame:.1f} sightings a frame) determine the camera's own motion in {known} of "
+            f"{intervals} intervals; {LEAST_INTERVALS} are needed"
+        )
+
+    @cached_property
     def intervals(self) -> Intervals | None:
         """The motion over each interval by the samples and by the camera; None where that cannot be compared."""
-        return compare(self.sequence, self.camera_motion) if is_comparable(self.sequence) else None
+        if self.spoilt_by or not is_comparable(self.sequence):
+            return None
+        return compare(self.sequence, self.camera_motion)
 
     def after(self, remedy: Sequence) -> "Evidence":
-        """Return the evidence after a repair; the camera's motion is kept where the repair left them alone."""
-        now, before = Evidence(remedy), self.sequence
+        """Return the evidence after a repair; the camera's motion is kept where the repair left it as it was."""
+        now, before = Evidence(remedy, self.spoilt_by), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
-        if same_tracks and "camera_motion" in self.__dict__:
+        if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m and "camera_motion" in self.__dict__:
             now.__dict__["camera_motion"] = self.camera_motion
         return now
 
@@ -70,5 +101,5 @@ class Fault:
 
     name: str
     summary: str
-    check: Callable[[Evidence], Symptom | None]
+    check: Callable[[Evidence], Symptom | Undecided | None]
     after: tuple[str, ...] = ()

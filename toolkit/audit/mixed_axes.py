@@ -1,8 +1,9 @@
-"""Motion samples and extrinsic that follow different conventions for the axes of the body.
+"""Motion samples and extrinsic that follow different conventions for the axes of the body, or for its direction.
 
 The camera's own motion, taken through the extrinsic, must be the measured motion. Of the 24 right-handed ways
-to name three axes, the one that explains the samples best is found; if it is not the recording's own, and the
-difference is beyond doubt, the extrinsic is turned to it. A gyro bias does not matter here: the median is off.
+to name three axes, and the inverse of the extrinsic, the one that explains the samples best is found; if it is not
+the recording's own, and the difference is beyond doubt, the extrinsic is turned to it, or inverted. A gyro bias does
+not matter here: the median is off.
 """
 
 import itertools
@@ -11,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import Intervals, median_one_step_px
 from toolkit.audit.parts.robust import spread
-from toolkit.geometry import Array, se3
-from toolkit.sequence import Sequence
+from toolkit.geometry import Array, se3, se3_inverse
 
 # Mean difference of two explanations in its own standard errors: a doubt about the file as given must be far
 # beyond chance (intervals are correlated over about a second), a choice among repairs only beyond chance.
@@ -26,23 +26,31 @@ LEAST_SPREAD_W = 0.003
 LEAST_SPREAD_V = 0.05
 
 
-def check(evidence: Evidence) -> Symptom | None:
-    """Find the axes in which samples and camera agree; turn the extrinsic where they are not the given ones."""
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Find the extrinsic with which samples and camera agree; take it where it is not the given one."""
     if evidence.intervals is None:
-        return None
-    sequence, turns = evidence.sequence, _right_handed_axes()
-    costs = _costs(evidence.intervals, sequence.rig.T_imu_cam, turns)  # (24, M); the first turn is none
+        return evidence.blind
+    given, turns = evidence.sequence.rig.T_imu_cam, _right_handed_axes()
+    candidates = np.concatenate([se3(turns, np.zeros(3)) @ given, se3_inverse(given)[None]])  # the first is the given
+    costs = _costs(evidence.intervals, candidates)  # (25, M)
     first, second = np.argsort(costs.mean(axis=1))[:2]
-    if first == 0 or _sigmas(costs[0] - costs[first]) < AGAINST_GIVEN:
+    if first == 0 and (certainty := _sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
+        return Undecided(
+            f"{_named(turns, second)} explains the motion as well as what is given ({certainty:.1f} sigma)"
+        )
+    if first == 0:
         return None
-    T_imu_cam = se3(turns[first], np.zeros(3)) @ sequence.rig.T_imu_cam
-    axes = _named(turns[first])
+    if (certainty := _sigmas(costs[0] - costs[first])) < AGAINST_GIVEN:
+        return Undecided(
+            f"{_named(turns, first)} explains the motion better than what is given, by {certainty:.1f} sigma"
+        )
     certain = _sigmas(costs[second] - costs[first]) > AGAINST_SECOND
+    remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=candidates[first]))
     return Symptom(
         count=1,
-        detail=f"the motion samples' axes are the extrinsic's {axes}{_reprojections(sequence, T_imu_cam)}",
-        treatment="the extrinsic is turned to the samples' axes" if certain else "two turns explain it: choose one",
-        remedy=replace(sequence, rig=replace(sequence.rig, T_imu_cam=T_imu_cam)) if certain else None,
+        detail=f"{_explained(turns, first)}: {_residuals(evidence, candidates[first])} {_done(turns, first)}",
+        treatment=_treatment(turns, first) if certain else f"{_named(turns, second)} explains it as well: choose one",
+        remedy=remedy if certain else None,
     )
 
 
@@ -56,18 +64,19 @@ def _right_handed_axes() -> Array:
     return np.stack([turn for turn in signed if np.linalg.det(turn) > 0.0])
 
 
-def _costs(intervals: Intervals, T_imu_cam: Array, turns: Array) -> Array:
-    """Return how badly each turn explains each interval (24, M): a Cauchy log-likelihood of its residuals."""
-    w_imu = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
-    v_imu = intervals.v_cam_mps @ T_imu_cam[:3, :3].T - np.cross(w_imu, T_imu_cam[:3, 3])
-    costs = _cauchy(intervals.w_radps - w_imu @ np.swapaxes(turns, 1, 2), LEAST_SPREAD_W)
+def _costs(intervals: Intervals, candidates: Array) -> Array:
+    """Return how badly each extrinsic (C, 4, 4) explains each interval (C, M): a Cauchy log-likelihood."""
+    R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
+    w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)
+    costs = _cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)
     if intervals.v_mps is not None:
-        costs = costs + _cauchy(intervals.v_mps - v_imu @ np.swapaxes(turns, 1, 2), LEAST_SPREAD_V)
+        v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
+        costs = costs + _cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
     return costs
 
 
 def _cauchy(residuals: Array, least_spread: float) -> Array:
-    """Return log(1 + r^2) (24, M) of residuals (24, M, 3) about their medians, in spreads of the best turn."""
+    """Return log(1 + r^2) (C, M) of residuals (C, M, 3) about their medians, in spreads of the best candidate."""
     centred = residuals - np.median(residuals, axis=1, keepdims=True)
     spreads = np.stack([spread(r) for r in residuals])
     best = spreads[np.argmin(np.sum(spreads**2, axis=1))]
@@ -81,23 +90,40 @@ def _sigmas(difference: Array) -> float:
     return float(np.mean(difference)) / max(error, 1e-12)
 
 
-def _named(turn: Array) -> str:
-    """Write a turn as the axes the new x, y and z are, for example "x, -y, -z"."""
+def _named(turns: Array, candidate: int) -> str:
+    """Name a candidate: the axes that the new x, y and z are, for example "x, -y, -z", or the inverse."""
+    if candidate == len(turns):
+        return "the inverse of the extrinsic"
+    turn = turns[candidate]
     largest = np.argmax(np.abs(turn), axis=1)
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 
 
-def _reprojections(sequence: Sequence, T_imu_cam: Array) -> str:
-    """Return the change of the one-step stereo reprojection as text, or "" without velocities to compute it."""
-    if sequence.motion_kind == "imu":
-        return ""
-    given_px, turned_px = (median_one_step_px(sequence, T) for T in (sequence.rig.T_imu_cam, T_imu_cam))
-    return f": median one-step reprojection {given_px:.2f} px as given, {turned_px:.2f} px turned"
+def _explained(turns: Array, candidate: int) -> str:
+    if candidate == len(turns):
+        return "T_imu_cam is inverted, from the IMU to the camera"
+    return f"the motion samples' axes are the extrinsic's {_named(turns, candidate)}"
+
+
+def _treatment(turns: Array, candidate: int) -> str:
+    done = f"the extrinsic is {_done(turns, candidate)}"
+    return done if candidate == len(turns) else f"{done} to the samples' axes"
+
+
+def _done(turns: Array, candidate: int) -> str:
+    return "inverted" if candidate == len(turns) else "turned"
+
+
+def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:
+    """Return the change of the one-step stereo reprojection as text."""
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    given_px, now_px = (median_one_step_px(sequence, camera, T) for T in (sequence.rig.T_imu_cam, T_imu_cam))
+    return f"median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px"
 
 
 FAULT = Fault(
     "mixed-axes",
-    "motion samples and camera extrinsic in different axes",
+    "motion samples and camera extrinsic in different axes, or an inverted extrinsic",
     check,
-    after=("stale-frames", "doubled-disparity", "no-disparity", "not-finite", "time-gap"),
+    after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics", "units"),
 )

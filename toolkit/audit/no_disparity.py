@@ -25,5 +25,6 @@ FAULT = Fault(
     "no-disparity",
     "stereo sightings with a disparity uL - uR <= 0",
     check,
-    after=("stale-frames", "returning-tracks"),  # a dropped sighting would look like a track that went and came back
+    # A dropped sighting would look like a track that went and came back.
+    after=("stale-frames", "returning-tracks", "swapped-coordinates"),
 )

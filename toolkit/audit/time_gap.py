@@ -16,7 +16,7 @@ from toolkit.sequence import Sequence
 # A step this many times the usual one is a hole; one missing stamp makes 2, two make 3.
 GAP_RATIO = 3.5
 # Motion samples may be further apart than that (a dropped sample of a fast IMU) and still be interpolated.
-MOTION_GAP_S = 1.0
+MOTION_GAP_S = 1.5
 
 
 def check(evidence: Evidence) -> Symptom | None:

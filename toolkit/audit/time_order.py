@@ -1,39 +1,111 @@
-"""Stamps of frames or motion samples that repeat, run backwards, or are no time at all."""
+"""Stamps of frames or motion samples that repeat, run backwards, jump back, or are no time at all."""
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.subsets import keep_frames, keep_samples
 from toolkit.geometry import IntArray
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
 
 # What a cast of NaN to int64 gives.
 NOT_A_TIME = np.iinfo(np.int64).min
+
+# A step forward that is so many times the usual one takes time back to where it was; a clock that jumped goes on with
+# fewer than two. So many stamps must follow, lest one that is out of place at the very end passes for a jump.
+LEAP, FEWEST_AFTER = 1.9, 3
 
 # With more of the stamps late than this the order itself is wrong, not some of the stamps.
 MOST_LATE = 0.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the stamps that are not after all the stamps before them; sort, first of equals kept."""
+    """Count the stamps that are not after all the stamps before them; sort, first of equals kept.
+
+    A clock that jumps back goes on from there, and sorting would interleave two times: one side of it is kept.
+    """
     sequence = evidence.sequence
     frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
     if frames + samples == 0:
         return None
+    jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
     detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
+    if jumps_s:
+        detail += f": the clock jumps back by {max(jumps_s):.2f} s and goes on from there"
+        remedy = _between_jumps(sequence)
+        treatment = f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames"
+        return Symptom(count=frames + samples, detail=detail, treatment=treatment, remedy=remedy)
     if max(frames / sequence.frame_count, samples / sequence.motion.t_ns.size) > MOST_LATE:
         why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
         return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
-    remedy = sequence
-    if frames:
-        remedy = keep_frames(remedy, _in_order(sequence.frames_t_ns))
-    if samples:
-        remedy = keep_samples(remedy, _in_order(sequence.motion.t_ns))
     return Symptom(
         count=frames + samples,
         detail=detail,
         treatment="sorted by time; of equal stamps the first is kept; stamps that are no time are dropped",
-        remedy=remedy,
+        remedy=_sorted(sequence),
     )
+
+
+def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
+    return sequence.frames_t_ns, sequence.motion.t_ns
+
+
+def _sorted(sequence: Sequence) -> Sequence:
+    """Return the sequence with stamps in order, without repeats and invalid ones."""
+    if _late(sequence.frames_t_ns):
+        sequence = keep_frames(sequence, _in_order(sequence.frames_t_ns))
+    if _late(sequence.motion.t_ns):
+        sequence = keep_samples(sequence, _in_order(sequence.motion.t_ns))
+    return sequence
+
+
+def _jumps(t_ns: IntArray) -> IntArray:
+    """Return the rows after which the clock has jumped back: time goes on from there at its usual step.
+
+    After a stamp, or a block of stamps, that is merely out of place, time leaps forward to where it was.
+    """
+    step_ns = np.diff(t_ns)
+    if t_ns.size < 3 or (t_ns == NOT_A_TIME).any():
+        return np.empty(0, dtype=np.int64)
+    usual_ns = float(np.median(np.abs(step_ns)))
+    backwards = np.flatnonzero(step_ns < 0)
+    return np.array([row for row in backwards.tolist() if _goes_on(t_ns, row, usual_ns)], dtype=np.int64)
+
+
+def _jump_lengths_s(t_ns: IntArray) -> list[float]:
+    """Return how far back each jump is (s) from where the next stamp was due."""
+    step_ns = np.diff(t_ns)
+    due_ns = np.median(np.abs(step_ns)) if step_ns.size else 0.0
+    return [float(due_ns - step_ns[row]) / NS_PER_S for row in _jumps(t_ns).tolist()]
+
+
+def _goes_on(t_ns: IntArray, row: int, usual_ns: float) -> bool:
+    latest = t_ns[: row + 1].max()
+    later = np.flatnonzero(t_ns[row + 1 :] > latest)
+    end = row + 1 + int(later[0]) if later.size else t_ns.size  # the first stamp that is new, or none
+    if end - row <= FEWEST_AFTER and not later.size:
+        return False  # the recording ends before it shows
+    return bool(np.diff(t_ns[row + 1 : end + 1]).max(initial=0) < LEAP * usual_ns)
+
+
+def _between_jumps(sequence: Sequence) -> Sequence:
+    """Return the longest stretch, in frames, whose frames and samples lie between two jumps; the first of equals."""
+    frames_t_ns, samples_t_ns = _streams(sequence)
+    frame_part = _parts(frames_t_ns)
+    sample_part = _parts(samples_t_ns)
+    part = int(np.argmax(np.bincount(frame_part)))
+    kept = keep_frames(sequence, np.flatnonzero(frame_part == part))
+    if sample_part.max(initial=0):
+        of_part = part if sample_part.max() == frame_part.max() else int(np.argmax(np.bincount(sample_part)))
+        kept = keep_samples(kept, sample_part == of_part)
+    return _sorted(kept)
+
+
+def _parts(t_ns: IntArray) -> IntArray:
+    """Number the stamps (N,) by the jumps before them."""
+    part = np.zeros(t_ns.size, dtype=np.int64)
+    part[_jumps(t_ns) + 1] = 1
+    return np.cumsum(part)
 
 
 def _late(t_ns: IntArray) -> int:
@@ -49,4 +121,4 @@ def _in_order(t_ns: IntArray) -> IntArray:
     return rows
 
 
-FAULT = Fault("time-order", "time stamps that repeat, run backwards or are no time at all", check)
+FAULT = Fault("time-order", "time stamps that repeat, run backwards, jump back or are no time at all", check)

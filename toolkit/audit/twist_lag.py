@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import BoolArray, IntArray
@@ -24,14 +24,18 @@ LARGEST_ERROR = 0.1
 SIGMAS = 5.0
 
 
-def check(evidence: Evidence) -> Symptom | None:
+def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Measure the lag of the angular velocities; pair the samples by the nearest of start, mean and end."""
     sequence, intervals = evidence.sequence, evidence.intervals
-    if intervals is None or not isinstance(sequence.motion, TwistSamples):
+    if not isinstance(sequence.motion, TwistSamples):
         return None
+    if intervals is None:
+        return evidence.blind
     lag = _lag(sequence, intervals)
-    if lag is None or lag.error > LARGEST_ERROR:
-        return None
+    if lag is None:
+        return Undecided("too few successive intervals have a sample at both ends and a known camera motion")
+    if lag.error > LARGEST_ERROR:
+        return Undecided(f"too little change of rotation: the lag is {lag.value:.1f} +- {lag.error:.1f} of an interval")
     present = sequence.motion.pairing
     nearest = min(LAG, key=lambda pairing: abs(LAG[pairing] - lag.value))
     if nearest == present or abs(lag.value - LAG[present]) < SIGMAS * lag.error:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, check_rows, observations, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, SparseArray, glance, opened
 from toolkit.geometry import Array, se3_inverse
 from toolkit.models.noise import pixel_covariance, twist_noise
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, TwistSamples
+from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig, TwistSamples
 
 _NOT_SEEN = -1.0
 _REQUIRED = (
@@ -41,10 +41,10 @@ def load(path: Path) -> Sequence:
         fields.require(*_REQUIRED)
         t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
         check_frame_count(path, t_ns.size)
-        sightings = _sightings(archive, t_ns.size)
+        sightings, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
     w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
-    facts = () if len(sightings) else ("no image features in this file",)
+    facts = () if has_features else (NO_FEATURES,)
     return Sequence(
         name=path.stem,
         rig=_rig(fields),
@@ -57,24 +57,25 @@ def load(path: Path) -> Sequence:
 
 
 def _rig(fields: Fields) -> StereoRig:
-    K = fields.constant("K", 3, 3)
+    K = camera_matrix(fields.path, "K", fields.constant("K", 3, 3))
     T_imu_cam = fields.rigid("imu_T_cam") if "imu_T_cam" in fields else se3_inverse(fields.rigid("cam_T_imu"))
     return StereoRig(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.positive("b"), T_imu_cam, pixel_covariance(2))
 
 
-def _sightings(archive: NpzArchive, frame_count: int) -> Observations:
+def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> Observations:
     if "features" not in archive.keys:
         nothing = np.empty(0, dtype=np.int64)
         return Observations(nothing, nothing, np.empty((0, 3)))
     features = archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN)
-    return _gather(features)
+    return _gather(path, features)
 
 
-def _gather(features: SparseArray) -> Observations:
+def _gather(path: Path, features: SparseArray) -> Observations:
     """Join the coordinates of each sighting; one that lacks a coordinate gets NaN there, for the audit to find."""
     coordinate, track, frame = features.indices
     tracks = max(features.shape[1], 1)
     cell, row = np.unique(frame * tracks + track, return_inverse=True)
     corners_px: Array = np.full((cell.size, 4), np.nan)
     corners_px[row, coordinate] = features.value
+    check_rows(path, corners_px)
     return observations(cell // tracks, cell % tracks, corners_px)

@@ -169,7 +169,7 @@ class Comparison:
 
     ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
-    changes against the rung before.
+    changes against the rung before. ``undecided`` has the faults that the audit could not judge, and why.
     """
 
     source: str
@@ -181,6 +181,7 @@ class Comparison:
     changes: Mapping[str, str] = field(default_factory=dict)
     settings: Settings = DEFAULTS
     workers: int = 1
+    undecided: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def over_seeds(self) -> bool:

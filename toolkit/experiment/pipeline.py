@@ -184,6 +184,7 @@ def _comparison(
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
         settings=plan.settings,
         workers=workers,
+        undecided=case.prepared.undecided,
     )
 
 

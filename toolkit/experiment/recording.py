@@ -1,7 +1,7 @@
 """From a source to what every estimator reads: loaded, audited, cut, with its noise and a state to start from."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -47,13 +47,14 @@ class Recording:
 class Prepared:
     """A recording as the estimators read it, what the audit found in it before, and the state they start from.
 
-    ``whole`` is the recording before it was cut.
+    ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why.
     """
 
     sequence: Sequence
     findings: tuple[Finding, ...]
     prior: Prior
     whole: Sequence
+    undecided: Mapping[str, str] = field(default_factory=dict)
 
 
 def prepare(recording: Recording) -> Prepared:
@@ -64,7 +65,7 @@ def prepare(recording: Recording) -> Prepared:
     audited = audited_recording(recording)
     whole = _with_noise(audited.sequence, recording.noise)
     sequence = _cut(whole, recording)
-    return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole)
+    return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
 
 
 def audited_recording(recording: Recording) -> Audit:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from toolkit.datasets.trajectories.belonging import (
     check_clock,
+    check_length_unit,
     check_turns,
     in_other_order,
     inverted,
@@ -49,6 +50,7 @@ def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesF
 def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequence) -> Run:
     trajectory, what = _stamped(poses, recording, sequence), str(poses.path)
     check_clock(what, recording, trajectory.t_ns)
+    check_length_unit(what, recording, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
     readings = [inverted(), of_the_camera(recording)]
     if poses.other_order is not None:
         readings.insert(0, in_other_order(poses.other_order))

@@ -6,7 +6,7 @@ makes its ``CombinedImuFactor`` of the very same object, so both see the same re
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -120,8 +120,8 @@ class ImuModel:
     variable_sizes: Mapping[str, int] = {"x": 6, "v": 3, "b": 6}
 
     def __init__(self, noise: ImuNoise, gravity_world: Array) -> None:
+        self._noise, self._gravity_world = noise, gravity_world
         self._params = preintegration_params(noise, gravity_world)
-        self._gravity_world = gravity_world
 
     def initial_belief(self, prior: Prior) -> Belief:
         """Return the belief at the first frame: all of the prior."""
@@ -130,8 +130,20 @@ class ImuModel:
     def integrate(self, motion: Motion, bias: Array) -> ImuIncrement:
         """Preintegrate the samples between two frames about a bias (6,)."""
         assert isinstance(motion, ImuMotion)
-        preintegration = preintegrate(motion, bias, self._params)
+        preintegration = preintegrate(motion, bias, self._params_over(motion))
         return ImuIncrement(preintegration, float(motion.dt_s.sum()), self._gravity_world)
+
+    def _params_over(self, motion: ImuMotion) -> gtsam.PreintegrationCombinedParams:
+        """Return the parameters over an interval: a preintegration has one noise, its mean over a bridged piece."""
+        if motion.noise_scale is None:
+            return self._params
+        accel, gyro = np.sqrt(motion.dt_s @ motion.noise_scale**2 / motion.dt_s.sum()).tolist()
+        scaled = replace(
+            self._noise,
+            accel_noise_density=accel * self._noise.accel_noise_density,
+            gyro_noise_density=gyro * self._noise.gyro_noise_density,
+        )
+        return preintegration_params(scaled, self._gravity_world)
 
     def clones(self, window: Window) -> int:
         """Return many: an IMU ties poses over a second so well that tracks may wait as long."""

@@ -39,13 +39,17 @@ def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> Twist
     """Integrate the twists of one interval with a gyro bias (3,) rad/s taken off."""
     T_start_end, d_step_d_bias, cov = np.eye(4), np.zeros((6, 3)), np.zeros((6, 6))
     density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
-    for dt_s, v_mps, w_radps in zip(motion.dt_s, motion.v_mps, motion.w_radps, strict=True):
+    density_squared = np.tile(density_squared, (len(motion.dt_s), 1))
+    if motion.noise_scale is not None:
+        density_squared *= np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
+    pieces = zip(motion.dt_s, motion.v_mps, motion.w_radps, density_squared, strict=True)
+    for dt_s, v_mps, w_radps, piece_density_squared in pieces:
         xi = dt_s * np.concatenate([w_radps - gyro_bias, v_mps])
         T_start_next, d_step_d_xi = se3_exp(xi), se3_right_jacobian(xi)
         carry = se3_adjoint(se3_inverse(T_start_next))
         T_start_end = T_start_end @ T_start_next
         d_step_d_bias = carry @ d_step_d_bias - dt_s * d_step_d_xi[:, :3]
-        cov = carry @ cov @ carry.T + (d_step_d_xi * (dt_s * density_squared)) @ d_step_d_xi.T
+        cov = carry @ cov @ carry.T + (d_step_d_xi * (dt_s * piece_density_squared)) @ d_step_d_xi.T
     return TwistStep(T_start_end, d_step_d_bias, cov, float(motion.dt_s.sum()))
 
 

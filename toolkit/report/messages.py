@@ -1,7 +1,7 @@
 """What the numbers mean, in plain words: statuses, findings, metrics that are missing and why."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
@@ -52,17 +52,27 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield a line a finding of the audit, or the good news that there is none."""
+    """Yield a line a finding of the audit, or the good news that there is none, then what it could not judge."""
     if not comparison.findings:
         yield "no fault found in the recording"
     for finding in comparison.findings:
         yield f"{finding.fault} ({outcome(finding)}): {finding.detail}"
+    yield from undecided_lines(comparison.undecided)
+
+
+def undecided_lines(undecided: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for each reason why faults could not be judged, behind their names."""
+    by_reason: dict[str, list[str]] = {}
+    for fault, why in undecided.items():
+        by_reason.setdefault(why, []).append(fault)
+    for why, names in by_reason.items():
+        yield f"not decidable: {', '.join(names)}: {why}"
 
 
 def outcome(finding: Finding) -> str:
     """Say in one or two words what became of a finding."""
     if finding.repaired:
-        return "repaired"
+        return "too much lost" if finding.blocking else "repaired"
     return "not repaired" if finding.blocking else "for information"
 
 

@@ -2,10 +2,18 @@
 
 from collections.abc import Mapping
 
-from toolkit.audit import Audit
+from toolkit.audit import Audit, Finding
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, outcome, sequence_line
+from toolkit.report.messages import (
+    consistency_lines,
+    finding_lines,
+    header_lines,
+    note_lines,
+    outcome,
+    sequence_line,
+    undecided_lines,
+)
 from toolkit.report.prose import WIDTH, Width, filled, section
 from toolkit.report.table import Columns, Table, as_text, comparison_table
 
@@ -31,15 +39,25 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     """Return what the audit found as plain text: fault, count, outcome, and the details below each."""
     findings = audited.findings
     lines = [printable(sequence_line(audited.sequence)), ""]
-    if not findings:
-        return "\n".join([*lines, "no fault found"])
-    headings = (("fault",), ("outcome",), ("count",))
-    rows = tuple((f.fault, outcome(f), str(f.count)) for f in findings)
-    lines += [as_text(Table(headings, rows, labels=2)), ""]
-    lines += [filled(f"{finding.fault}: {finding.detail}", width) for finding in findings]
-    left = [f.fault for f in findings if f.blocking]
-    lines += ["", f"not repaired: {', '.join(left)}" if left else "nothing is left that spoils a result"]
+    if findings:
+        headings = (("fault",), ("outcome",), ("count",))
+        rows = tuple((f.fault, outcome(f), str(f.count)) for f in findings)
+        lines += [as_text(Table(headings, rows, labels=2)), ""]
+        lines += [filled(f"{finding.fault}: {finding.detail}", width) for finding in findings]
+    else:
+        lines += ["no fault found"]
+    lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
+    if any(f.blocking for f in findings):
+        lines += ["", *_spoiling(findings)]
+    elif findings and not audited.undecided:
+        lines += ["", "nothing is left that spoils a result"]
     return "\n".join(lines)
+
+
+def _spoiling(findings: tuple[Finding, ...]) -> list[str]:
+    """Return a line for each way in which findings spoil a result, with their names."""
+    by_outcome = {how: [f.fault for f in findings if outcome(f) == how] for how in ("not repaired", "too much lost")}
+    return [f"{how}: {', '.join(names)}" for how, names in by_outcome.items() if names]
 
 
 def listing_text(title: str, entries: Mapping[str, str], width: Width = WIDTH) -> str:

@@ -61,18 +61,36 @@ def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Arra
     return means
 
 
-def median_one_step_px(sequence: Sequence, T_imu_cam: Array) -> float:
+def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
     """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
 
-    Points triangulated in one frame are moved by the twist samples (``sequence`` has twists) through the
-    extrinsic ``T_imu_cam`` and projected into the next.
+    Points triangulated in one frame are moved by the motion samples through the extrinsic ``T_imu_cam`` and projected
+    into the next. An IMU measures no velocity and its gyro has a bias: there the camera's own velocity is taken, and
+    the rates of rotation about their median difference from the camera's. Only intervals whose camera motion is known.
     """
-    pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
-    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
-    T_before_after_imu = se3_exp(dt_s * np.concatenate([mean[:, 3:], mean[:, :3]], axis=1))
-    T_after_before = se3_inverse(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
-    points = transform(T_after_before[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
+    w_radps, v_mps = mean[:, 3:], mean[:, :3]
+    R_imu_cam = T_imu_cam[:3, :3]
+    if isinstance(sequence.motion, TwistSamples):
+        dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+        T_before_after_imu = se3_exp(dt_s * np.concatenate([w_radps, v_mps], axis=1))
+        return _median_px(sequence, camera, se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
+    bias_radps = np.median((w_radps - camera.w_radps @ R_imu_cam.T)[camera.known], axis=0)
+    return own_one_step_px(sequence, camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam))
+
+
+def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
+    """Return the same median where the points are moved by a motion of the camera, for example its own."""
+    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+    return _median_px(sequence, camera, se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1)))
+
+
+def _median_px(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> float:
+    """Return the median residual under the camera's motion (K - 1, 4, 4) in the known intervals; NaN without any."""
+    pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
+    pairs = pairs.select(camera.known[pairs.interval])
+    points = transform(se3_inverse(T_before_after)[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
     points[:, 2] = np.maximum(points[:, 2], 0.1)
     residual_px = uv_px[pairs.after] - project(points, sequence.rig)
-    return float(np.median(np.sqrt(np.mean(residual_px**2, axis=1))))
+    each_px = np.sqrt(np.mean(residual_px**2, axis=1))
+    return float(np.median(each_px)) if each_px.size else float("nan")

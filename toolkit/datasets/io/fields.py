@@ -18,6 +18,10 @@ from toolkit.sequence import Observations
 
 # How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.
 _RIGID_TOLERANCE = 1e-3
+# A pair whose rows are this far apart (median, px) is not rectified: at most 0.4 px in the recordings at hand.
+_MOST_ROWS_APART_PX, _FEWEST_ROWS = 3.0, 30
+# Share of the focal length that a skew may be: less than a pixel at the edge of the image.
+_MOST_SKEW = 1e-3
 # No recording lies beyond the year 5000, nor has a sample only every half minute.
 _LATEST_S = 1e11
 _LONGEST_STEP_S = 30.0
@@ -136,6 +140,45 @@ def probable_unit(stamps_s: Array) -> str | None:
         if largest * scale > 1e8 or step * scale > 1e-3:
             return name
     return _UNITS[-1][1]
+
+
+def check_rows(path: Path, corners_px: Array) -> None:
+    """Raise DataError where the rows vL and vR of corners (N, 4) differ by a constant: the pair is not rectified.
+
+    Or u and v are exchanged. A sequence has only the rows' mean, in which nothing shows it any more.
+    """
+    whole = corners_px[np.isfinite(corners_px).all(axis=1)]
+    if len(whole) < _FEWEST_ROWS:
+        return
+    columns_px, rows_px = np.median(whole[:, 0] - whole[:, 2]), np.median(whole[:, 1] - whole[:, 3])
+    if abs(rows_px) <= _MOST_ROWS_APART_PX:
+        return
+    exchanged = abs(columns_px) <= _MOST_ROWS_APART_PX
+    remedy = "u and v look exchanged: exchange them" if exchanged else "rectify the images, or mend the rows"
+    raise DataError(
+        f"{path}: vL - vR is {rows_px:.1f} px and uL - uR {columns_px:.1f} px (medians of {len(whole)} sightings), and "
+        f"the rows of a rectified pair are equal; {remedy}"
+    )
+
+
+def camera_matrix(path: Path, key: str, K: Array) -> Array:
+    """Return a camera matrix (3, 3), or raise DataError, which names the entry, where it is none of a rectified pair.
+
+    A transposed one has its principal point in the last row; a skew would be ignored by every measurement model.
+    """
+    if not np.allclose(K[2], [0.0, 0.0, 1.0]):
+        transposed = np.allclose(K[:, 2], [0.0, 0.0, 1.0])
+        remedy = "transpose it" if transposed else "write fx, 0, cx; 0, fy, cy; 0, 0, 1"
+        raise DataError(f"{path}: the last row of {key} is {K[2].tolist()}, expected 0, 0, 1; {remedy}")
+    skew_px = max(abs(float(K[0, 1])), abs(float(K[1, 0])))
+    if skew_px > _MOST_SKEW * abs(float(K[0, 0])):
+        raise DataError(
+            f"{path}: {key} has a skew of {skew_px:g} px, and a rectified pair has none; rectify the images"
+        )
+    for axis, name in enumerate(("fx", "fy")):
+        if not K[axis, axis] > 0.0:
+            raise DataError(f"{path}: {name} in {key} is {K[axis, axis]:g}, expected a positive number; mend {key}")
+    return K
 
 
 def observations(frame: IntArray, track_id: IntArray, corners_px: Array) -> Observations:

@@ -9,7 +9,7 @@ from toolkit.datasets.trajectories.poses import OtherOrder
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, so3_log
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, TwistSamples
 
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,
 # unexplained than under the file's own: slow turns correlate with unrelated ones by chance, 0.8 at times.
@@ -21,6 +21,11 @@ _EPOCH_S = 1e6
 # A unit is wrong where most stamps miss the frames, and nearly all meet and cover half of them in another.
 _MOST, _NEARLY_ALL, _COVERED = 0.5, 0.9, 0.5
 _SCALES = (1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9)
+
+
+# A unit of length is named where the median ratio of speeds, over so many steps in motion, is within this factor of it.
+_LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
+_WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
 
 
 class Reading(NamedTuple):
@@ -87,6 +92,20 @@ def check_turns(what: str, sequence: Sequence, t_ns: IntArray, R_world_imu: Arra
     return as_given > _FITTING_CORRELATION and as_given >= fit
 
 
+def check_length_unit(what: str, sequence: Sequence, t_ns: IntArray, positions: Array) -> None:
+    """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
+    steps = _Steps.of(t_ns)
+    measured_mps = _speeds_along(sequence, steps)
+    known = np.isfinite(measured_mps) & (measured_mps > _MOVING_MPS)
+    if known.sum() < _FEWEST_STEPS:
+        return
+    ratio = float(np.median(steps.speeds(positions)[known] / measured_mps[known]))
+    for unit, factor in _LENGTHS.items():
+        if factor / _WITHIN_FACTOR < ratio < factor * _WITHIN_FACTOR:
+            found = f"{what} moves {ratio:.4g} times as fast as measured"
+            raise DataError(f"{sequence.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
+
+
 def range_s(t_ns: IntArray) -> str:
     """Return the first and the last of stamps as text."""
     return f"{t_ns[0] / NS_PER_S:.3f} .. {t_ns[-1] / NS_PER_S:.3f} s"
@@ -121,6 +140,19 @@ def _gyro_along(sequence: Sequence, t_ns: IntArray) -> tuple[BoolArray, IntArray
     return within, sample_t_ns, motion.values[samples, 3:]
 
 
+def _speeds_along(sequence: Sequence, steps: "_Steps") -> Array:
+    """Return the speeds (M,) m/s of the truth over steps, else of the twists; NaN where neither is known."""
+    truth, motion = sequence.truth, sequence.motion
+    if truth is not None and truth.t_ns.size > 1:
+        t_s, at_s = (truth.t_ns - truth.t_ns[0]) / NS_PER_S, (steps.t_ns - truth.t_ns[0]) / NS_PER_S
+        axes = truth.T_world_imu[:, :3, 3].T
+        return steps.speeds(np.stack([np.interp(at_s, t_s, x, np.nan, np.nan) for x in axes], axis=1))
+    if not isinstance(motion, TwistSamples) or motion.t_ns.size < 2:
+        return np.full(steps.start.size, np.nan)
+    t_s, middle_s = (motion.t_ns - motion.t_ns[0]) / NS_PER_S, (steps.t_ns[steps.start] - motion.t_ns[0]) / NS_PER_S
+    return np.asarray(np.interp(middle_s, t_s, np.linalg.norm(motion.v_mps, axis=1), np.nan, np.nan))
+
+
 class _Steps(NamedTuple):
     """Steps between stamps (N,), of their indices (M,): from each one to the first that is far enough behind it."""
 
@@ -149,6 +181,11 @@ class _Steps(NamedTuple):
         at_stamps = np.stack([np.interp(at_s, sample_s, axis) for axis in turned.T], axis=1)
         means: Array = (at_stamps[self.end] - at_stamps[self.start]) / self._duration_s[:, None]
         return means
+
+    def speeds(self, positions: Array) -> Array:
+        """Return the speeds (M,) m/s of positions (N, 3)."""
+        moved: Array = np.linalg.norm(positions[self.end] - positions[self.start], axis=1)
+        return moved / self._duration_s
 
     @property
     def _duration_s(self) -> Array:

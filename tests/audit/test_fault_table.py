@@ -1,0 +1,172 @@
+"""The table of faults: what the audit must say of each of them, in each kind of recording.
+
+A verdict is ``repaired`` (named, repaired, nothing blocks), ``blocks`` (named and blocking) or ``undecided`` (named as
+not decidable, nothing else found).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Audit, audit
+from toolkit.report.terminal import audit_text
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+DURATION_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+TWIST, IMU, ALL = ("drive",), ("flight",), ("drive", "flight")
+
+
+class Case(NamedTuple):
+    plant: Callable[..., Sequence]
+    dose: float
+    found: str
+    verdict: Literal["repaired", "blocks", "undecided"]
+    in_detail: str = ""
+    scenarios: tuple[str, ...] = ALL
+
+
+CASES = [
+    Case(faults.swapped_images, 1.0, "swapped-coordinates", "repaired", "left and right are exchanged"),
+    Case(faults.swapped_images, 0.4, "swapped-coordinates", "repaired", "whole tracks"),
+    Case(faults.swapped_coordinates, 1.0, "swapped-coordinates", "blocks", "u and v are exchanged"),
+    Case(faults.dropped_sightings, 1.0, "no-sightings", "blocks"),
+    Case(faults.nan_span, 3600.0, "not-finite", "blocks", "of the sightings"),
+    Case(faults.identity_intrinsics, 1.0, "intrinsics", "blocks", "fx_px = 1 "),
+    Case(faults.transposed_intrinsics, 0.0, "intrinsics", "blocks", "(cx_px, cy_px) = (0, 0)"),
+    Case(faults.shifted_pixels, 5000.0, "intrinsics", "blocks", "lies outside the sightings"),
+    Case(faults.baseline_unit, 1000.0, "units", "repaired", "it is in millimetres, 0.54 m", TWIST),
+    Case(faults.baseline_unit, 1000.0, "units", "blocks", "baseline_m is 110", IMU),
+    Case(faults.extrinsic_unit, 1000.0, "units", "repaired", "its translation is in millimetres"),
+    Case(faults.inverted_extrinsic, 1.0, "mixed-axes", "repaired", "T_imu_cam is inverted", TWIST),
+    Case(faults.linear_unit, 3.6, "units", "repaired", "km/h", TWIST),
+    Case(faults.linear_unit, 100.0, "units", "repaired", "cm/s", TWIST),
+    Case(faults.linear_unit, 0.1, "disagreement", "blocks", "times the camera's", TWIST),
+    Case(faults.linear_unit, 1.0 / 9.80665, "units", "repaired", "it is in g", IMU),
+    Case(faults.linear_unit, 3.6, "disagreement", "blocks", "times gravity", IMU),
+    Case(faults.angular_unit, 180.0 / np.pi, "units", "repaired", "deg/s"),
+    Case(faults.truth_unit, 1000.0, "units", "repaired", "the truth moves"),
+    Case(faults.spike, 1e300, "implausible", "repaired", "1 motion sample(s)"),
+    Case(faults.few_tracks, 3.0, "mixed-axes", "undecided", "0 of"),
+    Case(faults.few_tracks, 1.0, "time-offset", "undecided", "0 of"),
+    Case(faults.clock_jump, -0.5, "time-order", "repaired", "the clock jumps back by 0.50 s"),
+    Case(faults.motion_gap, 0.5, "motion-gap", "repaired", "times the noise"),
+    Case(faults.motion_gap, 0.9, "motion-gap", "repaired", "times the noise"),
+    Case(faults.motion_gap, 0.02, "motion-gap", "repaired", "1 gap(s)", IMU),
+    Case(faults.camera_clock, 0.02, "time-offset", "repaired", "stamped late", IMU),
+    Case(faults.camera_clock, -0.02, "time-offset", "repaired", "stamped early", IMU),
+    Case(faults.camera_clock, 0.25, "time-offset", "repaired", "stamped late"),
+]
+
+
+@cache
+def clean(scenario: str) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=DURATION_S[scenario]), 0)
+
+
+@cache
+def audited(case: Case, scenario: str) -> Audit:
+    with np.errstate(all="ignore"):
+        return audit(case.plant(clean(scenario), case.dose, 0))
+
+
+def name_of(case: Case, scenario: str) -> str:
+    return f"{scenario}-{case.plant.__name__}-{case.dose:.3g}"
+
+
+every_case = pytest.mark.parametrize(
+    "case, scenario",
+    [pytest.param(case, scenario, id=name_of(case, scenario)) for case in CASES for scenario in case.scenarios],
+)
+
+
+@every_case
+def test_the_fault_is_named_with_the_right_verdict(case: Case, scenario: str) -> None:
+    outcome = audited(case, scenario)
+    if case.verdict == "undecided":
+        assert not outcome.findings
+        assert case.in_detail in outcome.undecided[case.found]
+        return
+    found = {finding.fault: finding for finding in outcome.findings}
+    assert case.in_detail in found[case.found].detail
+    assert any(finding.blocking for finding in outcome.findings) == (case.verdict == "blocks")
+    assert found[case.found].blocking == (case.verdict == "blocks")
+
+
+@every_case
+def test_nothing_is_blessed_that_blocks_or_was_not_judged(case: Case, scenario: str) -> None:
+    outcome = audited(case, scenario)
+    blessed = "nothing is left that spoils a result" in audit_text(outcome)
+    assert blessed == (case.verdict == "repaired" and not outcome.undecided)
+    assert ("not decidable: " in audit_text(outcome)) == bool(outcome.undecided)
+
+
+@pytest.mark.parametrize("dose", [0.02, -0.02, 0.25])
+def test_the_offset_of_the_clocks_is_measured_and_undone(dose: float) -> None:
+    sequence = clean("flight")
+    repaired = audit(faults.camera_clock(sequence, dose, 0)).sequence
+    left_s = (
+        repaired.frames_t_ns[-1]
+        - sequence.frames_t_ns[sequence.frames_t_ns.searchsorted(repaired.frames_t_ns[-1] - NS_PER_S // 40)]
+    ) / NS_PER_S
+    assert abs(left_s) < 0.01  # three standard errors of 3 ms over six seconds
+
+
+def test_a_kept_offset_is_told_blocks_and_is_left() -> None:
+    late = faults.camera_clock(clean("flight"), 0.25, 0)
+    outcome = audit(late, frozenset({"time-offset"}))
+    (finding,) = [f for f in outcome.findings if f.fault == "time-offset"]
+    assert finding.blocking
+    assert outcome.sequence is late
+
+
+def test_a_calibration_that_was_repaired_is_the_true_one() -> None:
+    sequence = clean("drive")
+    for fault in (faults.baseline_unit, faults.extrinsic_unit, faults.inverted_extrinsic):
+        rig = audit(fault(sequence)).sequence.rig
+        assert rig.baseline_m == pytest.approx(sequence.rig.baseline_m)
+        np.testing.assert_allclose(rig.T_imu_cam, sequence.rig.T_imu_cam, atol=1e-9)
+
+
+def test_samples_in_another_unit_come_back_as_they_were() -> None:
+    sequence = clean("drive")
+    for fault, dose in ((faults.linear_unit, 3.6), (faults.angular_unit, 180.0 / np.pi)):
+        repaired = audit(fault(sequence, dose, 0)).sequence
+        np.testing.assert_allclose(repaired.motion.values, sequence.motion.values, rtol=1e-9, atol=1e-12)
+
+
+def test_an_implausible_sample_is_dropped_alone() -> None:
+    sequence = clean("flight")
+    repaired = audit(faults.spike(sequence, 1e300, 0)).sequence
+    assert repaired.motion.t_ns.size == sequence.motion.t_ns.size - 1
+    assert np.abs(repaired.motion.values).max() < 100.0
+
+
+def test_after_a_clock_jump_no_time_is_there_twice() -> None:
+    sequence = clean("flight")
+    repaired = audit(faults.clock_jump(sequence, -0.5, 0)).sequence
+    original = np.isin(repaired.frames_t_ns, sequence.frames_t_ns)
+    assert original.all() or not original.any()
+    assert repaired.frame_count >= 0.4 * sequence.frame_count
+
+
+def test_a_bridge_is_as_noisy_as_its_error_and_nothing_else_is() -> None:
+    sequence = clean("flight")
+    gap = faults.motion_gap(sequence, 0.5, 0)
+    repaired = audit(gap).sequence
+    assert repaired.bridges is not None
+    begin_ns, end_ns = repaired.bridges.begin_t_ns[0], repaired.bridges.end_t_ns[0]
+    for packet in repaired.packets():
+        outside = packet.frame.t_ns <= begin_ns or packet.frame.t_ns >= end_ns + NS_PER_S // 20
+        assert packet.motion is None or (packet.motion.noise_scale is None) == outside
+    lost = (sequence.motion.t_ns > begin_ns) & (sequence.motion.t_ns < end_ns)
+    at = np.searchsorted(repaired.motion.t_ns, sequence.motion.t_ns[lost])
+    error = np.sum(repaired.motion.values[at] - sequence.motion.values[lost], axis=0) / 200.0
+    stated = repaired.bridges.noise_scale[0] * [2e-3, 1.7e-4] * np.sqrt(0.5)  # densities of the flight's IMU
+    assert (np.abs(error) < 3.0 * np.repeat(stated, 3)).all()
+    assert (np.abs(error).reshape(2, 3).max(axis=1) > 0.05 * stated).all()

@@ -1,0 +1,140 @@
+"""Every injector does what its docstring says, to nothing else, and the same under the same seed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from inspect import getmembers, isfunction
+
+import numpy as np
+import pytest
+
+from toolkit.errors import DataError
+from toolkit.geometry import se3_inverse
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, check_runnable
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+INJECTORS = {
+    name: function
+    for name, function in getmembers(faults, isfunction)
+    if function.__module__ == faults.__name__ and not name.startswith("_")
+}
+# What an estimator is not given without a repair or a refusal first.
+NOT_RUNNABLE = {"nan_span", "clock_jump", "zero_intrinsics", "negative_focal"}
+
+
+@pytest.fixture(scope="module")
+def drive() -> Sequence:
+    return simulate(replace(SCENARIOS["drive"], duration_s=6.0), 0)
+
+
+def seen_at_s(sequence: Sequence) -> np.ndarray:
+    return (sequence.frames_t_ns[sequence.observations.frame] - sequence.frames_t_ns[0]) / NS_PER_S
+
+
+@pytest.mark.parametrize("name", INJECTORS)
+def test_a_fault_changes_a_copy_in_the_same_way_under_the_same_seed(name: str, drive: Sequence) -> None:
+    before = drive.content_hash()
+    once, again = (INJECTORS[name](drive, seed=4) for _ in range(2))
+    assert once.content_hash() == again.content_hash() != before
+    assert drive.content_hash() == before
+
+
+@pytest.mark.parametrize("name", sorted(INJECTORS.keys() - NOT_RUNNABLE))
+def test_what_remains_can_be_run(name: str, drive: Sequence) -> None:
+    check_runnable(INJECTORS[name](drive, seed=1))
+
+
+def test_every_fault_is_described() -> None:
+    assert len(INJECTORS) >= 25
+    assert all(len(function.__doc__ or "") > 40 for function in INJECTORS.values())
+
+
+def test_faults_are_composed_by_calling_one_after_the_other(drive: Sequence) -> None:
+    both = faults.camera_clock(faults.few_tracks(drive, 3, 0), 0.25, 0)
+    assert np.bincount(both.observations.frame).max() <= 3
+    assert both.frames_t_ns[0] == drive.frames_t_ns[0] + NS_PER_S // 4
+
+
+def test_a_tenth_of_the_sightings_goes(drive: Sequence) -> None:
+    kept = len(faults.dropped_sightings(drive, 0.1, 0).observations) / len(drive.observations)
+    assert kept == pytest.approx(0.9, abs=0.02)  # 3.6 standard deviations of 3000 chances
+
+
+def test_a_blackout_ends_every_track(drive: Sequence) -> None:
+    dark = faults.blackout(drive, 1.0, 0)
+    empty = np.setdiff1d(np.arange(drive.frame_count), dark.observations.frame)
+    assert empty.size == 10
+    seen = dark.observations
+    assert np.intersect1d(seen.track_id[seen.frame < empty[0]], seen.track_id[seen.frame > empty[-1]]).size == 0
+
+
+def test_outlier_tracks_begin_where_they_were_and_slide(drive: Sequence) -> None:
+    moved = faults.outlier_tracks(drive, 0.3, 0).observations.uv_px - drive.observations.uv_px
+    _, first = np.unique(drive.observations.track_id, return_index=True)
+    assert not moved[first].any()
+    np.testing.assert_allclose(moved[:, 0], moved[:, 1], atol=1e-9)  # the disparity stays, but for rounding
+    later = np.setdiff1d(np.arange(len(moved)), first)
+    assert moved[later].any(axis=1).mean() == pytest.approx(0.3, abs=0.1)
+
+
+def test_few_tracks_last_as_long_as_they_did(drive: Sequence) -> None:
+    few = faults.few_tracks(drive, 3, 0).observations
+    assert np.bincount(few.frame, minlength=drive.frame_count).tolist() == [3] * drive.frame_count
+    spans = [np.ptp(few.frame[few.track_id == i]) + 1 for i in np.unique(few.track_id)]
+    assert sum(spans) == len(few)
+
+
+@pytest.mark.parametrize("fault, dose", [(faults.motion_gap, 0.5), (faults.nan_span, 0.3)])
+def test_the_motion_of_a_span_is_lost(fault: Callable[..., Sequence], dose: float, drive: Sequence) -> None:
+    struck = fault(drive, dose, 0)
+    kept = np.isfinite(struck.motion.values).all(axis=1)
+    assert np.diff(struck.motion.t_ns[kept]).max() / NS_PER_S == pytest.approx(dose, abs=0.11)
+
+
+def test_a_clock_jump_shifts_all_that_follows(drive: Sequence) -> None:
+    shift = faults.clock_jump(drive, -0.5, 0).frames_t_ns - drive.frames_t_ns
+    assert set(shift.tolist()) == {0, -NS_PER_S // 2}
+    assert (np.diff(shift) <= 0).all()
+
+
+def test_exchanged_coordinates_leave_no_disparity_but_noise(drive: Sequence) -> None:
+    swapped = faults.swapped_coordinates(drive, 1.0, 0).observations.uv_px
+    assert np.median(np.abs(swapped[:, 0] - swapped[:, 1])) < 3.0
+    np.testing.assert_allclose(swapped[:, 2], drive.observations.uv_px[:, :2].mean(axis=1))
+
+
+def test_a_vehicle_that_stands_goes_on_later_where_it_was(drive: Sequence) -> None:
+    halted = faults.standstill(drive, 2.0, 0)
+    assert halted.frame_count == drive.frame_count + 20
+    assert halted.truth is not None and drive.truth is not None
+    steps = np.linalg.norm(np.diff(halted.truth.T_world_imu[:, :3, 3], axis=0), axis=1)
+    assert (steps == 0.0).sum() == 20
+    np.testing.assert_array_equal(halted.truth.T_world_imu[-1], drive.truth.T_world_imu[-1])
+    stands = np.linalg.norm(halted.motion.v_mps, axis=1) < 0.5  # 10 standard deviations; it drives at 3 m/s or more
+    assert stands.sum() == 20
+    assert len(halted.observations) > len(drive.observations)
+
+
+def test_an_imu_cannot_be_stopped_without_braking() -> None:
+    flight = simulate(replace(SCENARIOS["flight"], duration_s=1.0), 0)
+    with pytest.raises(DataError, match="simulate a scene that halts"):
+        faults.standstill(flight, 1.0, 0)
+
+
+def test_calibrations_are_wrong_in_the_field_that_is_named(drive: Sequence) -> None:
+    np.testing.assert_allclose(faults.inverted_extrinsic(drive).rig.T_imu_cam, se3_inverse(drive.rig.T_imu_cam))
+    assert faults.baseline_unit(drive, 1000.0).rig.baseline_m == 540.0
+    assert faults.transposed_intrinsics(drive).rig.cx_px == 0.0
+
+
+def test_the_noise_stated_is_scaled_and_the_measurements_stay(drive: Sequence) -> None:
+    wrong = faults.wrong_noise(drive, 2.0, 0)
+    np.testing.assert_allclose(wrong.rig.cov_uv_px2, 4.0 * drive.rig.cov_uv_px2)
+    assert wrong.observations is drive.observations and wrong.motion is drive.motion
+
+
+def test_sightings_outside_the_struck_time_are_as_they_were(drive: Sequence) -> None:
+    struck = faults.nan_span(drive, 0.5, 0)
+    sound = np.isfinite(struck.observations.uv_px).all(axis=1)
+    assert np.ptp(seen_at_s(drive)[~sound]) < 0.5
+    np.testing.assert_array_equal(struck.observations.uv_px[sound], drive.observations.uv_px[sound])

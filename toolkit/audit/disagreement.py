@@ -1,0 +1,60 @@
+"""Tracks that do not follow the measured motion, whatever was repaired before: calibration or samples are wrong.
+
+The last word on the calibration: what no other fault explains, or what a repair has left, is said here.
+"""
+
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.agreement import agreement
+from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
+
+# Ratios of the samples' speed, rate of rotation and specific force to what the camera and gravity say. Sound recordings
+# have speeds of 0.96 to 1.02; the noise of the camera's rotation lowers that of rotations, so only a larger one counts.
+MOST_RATIO, MOST_FORCE_RATIO, SIGMAS = 1.25, 1.5, 5.0
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Compare the median one-step residual with what the noise explains, and the sizes of the motions."""
+    if evidence.intervals is None:
+        return evidence.blind
+    found = agreement(evidence.sequence, evidence.camera_motion)
+    said = _ratios(evidence)
+    if found.residual_px > found.limit_px or found.own_px > found.limit_px or said:
+        said.append(
+            f"the tracks miss the measured motion by {found.residual_px:.2f} px from frame to frame (median; noise "
+            f"explains {found.limit_px:.2f} px at most) and the camera's own best motion by {found.own_px:.2f} px"
+        )
+    if not said:
+        return None
+    treatment = "T_imu_cam, the intrinsics, the baseline or the samples are wrong: check them"
+    if found.own_px > found.limit_px:
+        treatment = "the intrinsics or the tracks themselves are wrong: check K and the pixels"
+    return Symptom(count=1, detail="; ".join(said), treatment=treatment, remedy=None)
+
+
+def _ratios(evidence: Evidence) -> list[str]:
+    """Say which sizes of the motion differ from the camera's, or from gravity, by a factor."""
+    assert evidence.intervals is not None
+    speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
+    rotation = rotation_ratio(evidence.intervals)
+    said = []
+    if speed is not None and _is_off(speed, 1.0 / MOST_RATIO, MOST_RATIO):
+        said.append(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's")
+    if _is_off(rotation, 0.0, MOST_RATIO):
+        said.append(f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera")
+    if force is not None and _is_off(force, 1.0 / MOST_FORCE_RATIO, MOST_FORCE_RATIO):
+        said.append(f"the accelerometer reads {force.value:.3g} times gravity (median)")
+    return said
+
+
+def _is_off(ratio: Scalar, least: float, most: float) -> bool:
+    margin = SIGMAS * ratio.error
+    return not least - margin <= ratio.value <= most + margin
+
+
+FAULT = Fault(
+    "disagreement",
+    "tracks that do not follow the measured motion, for a reason no other fault explains",
+    check,
+    after=("units", "intrinsics", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset"),
+)

@@ -1,0 +1,63 @@
+"""Single values no sensor gives: a flipped bit or a failed parse, of which one ruins a whole run."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.subsets import keep_samples
+from toolkit.geometry import Array, BoolArray
+from toolkit.sequence import Sequence
+
+# Beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
+MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
+# A unit makes all samples too large; single ones are beyond this many times the median.
+BEYOND_MEDIAN = 1e3
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count sightings and motion samples beyond anything physical; drop them."""
+    sequence = evidence.sequence
+    sightings: BoolArray = np.asarray((np.abs(sequence.observations.uv_px) > MOST_PX).any(axis=1))
+    samples = _wild(sequence)
+    if not (sightings.any() or samples.any()):
+        return None
+    remedy = sequence
+    if sightings.any():
+        remedy = replace(remedy, observations=sequence.observations.select(~sightings))
+    if samples.any():
+        remedy = keep_samples(remedy, ~samples)
+    return Symptom(
+        count=int(sightings.sum() + samples.sum()),
+        detail=(
+            f"{sightings.sum()} sighting(s) and {samples.sum()} motion sample(s) are beyond anything a sensor gives, "
+            f"up to {_largest(sequence, sightings, samples):.3g}"
+        ),
+        treatment="dropped; the neighbouring motion samples bridge the interval",
+        remedy=remedy,
+    )
+
+
+def _wild(sequence: Sequence) -> BoolArray:
+    """Say which motion samples (S,) hold a value that is neither physical nor like the others."""
+    most_linear = MOST_MPS if sequence.motion_kind == "twist" else MOST_MPS2
+    size = np.abs(sequence.motion.values)
+    wild = np.zeros(len(size), dtype=bool)
+    for columns, most in ((size[:, :3], most_linear), (size[:, 3:], MOST_RADPS)):
+        largest = columns.max(axis=1, initial=0.0)
+        if largest.size:
+            wild |= (largest > most) & (largest > BEYOND_MEDIAN * np.median(largest))
+    return wild
+
+
+def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> float:
+    bad: tuple[Array, ...] = (sequence.observations.uv_px[sightings], sequence.motion.values[samples])
+    return max(float(np.abs(values).max(initial=0.0)) for values in bad)
+
+
+FAULT = Fault(
+    "implausible",
+    "single sightings or motion samples beyond anything a sensor gives",
+    check,
+    after=("not-finite",),
+)

@@ -1,0 +1,85 @@
+"""Intrinsics that belong to other pixels: a principal point outside of what was seen, a focal length no lens has.
+
+Both are named from the sightings' range, and accused only where other values let the tracks follow one rigid motion
+of the camera better, whatever the motion samples say.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, own_one_step_px
+from toolkit.audit.parts.vision import camera_motion
+from toolkit.geometry import Array
+from toolkit.sequence import Sequence, StereoRig
+
+# Quantiles of the sightings that are their range: tracks may slide out of the image.
+RANGE = (0.005, 0.995)
+# The range over the focal length: 2 is a view of 90 degrees, 12 one of 161; below 0.02 a view of 1 degree.
+WIDEST, NARROWEST = 12.0, 0.02
+# What a usual lens has.
+USUAL = 1.5
+# Share by which other intrinsics must lower the tracks' residual: 0.15 and more where the point is off by half a view.
+LEAST_GAIN = 0.05
+TRIED_FRAMES = 300
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Name the intrinsics that the sightings cannot have; without images there is no way to mend them."""
+    sequence = evidence.sequence
+    uv_px = sequence.observations.uv_px
+    if len(uv_px) < LEAST_INTERVALS or not np.isfinite(uv_px).all():
+        return None
+    low, high = np.quantile(uv_px[:, [0, 2]], RANGE, axis=0)
+    faults = _suspects(sequence.rig, low, high)
+    if not faults:
+        return None
+    ordinary: dict[str, Any] = {key: value for fields, _ in faults for key, value in fields.items()}
+    other = replace(sequence.rig, **ordinary)
+    given_px, other_px = _own_px(sequence), _own_px(replace(sequence, rig=other))
+    if not given_px * (1.0 - LEAST_GAIN) > other_px:
+        return None
+    return Symptom(
+        count=len(faults),
+        detail=(
+            f"{'; '.join(words for _, words in faults)}: the tracks miss the camera's own best motion by "
+            f"{given_px:.2f} px, and by {other_px:.2f} px with ordinary values"
+        ),
+        treatment="the true ones are not in the data: mend K, or the pixels",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, Any], str]]:
+    """Return ordinary values instead of those that sightings from ``low`` to ``high`` (u, v) cannot have, and why."""
+    found: list[tuple[dict[str, Any], str]] = []
+    middle, width_px = 0.5 * (low + high), float((high - low).max())
+    centre = np.array([rig.cx_px, rig.cy_px])
+    if ((centre < low) | (centre > high)).any():
+        u, v = (f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
+        where = f"(cx_px, cy_px) = ({centre[0]:.0f}, {centre[1]:.0f}) lies outside the sightings, u {u}, v {v} px"
+        found.append(({"cx_px": float(middle[0]), "cy_px": float(middle[1])}, where))
+    if not NARROWEST < width_px / rig.fx_px < WIDEST:
+        angle_deg = np.degrees(2.0 * np.arctan(0.5 * width_px / rig.fx_px))
+        usual_px = width_px / USUAL
+        words = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
+        found.append(({"fx_px": usual_px, "fy_px": usual_px}, words))
+    return found
+
+
+def _own_px(sequence: Sequence) -> float:
+    """Return the median residual of the camera's own best motion; infinite where there is none."""
+    part = sequence.truncated(TRIED_FRAMES)
+    own_px = own_one_step_px(part, camera_motion(part))
+    return own_px if np.isfinite(own_px) else np.inf
+
+
+FAULT = Fault(
+    "intrinsics",
+    "a principal point or a focal length that the sightings cannot have",
+    check,
+    after=("swapped-coordinates", "no-disparity", "time-order", "stale-frames", "doubled-disparity"),
+)

@@ -1,0 +1,123 @@
+"""Short holes in the motion samples: bridged, with as much noise as such a bridge has in the rest of the recording.
+
+A hole of a few samples up to a second is filled by straight lines between the samples at its ends. How wrong that is
+the recording itself shows: bridges of the same length are laid over stretches that were measured, and the integral of
+their error gives the noise they need. Where it is the same in every hole, the state after one is as uncertain as told.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.intervals import is_comparable
+from toolkit.audit.time_gap import GAP_RATIO
+from toolkit.geometry import Array, IntArray
+from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.sequence import MotionNoise, MotionSamples, Sequence, TwistNoise, TwistSamples
+
+# Bridges laid over measured stretches: with fewer than this the recording is too short to tell, and the whole spread of
+# the samples counts as their error.
+LEAST_TRIALS = 5
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the holes between the first frame and the last; fill them and raise the noise there."""
+    sequence = evidence.sequence
+    if not is_comparable(sequence):
+        return None
+    t_ns = sequence.motion.t_ns
+    rows, usual_ns = _holes(sequence)
+    if not rows.size:
+        return None
+    scale = np.stack([_noise_scale(sequence, round((t_ns[row + 1] - t_ns[row]) / usual_ns), usual_ns) for row in rows])
+    longest_s = float((t_ns[rows + 1] - t_ns[rows]).max()) / NS_PER_S
+    linear, angular = scale.max(axis=0)
+    return Symptom(
+        count=rows.size,
+        detail=f"{rows.size} gap(s) in the motion samples, the longest of {longest_s:.3g} s",
+        treatment=(
+            f"bridged by straight lines, with up to {linear:.0f} (linear) and {angular:.0f} (angular) times the noise "
+            "there, as bridges over measured stretches need"
+        ),
+        remedy=replace(
+            sequence,
+            motion=_filled(sequence.motion, rows, usual_ns),
+            bridges=_with(sequence.bridges, Bridges(t_ns[rows], t_ns[rows + 1], scale)),
+        ),
+    )
+
+
+def _holes(sequence: Sequence) -> tuple[IntArray, float]:
+    """Return the samples after which there is a hole, where frames are, and the usual step (ns).
+
+    A twist may be the mean of the whole interval to the next one: between those only a frame inside shows a hole.
+    """
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    step_ns = np.diff(t_ns)
+    if not step_ns.size:
+        return np.empty(0, dtype=np.int64), 0.0
+    usual_ns = float(np.median(step_ns))
+    inside = (t_ns[1:] > frames_t_ns[0]) & (t_ns[:-1] < frames_t_ns[-1])
+    if isinstance(sequence.motion, TwistSamples):
+        inside = np.searchsorted(frames_t_ns, t_ns[1:]) > np.searchsorted(frames_t_ns, t_ns[:-1], side="right")
+    return np.flatnonzero((step_ns > GAP_RATIO * usual_ns) & inside), usual_ns
+
+
+def _noise_scale(sequence: Sequence, steps: int, usual_ns: float) -> Array:
+    """Return the factors (2,) on the noise of a bridge over so many steps: of linear and of angular samples."""
+    values, step_s = sequence.motion.values, usual_ns / NS_PER_S
+    trials = _measured_stretches(sequence.motion.t_ns, steps, usual_ns)
+    if trials.size >= LEAST_TRIALS:
+        stretch = values[trials[:, None] + np.arange(steps + 1)]  # (W, steps + 1, 6)
+        share = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        line = stretch[:, :1] * (1.0 - share) + stretch[:, -1:] * share
+        summed = step_s * np.cumsum(stretch - line, axis=1)[:, 1:]
+        elapsed_s = step_s * np.arange(1, steps + 1)[:, None]
+        density_squared = (np.mean(summed**2, axis=0) / elapsed_s).max(axis=0)
+    else:
+        density_squared = np.var(values, axis=0) * steps * step_s
+    excess = density_squared.reshape(2, 3).max(axis=1) / _stated(sequence.noise) ** 2
+    return np.asarray(np.sqrt(1.0 + excess))
+
+
+def _measured_stretches(t_ns: IntArray, steps: int, usual_ns: float) -> IntArray:
+    """Return the first samples of the stretches of so many steps without a hole."""
+    if t_ns.size <= steps:
+        return np.empty(0, dtype=np.int64)
+    holes_before = np.concatenate([[0], np.cumsum(np.diff(t_ns) > GAP_RATIO * usual_ns)])
+    return np.flatnonzero(holes_before[steps:] == holes_before[:-steps])
+
+
+def _stated(noise: MotionNoise) -> Array:
+    """Return the stated densities (2,) of linear and angular samples, the least of their axes."""
+    if isinstance(noise, TwistNoise):
+        return np.array([noise.velocity_noise_density.min(), noise.gyro_noise_density.min()])
+    return np.array([noise.accel_noise_density, noise.gyro_noise_density])
+
+
+def _filled(motion: MotionSamples, rows: IntArray, usual_ns: float) -> MotionSamples:
+    """Return the samples with others put in the holes after ``rows``, on straight lines, at the usual steps."""
+    ends = [(int(motion.t_ns[row]), int(motion.t_ns[row + 1])) for row in rows]
+    inner = [np.linspace(begin, end, round((end - begin) / usual_ns) + 1)[1:-1] for begin, end in ends]
+    t_ns = np.sort(np.concatenate([motion.t_ns, *(np.rint(stamps).astype(np.int64) for stamps in inner)]))
+    at_s, sample_s = (t_ns - t_ns[0]) / NS_PER_S, (motion.t_ns - t_ns[0]) / NS_PER_S
+    values = np.stack([np.interp(at_s, sample_s, column) for column in motion.values.T], axis=1)
+    if isinstance(motion, TwistSamples):
+        return replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
+    return replace(motion, t_ns=t_ns, accel_mps2=values[:, :3], gyro_radps=values[:, 3:])
+
+
+def _with(before: Bridges | None, new: Bridges) -> Bridges:
+    if before is None:
+        return new
+    begin, end = np.append(before.begin_t_ns, new.begin_t_ns), np.append(before.end_t_ns, new.end_t_ns)
+    return Bridges(begin, end, np.vstack([before.noise_scale, new.noise_scale]))
+
+
+FAULT = Fault(
+    "motion-gap",
+    "short holes in the motion samples",
+    check,
+    after=("time-gap", "units"),
+)

@@ -1,0 +1,20 @@
+"""A recording whose frames show nothing at all, though nothing says that it was made without a camera."""
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.sequence import NO_FEATURES
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the frames where there is no sighting in any of them, unless the recording says that it has none."""
+    sequence = evidence.sequence
+    if len(sequence.observations) or not sequence.frame_count or NO_FEATURES in sequence.provenance.facts:
+        return None
+    return Symptom(
+        count=sequence.frame_count,
+        detail=f"none of {sequence.frame_count} frames has a stereo sighting",
+        treatment="nothing can be compared but dead reckoning: look for the lost tracks",
+        remedy=None,
+    )
+
+
+FAULT = Fault("no-sightings", "frames without any sighting, where a camera should have seen something", check)

@@ -1,0 +1,100 @@
+"""Image coordinates in the wrong columns: left and right images exchanged, or rows and columns.
+
+A point in front of a rectified pair is farther left in the right image, so in a sound recording nearly every
+disparity uL - uR is positive. Where many are not, the orders in which the three coordinates can stand are tried: the
+one is right under which the tracks follow the measured motion. Exchanged rows and columns of both images leave two
+rows where uL and uR belong, which differ by noise alone; with them the depth is lost, and nothing repairs that.
+"""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.agreement import agreement
+from toolkit.geometry import Array, BoolArray
+from toolkit.models.stereo import disparity_px
+from toolkit.sequence import Sequence
+
+# Share of the disparities that is not positive from which their order is doubted: a repair by dropping would block.
+SUSPECT_SHARE = 0.2
+# Of the right order at most this share is not positive: 1 % where it was measured.
+SOUND_SHARE = 0.05
+# Rows of a pair differ by their noise: within so many standard deviations of the rig's for half of the sightings.
+ROW_SIGMAS = 5.0
+# Frames in which the orders are tried.
+TRIED_FRAMES = 300
+NAMES = ("uL", "uR", "v")
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Find the order of the coordinates under which tracks and motion agree; exchange them where it is certain."""
+    sequence = evidence.sequence
+    disparity = disparity_px(sequence.observations.uv_px)
+    suspect = np.isfinite(disparity) & (disparity <= 0.0)
+    if suspect.sum() <= SUSPECT_SHARE * max(len(disparity), 1):
+        return None
+    count, share = int(suspect.sum()), suspect.mean()
+    detail = f"{count} of {len(disparity)} sightings have a disparity <= 0 ({share:.0%})"
+    apart_px, noise_px = float(np.nanmedian(np.abs(disparity))), float(np.sqrt(sequence.rig.cov_uv_px2[0, 0]))
+    if apart_px < ROW_SIGMAS * noise_px and share < 1.0 - SUSPECT_SHARE:
+        detail += f" and uL differs from uR by {apart_px:.1f} px only, as the rows of a pair do: u and v are exchanged"
+        why = "the depth is lost with the exchange: mend the file"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
+    explained = [remedy for remedy in _reordered(sequence) if _is_sound(remedy[1])]
+    if len(explained) != 1:
+        why = "no order of the coordinates makes the tracks follow the measured motion: mend the file"
+        detail += ": left and right, or u and v, are exchanged"
+        return Symptom(count, detail, why, remedy=None, spoils_vision=True)
+    words, remedy = explained[0]
+    treatment = "exchanged again, and the tracks follow the measured motion"
+    return Symptom(count, f"{detail}: {words}", treatment, remedy, spoils_vision=True)
+
+
+def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
+    """Return the recording with its coordinates in every other order, and with the tracks behind the camera turned."""
+    uv_px = sequence.observations.uv_px
+    orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
+    whole = [(_words(order), uv_px[:, list(order)]) for order in orders]
+    behind = _behind(sequence)
+    if behind.mean() < 1.0 - SUSPECT_SHARE:
+        turned = np.where(behind[:, None], uv_px[:, [1, 0, 2]], uv_px)
+        whole.append((f"left and right are exchanged in {behind.mean():.0%} of them, whole tracks", turned))
+    return [(words, _with_pixels(sequence, pixels)) for words, pixels in whole]
+
+
+def _behind(sequence: Sequence) -> BoolArray:
+    """Say of each sighting (N,) whether most of its track has a disparity <= 0."""
+    observations = sequence.observations
+    _, track = np.unique(observations.track_id, return_inverse=True)
+    behind = np.bincount(track, weights=disparity_px(observations.uv_px) <= 0.0) / np.bincount(track)
+    return np.asarray(behind[track] > 0.5)
+
+
+def _is_sound(sequence: Sequence) -> bool:
+    if (disparity_px(sequence.observations.uv_px) <= 0.0).mean() > SOUND_SHARE:
+        return False
+    evidence = Evidence(sequence.truncated(TRIED_FRAMES))
+    if evidence.intervals is None:
+        return False
+    found = agreement(evidence.sequence, evidence.camera_motion)
+    return found.residual_px <= found.limit_px
+
+
+def _words(order: tuple[int, ...]) -> str:
+    if order == (1, 0, 2):
+        return "left and right are exchanged"
+    return f"they stand in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"
+
+
+def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+
+
+FAULT = Fault(
+    "swapped-coordinates",
+    "left and right images, or rows and columns, exchanged",
+    check,
+    after=("time-order", "returning-tracks", "not-finite", "implausible", "outside-motion"),
+)

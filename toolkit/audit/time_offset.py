@@ -1,0 +1,142 @@
+"""Frames stamped by another clock than the motion samples, or with a constant delay of the camera.
+
+The camera's rotation, from its tracks alone, is the mean of the gyro over each interval, shifted by the offset. A
+coarse search over whole steps finds the neighbourhood, Gauss-Newton on the shift, with Cauchy weights and about the
+median (a gyro has a bias), finds it to a fraction of a sample; for twists, whose noise would hide the change of
+rotation, the change that the camera sees is the instrument. Source: Furgale, Rehder & Siegwart, "Unified temporal and
+spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
+
+A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, interval_means
+from toolkit.audit.parts.robust import Scalar, slope, spread
+from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.twist_lag import LAG
+from toolkit.geometry import Array, BoolArray
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, TwistSamples
+
+# How far it is searched for, and the step of the search in intervals.
+MOST_S, COARSE_STEP = 0.6, 0.25
+REFINEMENTS = 5
+# An offset is one beyond so many standard errors and beyond what is no fault: a sample of an IMU may stand for the
+# interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
+# which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
+SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
+# With a larger standard error (s) than these nothing is said. On simulated drives of 6 s, with an IMU, errors scatter
+# three times as widely as their standard error of 6 ms says, and on those of 15 s, with 3 ms, half as much again.
+LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S = 0.004, 0.0125
+# The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
+MOST_UNEXPLAINED = 0.9
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Find the offset of the frames' stamps; shift the frames by it."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    if intervals is None:
+        return evidence.blind
+    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    found = _offset(sequence, intervals, w_imu)
+    largest_s = LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
+    if found is None or found.error > largest_s:
+        error = "unknown" if found is None else f"known to {1e3 * found.error:.0f} ms"
+        return Undecided(f"too little change of rotation: the offset of camera and gyro is {error}")
+    expected_s, least_s = _expected(sequence)
+    if abs(found.value) < max(least_s, SIGMAS * found.error):
+        return None
+    offset_s = found.value - expected_s
+    late = "late" if offset_s < 0.0 else "early"
+    return Symptom(
+        count=1,
+        detail=(
+            f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
+            f"{1e3 * found.error:.1f} ms: frames are stamped {late}"
+        ),
+        treatment="the frames are shifted by it",
+        remedy=_shifted(sequence, offset_s),
+    )
+
+
+def _expected(sequence: Sequence) -> tuple[float, float]:
+    """Return the offset (s) that a right pairing of twists shows, and the largest that is no fault."""
+    if not isinstance(sequence.motion, TwistSamples):
+        return 0.0, LEAST_S
+    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    return (LAG[sequence.motion.pairing] - 0.5) * step_s, LEAST_TWIST_INTERVALS * step_s
+
+
+def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where nothing tells."""
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    candidates = np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s)
+    at_zero = _unexplained(w_imu, *_gyro_at(sequence, intervals, 0.0))
+    costs = [_unexplained(w_imu, *_gyro_at(sequence, intervals, offset_s)) for offset_s in candidates]
+    if not np.isfinite(costs).any():
+        return None
+    best = int(np.nanargmin(costs))
+    offset_s = float(candidates[best]) if costs[best] < MOST_UNEXPLAINED * at_zero else 0.0
+    found = Scalar(offset_s, np.inf)
+    seen, known = _change_seen(sequence, intervals, w_imu)
+    for _ in range(REFINEMENTS):
+        mean, inside = _gyro_at(sequence, intervals, found.value)
+        after, after_inside = _gyro_at(sequence, intervals, found.value + 0.1 * step_s)
+        before, before_inside = _gyro_at(sequence, intervals, found.value - 0.1 * step_s)
+        rows = known & inside & after_inside & before_inside
+        if rows.sum() < LEAST_INTERVALS:
+            return None
+        change = (after - before)[rows] / (0.2 * step_s)
+        residual = w_imu[rows] - mean[rows]
+        instrument = seen[rows] if isinstance(sequence.motion, TwistSamples) else change
+        step = slope(instrument, change, residual - np.median(residual, axis=0))
+        found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
+    return found if abs(found.value) < 2.0 * MOST_S else None
+
+
+def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
+    """Return how the camera's rotation changes about each interval (M, 3) rad/s^2, and where that is known (M,).
+
+    From the neighbouring intervals: it follows the gyro's change and not its noise, nor the interval's own.
+    """
+    seen, known = np.zeros((sequence.frame_count + 1, 3)), np.zeros(sequence.frame_count + 1, dtype=bool)
+    seen[intervals.interval + 1], known[intervals.interval + 1] = w_imu, True
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    before, after = intervals.interval, intervals.interval + 2
+    return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
+
+
+def _gyro_at(sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
+    """Return the mean rates (M, 3) of the gyro over the intervals, shifted, and which of them it reaches (M,)."""
+    motion = sequence.motion
+    frames_t_ns = sequence.frames_t_ns + round(offset_s * NS_PER_S)
+    begin, end = frames_t_ns[intervals.interval], frames_t_ns[intervals.interval + 1]
+    inside = (begin >= motion.t_ns[0]) & (end <= motion.t_ns[-1])
+    return interval_means(motion.t_ns, motion.values[:, 3:], frames_t_ns)[intervals.interval], np.asarray(inside)
+
+
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:
+    """Return the spread of the difference over the intervals that are reached, squared; NaN where those are few."""
+    if inside.sum() < LEAST_INTERVALS:
+        return float("nan")
+    return float(np.sum(spread((w_imu - mean)[inside]) ** 2))
+
+
+def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
+    """Return the sequence with its frames on the motion's clock, without those that its samples do not reach."""
+    shifted = replace(sequence, frames_t_ns=sequence.frames_t_ns + round(offset_s * NS_PER_S))
+    motion_t_ns = sequence.motion.t_ns
+    inside = (shifted.frames_t_ns >= motion_t_ns[0]) & (shifted.frames_t_ns <= motion_t_ns[-1])
+    return shifted if inside.all() else keep_frames(shifted, np.flatnonzero(inside))
+
+
+FAULT = Fault(
+    "time-offset",
+    "frames and motion samples stamped by different clocks",
+    check,
+    after=("mixed-axes", "twist-lag"),
+)

@@ -1,0 +1,166 @@
+"""Lengths, speeds, rates of rotation and accelerations in another unit than SI.
+
+What two sources tell of the same motion has a ratio, whatever the axes: that of the speeds of samples and camera, of
+their rates of rotation, of the speeds of the truth and the samples, of the specific force and gravity. A ratio that
+is a unit's, and far from one, names the unit; one that is neither is not judged here. The baseline and the extrinsic
+are lengths that a rig cannot have in another unit.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.intervals import median_one_step_px
+from toolkit.audit.parts.units import (
+    force_ratio,
+    in_other_unit,
+    linear_scaled,
+    ratio_of_speeds,
+    rotation_ratio,
+    speed_ratio,
+)
+from toolkit.geometry import se3
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
+
+SPEEDS = {"km/h": 3.6, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
+RATES = {"deg/s": 180.0 / np.pi}
+LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
+FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665}
+# A unit is named where the ratio is within this factor of it, and this many standard errors from one.
+WITHIN_FACTOR, SIGMAS = 1.25, 5.0
+# Baselines of rigs on vehicles, in the hand or in the air (m), and the farthest that a camera stands from its IMU.
+LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
+
+
+class _Wrong(NamedTuple):
+    """A unit that is wrong: what was measured, and the sequence in SI, or None where two units are as likely."""
+
+    words: str
+    remedy: Sequence | None
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Count the quantities in another unit; convert them where the unit is certain."""
+    found: list[_Wrong] = []
+    now = evidence
+    for measure in (_baseline, _lever_arm, _speed, _rotation, _force, _truth):
+        wrong = measure(now)
+        if wrong is not None:
+            found.append(wrong)
+            now = now if wrong.remedy is None else now.after(wrong.remedy)
+    if not found:
+        return evidence.blind if evidence.intervals is None else None
+    certain = all(wrong.remedy is not None for wrong in found)
+    return Symptom(
+        count=len(found),
+        detail="; ".join(wrong.words for wrong in found),
+        treatment="converted to SI" if certain else "two units are as likely: mend the recording",
+        remedy=now.sequence if certain else None,
+        spoils_vision=True,
+    )
+
+
+def _baseline(evidence: Evidence) -> _Wrong | None:
+    """Judge the baseline by its size; a measured speed decides between units."""
+    rig = evidence.sequence.rig
+    if LEAST_BASELINE_M <= rig.baseline_m <= MOST_BASELINE_M:
+        return None
+    fitting = [u for u, factor in LENGTHS.items() if LEAST_BASELINE_M <= rig.baseline_m / factor <= MOST_BASELINE_M]
+    ratio = speed_ratio(evidence.intervals)
+    words = f"baseline_m is {rig.baseline_m:g}, which no rig has"
+    if ratio is not None:
+        measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
+        unit = in_other_unit(ratio, measured, WITHIN_FACTOR, SIGMAS)
+        fitting = [unit] if unit is not None else []
+        words += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
+    if len(fitting) != 1:
+        return _Wrong(f"{words}: it is not in metres", None)
+    baseline_m = rig.baseline_m / LENGTHS[fitting[0]]
+    remedy = replace(evidence.sequence, rig=replace(rig, baseline_m=baseline_m))
+    return _Wrong(f"{words}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
+
+
+def _lever_arm(evidence: Evidence) -> _Wrong | None:
+    """Judge the distance of camera and IMU by its size, in the largest unit that makes it one."""
+    rig = evidence.sequence.rig
+    position = rig.T_imu_cam[:3, 3]
+    distance_m = float(np.linalg.norm(position))
+    if not distance_m > MOST_LEVER_M:
+        return None
+    words = f"T_imu_cam puts the camera {distance_m:.3g} m from the IMU"
+    unit = "millimetres"
+    if distance_m / LENGTHS[unit] > MOST_LEVER_M:
+        return _Wrong(f"{words}: it is not in metres", None)
+    T_imu_cam = se3(rig.T_imu_cam[:3, :3], position / LENGTHS[unit])
+    if evidence.intervals is not None:
+        camera = evidence.camera_motion
+        given_px, now_px = (median_one_step_px(evidence.sequence, camera, T) for T in (rig.T_imu_cam, T_imu_cam))
+        words += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
+    remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=T_imu_cam))
+    return _Wrong(f"{words}: its translation is in {unit}", remedy)
+
+
+def _speed(evidence: Evidence) -> _Wrong | None:
+    ratio = speed_ratio(evidence.intervals)
+    unit = None if ratio is None else in_other_unit(ratio, SPEEDS, WITHIN_FACTOR, SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    words = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
+    return _Wrong(words, linear_scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
+
+
+def _rotation(evidence: Evidence) -> _Wrong | None:
+    intervals = evidence.intervals
+    if intervals is None:
+        return None
+    ratio = rotation_ratio(intervals)
+    unit = in_other_unit(ratio, RATES, WITHIN_FACTOR, SIGMAS)
+    if unit is None:
+        return None
+    words = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
+    return _Wrong(words, linear_scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
+
+
+def _force(evidence: Evidence) -> _Wrong | None:
+    ratio = force_ratio(evidence.sequence)
+    unit = None if ratio is None else in_other_unit(ratio, FORCES, WITHIN_FACTOR, SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    words = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
+    return _Wrong(words, linear_scaled(evidence.sequence, 1.0 / FORCES[unit]))
+
+
+def _truth(evidence: Evidence) -> _Wrong | None:
+    """Judge the truth by its speed against the samples', or the camera's where those have none."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    truth = sequence.truth
+    if truth is None or intervals is None or truth.t_ns.size < 2:
+        return None
+    frames_t_ns = sequence.frames_t_ns
+    inside = (frames_t_ns >= truth.t_ns[0]) & (frames_t_ns <= truth.t_ns[-1])
+    t_s, at_s = ((stamps - truth.t_ns[0]) / NS_PER_S for stamps in (truth.t_ns, frames_t_ns))
+    positions = np.stack([np.interp(at_s, t_s, axis) for axis in truth.T_world_imu[:, :3, 3].T], axis=1)
+    v_true = np.diff(positions, axis=0) / np.diff(at_s)[:, None]
+    rows = inside[intervals.interval] & inside[intervals.interval + 1]
+    measured = intervals.v_cam_mps if intervals.v_mps is None else intervals.v_mps
+    ratio = ratio_of_speeds(v_true[intervals.interval[rows]], measured[rows])
+    unit = None if ratio is None else in_other_unit(ratio, LENGTHS, WITHIN_FACTOR, SIGMAS)
+    if ratio is None or unit is None:
+        return None
+    scale = 1.0 / LENGTHS[unit]
+    T_world_imu = se3(truth.T_world_imu[:, :3, :3], scale * truth.T_world_imu[:, :3, 3])
+    v_world = None if truth.v_world is None else scale * truth.v_world
+    remedy = replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
+    words = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
+    return _Wrong(words, remedy)
+
+
+FAULT = Fault(
+    "units",
+    "lengths, speeds, rates of rotation or accelerations in another unit than SI",
+    check,
+    after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics"),
+)

@@ -1,0 +1,385 @@
+"""Faults to plant in a recording: what goes wrong with trackers, motion sensors, clocks, calibrations and units.
+
+Every injector is ``fault(sequence, dose, seed) -> Sequence``: it leaves what it is given as it is, draws where and
+whom it strikes from the seed, and can be followed by another. The dose is in the unit its docstring names. The truth
+stays that of the motion, unless the fault is one of the truth.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import (
+    ImuNoise,
+    MotionNoise,
+    MotionSamples,
+    Observations,
+    Sequence,
+    Truth,
+    TwistNoise,
+    TwistSamples,
+)
+
+Fault = Callable[[Sequence, float, int], Sequence]
+
+# The tracks ---------------------------------------------------------------------------------------------------------
+
+
+def dropped_sightings(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
+    """Lose a share of the sightings, each by itself: a matcher that fails now and then, or packets lost on the way."""
+    kept = np.random.default_rng(seed).uniform(size=len(sequence.observations)) >= dose
+    return replace(sequence, observations=sequence.observations.select(kept))
+
+
+def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """See nothing for so many seconds, and new tracks after that: a tunnel, glare, a covered lens."""
+    seen, begin_s, end_s = sequence.observations, *_span_s(sequence, dose, seed)
+    time_s = _frames_s(sequence)[seen.frame]
+    later = time_s >= end_s
+    track_id = np.where(later, seen.track_id + seen.track_id.max(initial=-1) + 1, seen.track_id)
+    rows = (time_s < begin_s) | later
+    return replace(sequence, observations=Observations(seen.frame, track_id, seen.uv_px).select(rows))
+
+
+def outlier_tracks(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequence:
+    """Let a share of the tracks slide over the image by a steady few pixels a frame: points on moving vehicles."""
+    rng, seen = np.random.default_rng(seed), sequence.observations
+    track, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
+    slides = rng.uniform(size=track.size) < dose
+    angle, speed_px = rng.uniform(0.0, 2.0 * np.pi, track.size), rng.uniform(1.0, 6.0, track.size)
+    step_px = (slides * speed_px * np.stack([np.cos(angle), np.sin(angle)])).T
+    age = seen.frame - seen.frame[first][row]
+    return _with_pixels(sequence, seen.uv_px + age[:, None] * step_px[row][:, [0, 0, 1]])
+
+
+def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence:
+    """Keep so many tracks a frame at most, each for as long as it lasts: fog, a bare wall, a cheap tracker."""
+    seen = sequence.observations
+    chance = np.random.default_rng(seed).permutation(int(seen.track_id.max(initial=-1)) + 1)
+    followed, kept = np.empty(0, dtype=np.int64), np.zeros(len(seen), dtype=bool)
+    first = np.searchsorted(seen.frame, np.arange(sequence.frame_count + 1))
+    for begin, end in pairwise(first.tolist()):
+        here = seen.track_id[begin:end]
+        followed = followed[np.isin(followed, here)]
+        others = np.setdiff1d(here, followed)
+        free = max(int(dose) - followed.size, 0)
+        followed = np.concatenate([followed, others[np.argsort(chance[others])][:free]])
+        kept[begin:end] = np.isin(here, followed)
+    return replace(sequence, observations=seen.select(kept))
+
+
+def one_sided_view(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Lose a share of the image, from its left or its right edge on: a dirty lens, a wall on one side only."""
+    seen, side = sequence.observations, np.random.default_rng(seed).choice([-1.0, 1.0])
+    across = side * seen.uv_px[:, 0]
+    hidden = across < np.quantile(across, dose) if len(seen) else np.zeros(0, dtype=bool)
+    return replace(sequence, observations=seen.select(~hidden))
+
+
+def swapped_images(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Exchange left and right in a share of the tracks; all of them where the cameras' cables are exchanged."""
+    seen, struck = sequence.observations, _struck_tracks(sequence, dose, seed)
+    return _with_pixels(sequence, np.where(struck[:, None], seen.uv_px[:, [1, 0, 2]], seen.uv_px))
+
+
+def swapped_coordinates(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Exchange u and v in a share of the tracks: row and column mixed up by who wrote the file.
+
+    uL and uR become the two rows, which differ by their noise alone, and v the mean of the two columns.
+    """
+    seen, struck = sequence.observations, _struck_tracks(sequence, dose, seed)
+    sigma_px = np.sqrt(sequence.rig.cov_uv_px2[2, 2])
+    apart_px = sigma_px * np.random.default_rng(seed).standard_normal(len(seen))
+    v_px = seen.uv_px[:, 2]
+    swapped = np.stack([v_px + apart_px, v_px - apart_px, seen.uv_px[:, :2].mean(axis=1)], axis=1)
+    return _with_pixels(sequence, np.where(struck[:, None], swapped, seen.uv_px))
+
+
+def shifted_pixels(sequence: Sequence, dose: float = 5000.0, seed: int = 0) -> Sequence:
+    """Add so many pixels to every image coordinate: pixels of a crop, of a mosaic, or counted from elsewhere."""
+    return _with_pixels(sequence, sequence.observations.uv_px + dose)
+
+
+def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Sequence:
+    """Put vR so many pixels off vL: a pair that is not rectified, or no longer. v, their mean, is off by half of it."""
+    return _with_pixels(sequence, sequence.observations.uv_px + np.array([0.0, 0.0, 0.5 * dose]))
+
+
+# The motion samples -------------------------------------------------------------------------------------------------
+
+
+def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Lose the motion samples of so many seconds: a full buffer, a loose cable."""
+    begin_s, end_s = _span_s(sequence, dose, seed)
+    t_s = _samples_s(sequence)
+    return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
+
+
+def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
+    """Give one motion sample the value of the dose on one axis: a flipped bit, a failed parse."""
+    rng, values = np.random.default_rng(seed), sequence.motion.values.copy()
+    values[rng.integers(len(values) // 4, 3 * len(values) // 4), rng.integers(6)] = dose
+    return replace(sequence, motion=_with_values(sequence.motion, values))
+
+
+def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
+    """Write NaN for all motion samples and sightings of so many seconds: a driver that gives up and comes back."""
+    begin_s, end_s = _span_s(sequence, dose, seed)
+    values, uv_px = sequence.motion.values.copy(), sequence.observations.uv_px.copy()
+    t_s, seen_s = _samples_s(sequence), _frames_s(sequence)[sequence.observations.frame]
+    values[(t_s > begin_s) & (t_s < end_s)] = np.nan
+    uv_px[(seen_s > begin_s) & (seen_s < end_s)] = np.nan
+    return replace(_with_pixels(sequence, uv_px), motion=_with_values(sequence.motion, values))
+
+
+def linear_unit(sequence: Sequence, dose: float = 3.6, seed: int = 0) -> Sequence:
+    """Multiply velocities, or accelerations, by the dose: 3.6 for km/h, 100 for cm/s, 0.102 for g."""
+    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values * np.repeat([dose, 1.0], 3)))
+
+
+def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0) -> Sequence:
+    """Multiply angular velocities by the dose: 57.3 for degrees."""
+    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values * np.repeat([1.0, dose], 3)))
+
+
+def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
+    """Add a constant of the dose (rad/s), in a direction drawn, to every angular velocity: a warm gyro."""
+    axis = np.random.default_rng(seed).standard_normal(3)
+    bias = np.concatenate([np.zeros(3), dose * axis / np.linalg.norm(axis)])
+    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values + bias))
+
+
+def wrong_noise(sequence: Sequence, dose: float = 2.0, seed: int = 0) -> Sequence:
+    """State the dose times the noise of tracks and motion, which stay as they are: a data sheet of another sensor."""
+    rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 * dose**2)
+    return replace(sequence, rig=rig, noise=_scaled_noise(sequence.noise, dose))
+
+
+# The clocks ---------------------------------------------------------------------------------------------------------
+
+
+def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
+    """Stamp frames so many seconds late: exposure and transfer not accounted for, a clock set by hand.
+
+    Frames that leave the time of the motion samples are cut off. The truth stays on the motion's clock.
+    """
+    late = replace(sequence, frames_t_ns=sequence.frames_t_ns + _ns(dose))
+    motion_t_ns = sequence.motion.t_ns
+    inside = (late.frames_t_ns >= motion_t_ns[0]) & (late.frames_t_ns <= motion_t_ns[-1])
+    return late if inside.all() else _with_first_frames_cut(late, inside)
+
+
+def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
+    """Let frames and samples be stamped on by a clock that has jumped so many seconds: a daemon sets the time."""
+    at_ns = sequence.frames_t_ns[0] + _ns(_span_s(sequence, 0.0, seed)[0])
+    motion, frames_t_ns = sequence.motion, sequence.frames_t_ns
+    frames_t_ns = frames_t_ns + np.where(frames_t_ns > at_ns, _ns(dose), 0)
+    samples_t_ns = motion.t_ns + np.where(motion.t_ns > at_ns, _ns(dose), 0)
+    return replace(sequence, frames_t_ns=frames_t_ns, motion=replace(motion, t_ns=samples_t_ns))
+
+
+def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
+    """Stop for so many seconds at a frame and go on from there: a red light. For twists, whose motion may just stop.
+
+    The tracks of that frame are seen again in every one, with the noise of the rig. Raises DataError where the
+    motion is an IMU's: braking would need accelerations nobody measured; simulate a scene that halts.
+    """
+    motion, noise = sequence.motion, sequence.noise
+    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
+        raise DataError(
+            f"{sequence.name}: a standstill can be planted between twists only; simulate a scene that halts"
+        )
+    rng, period_ns = np.random.default_rng(seed), int(np.median(np.diff(sequence.frames_t_ns)))
+    halt = int(np.searchsorted(_frames_s(sequence), _span_s(sequence, 0.0, seed)[0]))
+    pause = _Pause(sequence.frames_t_ns[halt], period_ns, round(_ns(dose) / period_ns))
+    t_ns, rows = pause.inserted(motion.t_ns)
+    density = np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
+    still = rng.standard_normal((t_ns.size, 6)) * density / np.sqrt(period_ns / NS_PER_S)
+    values = np.where(pause.within(t_ns)[:, None], still, motion.values[rows])
+    return replace(
+        sequence,
+        frames_t_ns=pause.inserted(sequence.frames_t_ns)[0],
+        observations=_seen_standing(sequence, halt, pause.stamps, rng),
+        motion=replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:]),
+        truth=None if sequence.truth is None else _truth_standing(sequence.truth, pause),
+    )
+
+
+class _Pause(NamedTuple):
+    """So many stamps, a period apart, put in before the stamp ``at_ns``; what follows is as much later."""
+
+    at_ns: int
+    period_ns: int
+    stamps: int
+
+    def inserted(self, t_ns: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the stamps (N + stamps,) and the row of ``t_ns`` (N,) that each one repeats."""
+        at = int(np.searchsorted(t_ns, self.at_ns))
+        rows = np.concatenate([np.arange(at), np.full(self.stamps, min(at, t_ns.size - 1)), np.arange(at, t_ns.size)])
+        extra_ns = self.at_ns + self.period_ns * np.arange(self.stamps)
+        return np.concatenate([t_ns[:at], extra_ns, t_ns[at:] + self.stamps * self.period_ns]), rows
+
+    def within(self, t_ns: IntArray) -> BoolArray:
+        """Say which stamps (N,) are of the pause."""
+        return np.asarray((t_ns >= self.at_ns) & (t_ns < self.at_ns + self.stamps * self.period_ns))
+
+
+def _seen_standing(sequence: Sequence, halt: int, count: int, rng: np.random.Generator) -> Observations:
+    seen = sequence.observations
+    here = np.flatnonzero(seen.frame == halt)
+    standing = seen.select(np.tile(here, count))
+    noise_px = rng.standard_normal((len(standing), 3)) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T
+    return Observations.sorted(
+        np.concatenate([seen.frame + count * (seen.frame >= halt), np.repeat(halt + np.arange(count), here.size)]),
+        np.concatenate([seen.track_id, standing.track_id]),
+        np.concatenate([seen.uv_px, standing.uv_px + noise_px]),
+    )
+
+
+def _truth_standing(truth: Truth, pause: _Pause) -> Truth:
+    t_ns, rows = pause.inserted(truth.t_ns)
+    moves = ~pause.within(t_ns)[:, None]
+    return replace(
+        truth,
+        t_ns=t_ns,
+        T_world_imu=truth.T_world_imu[rows],
+        v_world=None if truth.v_world is None else truth.v_world[rows] * moves,
+        bias=None if truth.bias is None else truth.bias[rows],
+    )
+
+
+# The calibration and the truth --------------------------------------------------------------------------------------
+
+
+def zero_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
+    """Give every intrinsic the value of the dose: a K nobody filled in."""
+    return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=dose, cy_px=dose)
+
+
+def identity_intrinsics(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Give the focal lengths the value of the dose and put the centre to zero: K left at the identity."""
+    return _with_rig(sequence, fx_px=dose, fy_px=dose, cx_px=0.0, cy_px=0.0)
+
+
+def transposed_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
+    """Put the principal point to the dose: what a transposed K, read by its places, says."""
+    return _with_rig(sequence, cx_px=dose, cy_px=dose)
+
+
+def negative_focal(sequence: Sequence, dose: float = -1.0, seed: int = 0) -> Sequence:
+    """Multiply the focal lengths by the dose: axes of a camera that looks backwards."""
+    return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
+
+
+def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequence:
+    """Give the images a skew of the dose (px), as a K may state one that no rectified pair has."""
+    rig, uv_px = sequence.rig, sequence.observations.uv_px
+    shift_px = dose * (uv_px[:, 2:] - rig.cy_px) / rig.fy_px
+    return _with_pixels(sequence, uv_px + shift_px * np.array([1.0, 1.0, 0.0]))
+
+
+def baseline_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
+    """Multiply the baseline by the dose: 1000 for millimetres."""
+    return _with_rig(sequence, baseline_m=dose * sequence.rig.baseline_m)
+
+
+def extrinsic_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
+    """Multiply the camera's position in the IMU frame by the dose: 1000 for millimetres."""
+    T_imu_cam = sequence.rig.T_imu_cam
+    return _with_rig(sequence, T_imu_cam=se3(T_imu_cam[:3, :3], dose * T_imu_cam[:3, 3]))
+
+
+def inverted_extrinsic(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Invert the extrinsic: IMU to camera written where camera to IMU is read. A dose of 0 leaves it."""
+    T_imu_cam = sequence.rig.T_imu_cam
+    return _with_rig(sequence, T_imu_cam=se3_inverse(T_imu_cam)) if dose else sequence
+
+
+def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
+    """Turn the camera in its mount by the dose (rad) about an axis drawn: a knock, a calibration of another day."""
+    axis = np.random.default_rng(seed).standard_normal(3)
+    T_imu_cam = sequence.rig.T_imu_cam
+    return _with_rig(sequence, T_imu_cam=T_imu_cam @ se3(so3_exp(dose * axis / np.linalg.norm(axis)), np.zeros(3)))
+
+
+def truth_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
+    """Multiply the true positions and velocities by the dose: 1000 for millimetres."""
+    truth = sequence.truth
+    if truth is None:
+        raise DataError(f"{sequence.name}: no truth, whose unit could be wrong")
+    T_world_imu = se3(truth.T_world_imu[:, :3, :3], dose * truth.T_world_imu[:, :3, 3])
+    v_world = None if truth.v_world is None else dose * truth.v_world
+    return replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
+
+
+# What they share ----------------------------------------------------------------------------------------------------
+
+
+def _span_s(sequence: Sequence, length_s: float, seed: int) -> tuple[float, float]:
+    """Return begin and end (s from the first frame) of a span in the middle half, where one of that length fits."""
+    begin_s = sequence.duration_s * np.random.default_rng(seed).uniform(0.3, 0.6)
+    begin_s = max(min(begin_s, 0.9 * sequence.duration_s - length_s), 0.0)
+    return begin_s, begin_s + length_s
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * NS_PER_S)
+
+
+def _frames_s(sequence: Sequence) -> Array:
+    return np.asarray((sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
+
+
+def _samples_s(sequence: Sequence) -> Array:
+    return np.asarray((sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
+
+
+def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:
+    """Say of each sighting (N,) whether its track is of the share that is struck."""
+    track, row = np.unique(sequence.observations.track_id, return_inverse=True)
+    return np.asarray((np.random.default_rng(seed).uniform(size=track.size) < share)[row])
+
+
+def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+
+
+def _with_values(motion: MotionSamples, values: Array) -> MotionSamples:
+    """Return the motion with other values (S, 6)."""
+    linear, angular = values[:, :3], values[:, 3:]
+    if isinstance(motion, TwistSamples):
+        return replace(motion, v_mps=linear, w_radps=angular)
+    return replace(motion, accel_mps2=linear, gyro_radps=angular)
+
+
+def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
+    arrays: dict[str, Any] = {k: x[kept] for k, x in vars(sequence.motion).items() if isinstance(x, np.ndarray)}
+    return replace(sequence, motion=replace(sequence.motion, **arrays))
+
+
+def _with_first_frames_cut(sequence: Sequence, inside: BoolArray) -> Sequence:
+    """Return the sequence with the frames of a mask (K,) that is one stretch; the prior goes with the first one."""
+    seen, first = sequence.observations, int(np.argmax(inside))
+    rows = inside[seen.frame]
+    kept = Observations(seen.frame[rows] - first, seen.track_id[rows], seen.uv_px[rows])
+    prior = sequence.prior if first == 0 else None
+    return replace(sequence, frames_t_ns=sequence.frames_t_ns[inside], observations=kept, prior=prior)
+
+
+def _with_rig(sequence: Sequence, **fields: Any) -> Sequence:
+    return replace(sequence, rig=replace(sequence.rig, **fields))
+
+
+def _scaled_noise(noise: MotionNoise, factor: float) -> MotionNoise:
+    """Return the noise with its white densities scaled; random walks stay."""
+    if isinstance(noise, ImuNoise):
+        gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
+        return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
+    velocity = factor * noise.velocity_noise_density
+    return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)
