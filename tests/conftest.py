@@ -19,7 +19,7 @@ from toolkit.estimate import Run
 from toolkit.estimator import find
 from toolkit.experiment import pipeline, recording, workers
 from toolkit.experiment.recording import Recording
-from toolkit.progress import SILENT
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Prior, Sequence
 from toolkit.simulation import SCENARIOS
 
@@ -112,10 +112,10 @@ def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], se
 def audited_once() -> Iterator[None]:
     """Simulate and audit each built-in recording once for all tests of a worker that run a few frames of it."""
 
-    def remembered(asked: Recording) -> Audit:
+    def remembered(asked: Recording, progress: Progress = SILENT) -> Audit:
         if asked.truth is None and asked.duration_s is None and asked.source in SCENARIOS:
             return _audited(recording.audit, asked.source, asked.keep, asked.seed)
-        return _audited_recording(asked)
+        return _audited_recording(asked, progress)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recording, "audited_recording", remembered)

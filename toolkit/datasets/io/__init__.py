@@ -1,5 +1,5 @@
 """Parts of the recording formats; no file here is a format.
 
 Read ``fields`` (named arrays with their checks) and ``tables`` (CSV) first; ``npz_archive`` streams large arrays,
-``opencv_yaml`` reads calibrations, ``truth_file`` ground truth, ``euroc_*`` and ``tracks_along`` belong to EuRoC.
+``yaml_fields`` and ``cameras`` read calibrations, ``image_pairs`` lists images, ``truth_file`` ground truth, ``euroc_*`` and ``tracks_along`` belong to EuRoC.
 """
