@@ -14,7 +14,7 @@ from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence
+from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence, TwistChangeNoise
 from toolkit.settings import DEFAULTS, Frontend, Noise
 from toolkit.simulation import SCENARIOS, simulate
 
@@ -115,5 +115,8 @@ def _scaled(noise: MotionNoise, factor: float) -> MotionNoise:
     if isinstance(noise, ImuNoise):
         gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
         return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
+    if isinstance(noise, TwistChangeNoise):
+        changes = (factor * noise.velocity_change_density, factor * noise.turn_change_density)
+        return TwistChangeNoise(*changes)
     velocity = factor * noise.velocity_noise_density
     return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)

@@ -1,5 +1,6 @@
-"""Which image files belong together: listed in the tables of an ASL folder, or paired by their order."""
+"""Which image files belong together: listed in the tables of an ASL folder, or paired by the numbers of their names."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,6 +57,29 @@ def pairs_of_asl(mav0: Path) -> Listed:
         if j >= 0
     )
     return Listed(pairs, t_ns.size, tuple(remarks))
+
+
+def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
+    """Pair images whose names are the same number; ``t_ns`` has the stamp of each number.
+
+    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said.
+    """
+    numbers = {int(path.stem): path.suffix for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    names = {int(path.stem): path.stem for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
+    remarks = []
+    if len(stamped) < len(numbers):
+        remarks.append(f"{len(numbers) - len(stamped)} images have no stamp and are left out")
+    if [number for _, number in stamped] != sorted(number for _, number in stamped):
+        remarks.append("the stamps of the images were out of order and have been sorted")
+    pairs: list[StampedPair] = []
+    for stamp, number in stamped:
+        if pairs and pairs[-1].t_ns == stamp:
+            remarks.append(f"image {names[number]} has the stamp of another and is left out")
+            continue
+        name = f"{names[number]}{numbers[number]}"
+        pairs.append(StampedPair(stamp, left / name, right / name))
+    return Listed(tuple(pairs), len(numbers), tuple(remarks))
 
 
 def rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
