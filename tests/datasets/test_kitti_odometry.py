@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +14,8 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.sequence import NoSamples, TwistChangeNoise
 from toolkit.settings import Frontend
 
-FRAMES, SIZE, FOCAL_PX, BASELINE_M, STEP_M = 8, (320, 200), 250.0, 0.4, 0.05
+# Of the rendered drive, as in conftest.
+FRAMES, FOCAL_PX, BASELINE_M, STEP_M = 8, 250.0, 0.4, 0.05
 
 
 @pytest.fixture(autouse=True)
@@ -23,35 +23,9 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
 
 
-@pytest.fixture(scope="module")
-def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a drive towards a textured wall 8 m ahead: its images are the texture, ever larger."""
-    root = tmp_path_factory.mktemp("kitti") / "drive"
-    rng = np.random.default_rng(2)
-    texture = cv2.GaussianBlur(rng.uniform(0, 255, (900, 1200)), (0, 0), 2.5) * 4.0 - 382.0
-    texture = np.clip(texture, 0, 255).astype(np.float32)
-    poses = []
-    for k in range(FRAMES):
-        depth = 8.0 - STEP_M * k
-        for side, folder in enumerate(("image_0", "image_1")):
-            (root / folder).mkdir(parents=True, exist_ok=True)
-            u, v = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
-            x = (u - 160.0) / FOCAL_PX * depth + side * BASELINE_M
-            y = (v - 100.0) / FOCAL_PX * depth
-            columns, rows = (x * 80.0 + 600.0).astype(np.float32), (y * 80.0 + 450.0).astype(np.float32)
-            image = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR) + rng.normal(0.0, 1.0, SIZE[::-1])
-            cv2.imwrite(str(root / folder / f"{k:06d}.png"), np.clip(image, 0, 255).astype(np.uint8))
-        poses.append(f"1 0 0 0 0 1 0 0 0 0 1 {STEP_M * k:.6f}\n")
-    projection = [f"P{i}: {FOCAL_PX} 0 160 {-i * FOCAL_PX * BASELINE_M} 0 {FOCAL_PX} 100 0 0 0 1 0\n" for i in (0, 1)]
-    (root / "calib.txt").write_text("".join(projection) + "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
-    (root / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(FRAMES)))
-    (root / "poses.txt").write_text("".join(poses))
-    return root
-
-
 @pytest.fixture
-def drive(template: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(template, tmp_path / "drive"))
+def drive(kitti_drive: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(kitti_drive, tmp_path / "drive"))
 
 
 def test_a_folder_is_recognised_by_its_images(drive: Path) -> None:
