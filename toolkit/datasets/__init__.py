@@ -20,6 +20,7 @@ import numpy as np
 from toolkit.discovery import MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
+from toolkit.frontend import ImageRecording
 from toolkit.inputs import is_regular, open_input, unreadable
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, check_stated
@@ -71,6 +72,9 @@ class HasImages(Protocol):
 
     def load_from_images(self, path: Path, frontend: Frontend, progress: Progress) -> Sequence:
         """Read the recording with tracks made of its images; raise DataError where it cannot be."""
+
+    def images_of(self, path: Path) -> ImageRecording:
+        """Return the image pairs that tracks are made of and their cameras; raise DataError where there are none."""
 
 
 @runtime_checkable
@@ -166,6 +170,18 @@ def _of_images(reader: RecordingFormat, path: Path, frontend: Frontend) -> TypeG
             raise DataError(f"{path}: its format has tracks and no images; leave --tracks images out")
         return False
     return reader.uses_images(path, frontend.tracks)
+
+
+def load_images(source: str) -> ImageRecording:
+    """Return the image pairs of a recording and their cameras.
+
+    Raises DataError where the source is no recording with images, or they cannot be used.
+    """
+    path = Path(source).expanduser()
+    reader = None if source in built_ins() else _reader_of(path, source)
+    if not isinstance(reader, HasImages):
+        raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
+    return reader.images_of(path)
 
 
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:

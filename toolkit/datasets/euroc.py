@@ -29,7 +29,7 @@ from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_of_asl, r
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.errors import DataError
-from toolkit.frontend import rectified, track_images
+from toolkit.frontend import ImageRecording, rectified, track_images
 from toolkit.geometry import Array, IntArray, interpolate_poses
 from toolkit.inputs import is_regular
 from toolkit.progress import Progress
@@ -86,33 +86,34 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
     return _share_with_images(layout.mav0, layout.stamps) >= _NEARLY_ALL
 
 
+def images_of(path: Path) -> ImageRecording:
+    """Return the image pairs within the IMU's time and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    mav0 = _with_images(layout)
+    return _filmed(layout, mav0, _imu(layout), read_calibration(layout.root, mav0))[0]
+
+
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
     """Read IMU and calibration, and make the tracks of the image pairs within the IMU's time; a truth may be missing.
 
     Raises DataError where a part is missing or damaged, or the images cannot be used.
     """
     layout = _whole(path)
-    if layout.mav0 is None:
-        raise DataError(f"{path}: a lean recording has no images; leave --tracks images out")
-    imu, calibration = _imu(layout), read_calibration(layout.root, layout.mav0)
-    if calibration.cameras is None:
-        raise DataError(f"{path}: the calibration lacks distortion_model or intrinsics of a camera; add them")
-    pair = rectified(*calibration.cameras, calibration.T_right_left)
-    listed = pairs_of_asl(layout.mav0)
-    within = [p for p in listed.pairs if imu.t_ns.min() <= p.t_ns <= imu.t_ns.max()]
-    check_frame_count(layout.root, len(within))
-    tracks = track_images(within, pair, frontend, progress)
+    mav0 = _with_images(layout)
+    imu, calibration = _imu(layout), read_calibration(layout.root, mav0)
+    filmed, remarks = _filmed(layout, mav0, imu, calibration)
+    tracks = track_images(filmed.pairs, filmed.rig, frontend, progress)
     check_frame_count(layout.root, tracks.t_ns.size)
-    choice = find_truth(layout.root, layout.mav0, imu)
+    choice = find_truth(layout.root, mav0, imu)
     facts = (
-        *facts_of(tracks, len(within)),
-        *listed.remarks,
+        *facts_of(tracks, len(filmed.pairs)),
+        *remarks,
         *(() if choice is None else (choice.reason,)),
         *(calibration.source, calibration.noise_source),
     )
     return Sequence(
         name=layout.root.name,
-        rig=rig_of(pair, calibration.T_imu_left),
+        rig=rig_of(filmed.rig, calibration.T_imu_left),
         noise=calibration.noise,
         frames_t_ns=tracks.t_ns,
         observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
@@ -159,6 +160,24 @@ def _whole(path: Path) -> _Layout:
 def _imu(layout: _Layout) -> ImuSamples:
     table = read_table(layout.imu, _ACCEL + _GYRO)
     return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
+
+
+def _with_images(layout: _Layout) -> Path:
+    if layout.mav0 is None:
+        raise DataError(f"{layout.root}: a lean recording has no images; its tracks can be simulated")
+    return layout.mav0
+
+
+def _filmed(
+    layout: _Layout, mav0: Path, imu: ImuSamples, calibration: Calibration
+) -> tuple[ImageRecording, tuple[str, ...]]:
+    """Return the pairs within the IMU's time with their cameras, and what had to be put right."""
+    if calibration.cameras is None:
+        raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
+    listed = pairs_of_asl(mav0)
+    within = tuple(p for p in listed.pairs if imu.t_ns.min() <= p.t_ns <= imu.t_ns.max())
+    check_frame_count(layout.root, len(within))
+    return ImageRecording(within, rectified(*calibration.cameras, calibration.T_right_left)), listed.remarks
 
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:

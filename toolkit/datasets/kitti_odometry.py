@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
-from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, pairs_by_name, rig_of
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
-from toolkit.frontend import already_rectified, size_of, track_images
+from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.inputs import is_regular, read_text_input
 from toolkit.models.noise import unmeasured_motion
@@ -59,26 +59,24 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
     return True
 
 
+def images_of(path: Path) -> ImageRecording:
+    """Return the image pairs and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    return ImageRecording(_listed(layout, _stamps(layout)[0]).pairs, _pair(layout))
+
+
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
     """Read calibration, stamps and poses, and make the tracks of the images.
 
     Raises DataError where a part is missing or damaged, or the images cannot be used.
     """
-    layout = _layout(path)
-    if layout is None:
-        raise DataError(f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images")
-    left, right = _projections(layout)
-    size_px = size_of(_first_readable(layout))
-    baseline_m = (left[0, 3] - right[0, 3]) / left[0, 0]
-    if not baseline_m > 0.0:
-        raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
-    fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
-    pair = already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
+    layout = _whole(path)
+    pair = _pair(layout)
     stamps, how = _stamps(layout)
-    listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
-    check_frame_count(layout.root, len(listed.pairs))
+    listed = _listed(layout, stamps)
     tracks = track_images(listed.pairs, pair, frontend, progress)
     check_frame_count(layout.root, tracks.t_ns.size)
+    left = _projections(layout)[0]
     T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
     truth = _truth(layout, stamps, tracks.t_ns)
     facts = (NO_MOTION, *facts_of(tracks, len(listed.pairs)), *listed.remarks, *how)
@@ -92,6 +90,29 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         provenance=Provenance("kitti-odometry", f"{path}: stereo tracks from the images", facts),
         truth=truth,
     )
+
+
+def _whole(path: Path) -> _Layout:
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images")
+    return layout
+
+
+def _pair(layout: _Layout) -> RectifiedPair:
+    left, right = _projections(layout)
+    baseline_m = (left[0, 3] - right[0, 3]) / left[0, 0]
+    if not baseline_m > 0.0:
+        raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
+    fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
+    size_px = size_of(_first_readable(layout))
+    return already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
+
+
+def _listed(layout: _Layout, stamps: IntArray) -> Listed:
+    listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
+    check_frame_count(layout.root, len(listed.pairs))
+    return listed
 
 
 def _layout(path: Path) -> _Layout | None:

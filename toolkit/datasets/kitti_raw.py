@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, observations
-from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, pairs_by_name, rig_of
 from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
 from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
-from toolkit.frontend import size_of, track_images
+from toolkit.frontend import ImageRecording, size_of, track_images
 from toolkit.models.noise import twist_noise, unmeasured_motion
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
@@ -71,18 +71,19 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
     return True
 
 
+def images_of(path: Path) -> ImageRecording:
+    """Return the image pairs and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    return ImageRecording(_listed(layout).pairs, _mounted(layout).pair)
+
+
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
     """Read calibration, stamps and packets, and make the tracks of the images.
 
     Raises DataError where a part is missing or damaged, or the images cannot be used.
     """
-    layout = _layout(path)
-    if layout is None:
-        raise DataError(f"{path}: no image_00/data and image_01/data, or image_02 and image_03, with images")
-    mounted = _mounted(layout)
-    stamps = read_stamps(layout.images(0).parent / "timestamps.txt")
-    listed = pairs_by_name(layout.images(0), layout.images(1), stamps)
-    check_frame_count(layout.root, len(listed.pairs))
+    layout = _whole(path)
+    mounted, listed = _mounted(layout), _listed(layout)
     tracks = track_images(listed.pairs, mounted.pair, frontend, progress)
     check_frame_count(layout.root, tracks.t_ns.size)
     packets = read_packets(layout.root / "oxts")
@@ -107,6 +108,20 @@ def _layout(path: Path) -> _Layout | None:
         if images_in(layout.images(0)) or images_in(layout.images(1)):
             return layout
     return None
+
+
+def _whole(path: Path) -> _Layout:
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(f"{path}: no image_00/data and image_01/data, or image_02 and image_03, with images")
+    return layout
+
+
+def _listed(layout: _Layout) -> Listed:
+    stamps = read_stamps(layout.images(0).parent / "timestamps.txt")
+    listed = pairs_by_name(layout.images(0), layout.images(1), stamps)
+    check_frame_count(layout.root, len(listed.pairs))
+    return listed
 
 
 def _mounted(layout: _Layout) -> PairMounting:

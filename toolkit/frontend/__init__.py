@@ -5,10 +5,11 @@ Read ``tracker`` first: it is the algorithm. ``tracking`` runs it over a recordi
 
 from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified
 from toolkit.frontend.images import StampedPair, size_of
-from toolkit.frontend.tracking import ImageTracks, track_images
+from toolkit.frontend.tracking import ImageRecording, ImageTracks, track_images
 
 __all__ = [
     "Camera",
+    "ImageRecording",
     "ImageTracks",
     "Pinhole",
     "RectifiedPair",

@@ -26,6 +26,14 @@ _MISPAIRED = "left and right image are not of the same instant"
 
 
 @dataclass(frozen=True, eq=False)
+class ImageRecording:
+    """The image pairs of a recording in order of time, and the pair of cameras that took them."""
+
+    pairs: tuple[StampedPair, ...]
+    rig: RectifiedPair
+
+
+@dataclass(frozen=True, eq=False)
 class ImageTracks:
     """Tracks of the usable pairs: stamps (K,), sightings as frame (N,), id (N,), corners (N, 4) px, and what was not.
 
