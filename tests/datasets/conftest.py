@@ -5,15 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from toolkit.errors import DataError
 
 Refused = Callable[..., None]
-# Of the rendered drive: images, (width, height) px, and how far it goes from one to the next.
-KITTI_FRAMES, KITTI_SIZE, KITTI_FOCAL_PX, KITTI_BASELINE_M, KITTI_STEP_M = 8, (320, 200), 250.0, 0.4, 0.05
 
 
 @pytest.fixture
@@ -76,35 +73,6 @@ def openvins(tmp_path: Path) -> Path:
     truth = [f"{0.1 * k + 0.1:.1f},{k},1,0,0,0,1,2,3,4,5,6,.1,.2,.3,.4,.5,.6" for k in range(4)]
     (folder / "truth_cam.csv").write_text("\n".join([columns, *truth]) + "\n")
     return folder
-
-
-@pytest.fixture(scope="session")
-def kitti_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a drive towards a textured wall 8 m ahead: its images are the texture, ever larger."""
-    root = tmp_path_factory.mktemp("kitti") / "drive"
-    rng = np.random.default_rng(2)
-    texture = cv2.GaussianBlur(rng.uniform(0, 255, (900, 1200)), (0, 0), 2.5) * 4.0 - 382.0
-    texture = np.clip(texture, 0, 255).astype(np.float32)
-    poses = []
-    for k in range(KITTI_FRAMES):
-        depth = 8.0 - KITTI_STEP_M * k
-        for side, folder in enumerate(("image_0", "image_1")):
-            (root / folder).mkdir(parents=True, exist_ok=True)
-            u, v = np.meshgrid(np.arange(KITTI_SIZE[0], dtype=np.float32), np.arange(KITTI_SIZE[1], dtype=np.float32))
-            x = (u - 160.0) / KITTI_FOCAL_PX * depth + side * KITTI_BASELINE_M
-            y = (v - 100.0) / KITTI_FOCAL_PX * depth
-            columns, rows = (x * 80.0 + 600.0).astype(np.float32), (y * 80.0 + 450.0).astype(np.float32)
-            image = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR) + rng.normal(0.0, 1.0, KITTI_SIZE[::-1])
-            cv2.imwrite(str(root / folder / f"{k:06d}.png"), np.clip(image, 0, 255).astype(np.uint8))
-        poses.append(f"1 0 0 0 0 1 0 0 0 0 1 {KITTI_STEP_M * k:.6f}\n")
-    projection = [
-        f"P{i}: {KITTI_FOCAL_PX} 0 160 {-i * KITTI_FOCAL_PX * KITTI_BASELINE_M} 0 {KITTI_FOCAL_PX} 100 0 0 0 1 0\n"
-        for i in (0, 1)
-    ]
-    (root / "calib.txt").write_text("".join(projection) + "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
-    (root / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(KITTI_FRAMES)))
-    (root / "poses.txt").write_text("".join(poses))
-    return root
 
 
 @pytest.fixture

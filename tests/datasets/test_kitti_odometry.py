@@ -14,13 +14,10 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.sequence import NoSamples, TwistChangeNoise
 from toolkit.settings import Frontend
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 # Of the rendered drive, as in conftest.
 FRAMES, FOCAL_PX, BASELINE_M, STEP_M = 8, 250.0, 0.4, 0.05
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture

@@ -14,16 +14,13 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
 from toolkit.sequence import ImuSamples, TwistSamples
 
+pytestmark = pytest.mark.usefixtures("own_cache")
+
 FRAMES, STEP_M, SPEED_MPS = 8, 0.05, 0.5
 DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"
 # The camera looks along the IMU's x and stands 0.3 m before and 0.1 m above it.
 R_CAM_IMU = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 T_CAM_IMU = R_CAM_IMU @ -np.array([0.3, 0.0, 0.1])
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
 
 
 def numbers(values: Any) -> str:

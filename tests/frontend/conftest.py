@@ -162,10 +162,8 @@ def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pa
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep tracks where no other test finds them."""
-    monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+def _own_cache(own_cache: Path) -> None:
+    """Have no test find what another has kept."""
 
 
 def write_images(folder: Path, images: list[Image], names: list[str]) -> None:

@@ -55,7 +55,7 @@ class Patches:
         diagonal = np.einsum("nii->ni", normal)
         diagonal *= 1.0 + _DAMPING
         diagonal += 1e-12
-        solvers = np.asarray(np.linalg.solve(normal, jacobian), dtype=np.float64)
+        solvers = np.asarray(np.linalg.inv(normal) @ jacobian, dtype=np.float64)
         return cls(values, solvers, warps)
 
     def select(self, rows: BoolArray | IntArray) -> "Patches":

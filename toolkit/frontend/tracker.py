@@ -118,12 +118,16 @@ class Tracker:
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
         """Return the tracks found in the right image, near where they are in ``right_px``."""
-        right_px, found = self._across.follow(left, right, tracks.left_px, tracks.right_px)
-        disparity_px = tracks.left_px[:, 0] - right_px[:, 0]
-        found &= np.abs(tracks.left_px[:, 1] - right_px[:, 1]) < self.settings.epipolar_px
-        found &= (disparity_px > _LEAST_DISPARITY_PX) & (disparity_px < self._most_disparity_px)
-        found &= self._inside(right_px, 1)
+        right_px, found = self._found_right(left, right, tracks.left_px, tracks.right_px)
         return _Tracks(tracks.ids, tracks.left_px, right_px, tracks.patches).select(found)
+
+    def _found_right(self, left: Image, right: Image, left_px: Array, near_px: Array) -> tuple[Array, BoolArray]:
+        """Return where points (N, 2) of the left image are in the right one, sought near (N, 2), and if found (N,)."""
+        right_px, found = self._across.follow(left, right, left_px, near_px)
+        disparity_px = left_px[:, 0] - right_px[:, 0]
+        found &= np.abs(left_px[:, 1] - right_px[:, 1]) < self.settings.epipolar_px
+        found &= (disparity_px > _LEAST_DISPARITY_PX) & (disparity_px < self._most_disparity_px)
+        return right_px, found & self._inside(right_px, 1)
 
     @property
     def _most_disparity_px(self) -> float:
@@ -139,15 +143,14 @@ class Tracker:
         places_px = corners(left, free, present, self.settings.spacing_px, _CANDIDATES * wanted)
         self.tried += len(places_px)
         near_px, found = match_rows(halved(left), halved(right), places_px, self._most_disparity_px)
-        ids = np.arange(len(places_px))
-        matched = _Tracks(ids, places_px, near_px, Patches.taken(floats, places_px)).select(found)
-        paired = self._paired(left, right, matched)
-        hopeless = np.setdiff1d(ids, paired.ids)
-        self._hopeless = [places_px[hopeless], *self._hopeless[: _COOL_DOWN_FRAMES - 1]]
-        begun = paired.select(np.arange(min(wanted, len(paired.ids))))
-        new_ids = self._next_id + np.arange(len(begun.ids))
-        self._next_id += len(begun.ids)
-        return _Tracks(new_ids, begun.left_px, begun.right_px, begun.patches)
+        rows = np.flatnonzero(found)
+        right_px, paired = self._found_right(left, right, places_px[rows], near_px[rows])
+        found[rows] = paired
+        self._hopeless = [places_px[~found], *self._hopeless[: _COOL_DOWN_FRAMES - 1]]
+        begun_px, right_px = places_px[found][:wanted], right_px[paired][:wanted]
+        new_ids = self._next_id + np.arange(len(begun_px))
+        self._next_id += len(begun_px)
+        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px))
 
     def _free(self, taken_px: Array) -> BoolArray:
         """Return for each pixel whether a track may begin there."""
