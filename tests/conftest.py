@@ -133,6 +133,17 @@ def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "usable_cpus", lambda: 1)
 
 
+@pytest.fixture(scope="session")
+def _kept_tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def shared_cache(_kept_tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep tracks made of images for other tests on the same images; what is kept is found by its content."""
+    monkeypatch.setenv("VISLAM_CACHE", str(_kept_tracks))
+
+
 @pytest.fixture
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep tracks made of images where no other test finds them."""

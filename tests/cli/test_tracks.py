@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-pytestmark = pytest.mark.usefixtures("own_cache")
+pytestmark = pytest.mark.usefixtures("shared_cache")
 Vislam = Callable[..., int]
 
 

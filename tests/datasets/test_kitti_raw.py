@@ -14,7 +14,7 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
 from toolkit.sequence import ImuSamples, TwistSamples
 
-pytestmark = pytest.mark.usefixtures("own_cache")
+pytestmark = pytest.mark.usefixtures("shared_cache")
 
 FRAMES, STEP_M, SPEED_MPS = 8, 0.05, 0.5
 DRIVE = "2011_09_26/2011_09_26_drive_0001_sync"

@@ -85,7 +85,7 @@ def along(k: int, speed_m: float = 0.015) -> Array:
 
 
 Pair = tuple[Image, Image]
-FRAMES = 12
+FRAMES = 10
 START_NS, PERIOD_NS = 1_403_715_273_262_142_976, 50_000_000
 # The IMU looks ahead with its x, to the left with its y; the camera stands a little off it.
 T_IMU_LEFT = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.05, 0.06, 0.01]))
@@ -162,8 +162,8 @@ def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pa
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(own_cache: Path) -> None:
-    """Have no test find what another has kept."""
+def _shared_cache(shared_cache: None) -> None:
+    """Leave the user's own cache alone."""
 
 
 def write_images(folder: Path, images: list[Image], names: list[str]) -> None:
@@ -198,9 +198,9 @@ def imu_text(frames: int) -> str:
     return f"#timestamp [ns],{columns}\n" + "".join(f"{t},{','.join(f'{x:.9g}' for x in row)}\n" for t, row in rows)
 
 
-def positions(frames: int) -> Array:
-    """Return where the IMU is (N, 3) m at each frame, in a world whose axes are the IMU's at the first."""
-    moved = -np.stack([along(k)[:3, 3] for k in range(frames)])
+def positions(frames: range) -> Array:
+    """Return where the IMU is (N, 3) m at frames, in a world whose axes are the IMU's at the first."""
+    moved = -np.stack([along(k)[:3, 3] for k in frames])
     return np.asarray(moved @ T_IMU_LEFT[:3, :3].T)
 
 
@@ -221,7 +221,9 @@ def asl_template(raw: dict[str, list[Pair]], tmp_path_factory: pytest.TempPathFa
     densities = "gyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-05\n"
     densities += "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
     (root / "mav0/imu0/sensor.yaml").write_text(camera_yaml(PLAIN, np.eye(4)) + densities)
-    rows = zip(stamps, positions(FRAMES).tolist(), strict=True)
+    # Seconds as doubles are off by 1e-7: the truth begins before the first frame and ends behind the last.
+    frames = range(-1, FRAMES + 1)
+    rows = zip((START_NS + PERIOD_NS * k for k in frames), positions(frames).tolist(), strict=True)
     lines = [f"{t / 1e9:.9f} {x:.9f} {y:.9f} {z:.9f} 0 0 0 1\n" for t, (x, y, z) in rows]
     (root / "truth.tum").write_text("".join(lines))
     return root

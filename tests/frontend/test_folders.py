@@ -20,7 +20,7 @@ from toolkit.geometry import se3_inverse
 from toolkit.sequence import Sequence
 from toolkit.settings import Frontend
 
-FRAMES = 12
+FRAMES = 10
 IMAGES = "mav0/cam{}/data"
 
 
@@ -76,12 +76,15 @@ def test_an_estimator_finds_the_motion_in_the_images(asl: Path, run_estimator: C
     assert truth is not None
     moved = np.linalg.norm(found - found[0], axis=1)
     true = np.linalg.norm(truth.T_world_imu[:, :3, 3] - truth.T_world_imu[0, :3, 3], axis=1)
-    # 0.18 m of motion, seen at 1.6 to 3 m
+    # 0.15 m of motion, seen at 1.6 to 3 m
     np.testing.assert_allclose(moved, true, atol=0.005)
 
 
-def test_a_second_reading_tracks_nothing_and_is_the_same(asl: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_reading_tracks_nothing_and_is_the_same(
+    asl: Path, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = load_sequence(str(asl)).content_hash()
+    assert len(list((own_cache / "tracks").iterdir())) == 1
     monkeypatch.setattr(tracking, "Tracker", None)
     assert load_sequence(str(asl)).content_hash() == first
 
@@ -290,10 +293,10 @@ def test_the_first_seconds_of_a_real_flight_have_tracks_enough(real: Callable[[s
     calibration = read_calibration(root, root / "mav0")
     assert calibration.cameras is not None
     rig = rectified(*calibration.cameras, calibration.T_right_left)
-    tracks = track_images(pairs_of_asl(root / "mav0").pairs[:30], rig, Frontend())
+    tracks = track_images(pairs_of_asl(root / "mav0").pairs[:12], rig, Frontend())
     a_frame = np.bincount(tracks.frame)
     assert tracks.skipped == ()
     assert a_frame.mean() > 110
     assert a_frame.min() > 60
     lives = np.bincount(tracks.track_id)
-    assert np.median(lives) > 4
+    assert lives.mean() > 4
