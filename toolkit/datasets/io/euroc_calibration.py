@@ -77,7 +77,7 @@ def published() -> Calibration:
     T_left_right = np.eye(4)
     T_left_right[:3, 3] = _T_IMU_CAM0[:3, :3].T @ (_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])
     return Calibration(
-        _simulated_rig(_PINHOLE_PX, T_left_right, _T_IMU_CAM0),
+        _simulated_rig(_PINHOLE_PX, float(np.linalg.norm(_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])), _T_IMU_CAM0),
         _SIZE_PX,
         _in_flight(_STATED_NOISE),
         "the folder has no sensor.yaml: calibration as published with all EuRoC recordings",
@@ -153,7 +153,7 @@ def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str)
     left.require("intrinsics", "resolution")
     fx_px, fy_px, cx_px, cy_px = left.constant("intrinsics", 4)
     width_px, height_px = left.constant("resolution", 2)
-    rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), T_left_right, sides.T_imu_left)
+    rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
     cameras = (camera_of(left), camera_of(right)) if whole else None
     return Calibration(
@@ -164,8 +164,7 @@ def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str)
     )
 
 
-def _simulated_rig(pinhole_px: Pinhole, T_left_right: Array, T_imu_left: Array) -> StereoRig:
-    baseline_m = float(np.linalg.norm(T_left_right[:3, 3]))
+def _simulated_rig(pinhole_px: Pinhole, baseline_m: float, T_imu_left: Array) -> StereoRig:
     return StereoRig(*pinhole_px, baseline_m, T_imu_left, stereo_cov_px2(PIXEL_SIGMA_PX))
 
 
