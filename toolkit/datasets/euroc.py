@@ -12,6 +12,7 @@ The body is the IMU; quaternions are Hamilton, w first.
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,7 +146,9 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         frames_t_ns=frames_t_ns,
         observations=tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
         motion=imu,
-        provenance=Provenance("euroc", f"{path}: {SIMULATED}, seed {seed}", _facts(choice.reason, calibration)),
+        provenance=Provenance(
+            "euroc", f"{path}: {SIMULATED}, seed {seed}", (*_facts(choice.reason, calibration), *_few_images(layout))
+        ),
         truth=truth,
     )
 
@@ -160,6 +163,13 @@ def _whole(path: Path) -> _Layout:
 def _imu(layout: _Layout) -> ImuSamples:
     table = read_table(layout.imu, _ACCEL + _GYRO)
     return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
+
+
+def _few_images(layout: _Layout) -> Iterator[str]:
+    """Yield why the images that a folder holds were not used, where it holds too few."""
+    share = 0.0 if layout.mav0 is None else _share_with_images(layout.mav0, layout.stamps)
+    if 0.0 < share < _NEARLY_ALL:
+        yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images uses those there are"
 
 
 def _with_images(layout: _Layout) -> Path:
