@@ -10,6 +10,8 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -19,11 +21,13 @@ from toolkit.estimate import Run
 from toolkit.estimator import find
 from toolkit.experiment import pipeline, recording, workers
 from toolkit.experiment.recording import Recording
-from toolkit.progress import SILENT
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Prior, Sequence
 from toolkit.simulation import SCENARIOS
 
 PROJECT = Path(__file__).parents[1]
+# Of the rendered drive: images, (width, height) px, and how far it goes from one to the next.
+KITTI_FRAMES, KITTI_SIZE, KITTI_FOCAL_PX, KITTI_BASELINE_M, KITTI_STEP_M = 8, (320, 200), 250.0, 0.4, 0.05
 
 # Where systems keep what is one user's or passing. Before it stands no part of a longer path or of an address.
 _OF_ONE_MACHINE = re.compile(
@@ -112,10 +116,10 @@ def _audited(_audit: Callable[..., Audit], source: str, keep: frozenset[str], se
 def audited_once() -> Iterator[None]:
     """Simulate and audit each built-in recording once for all tests of a worker that run a few frames of it."""
 
-    def remembered(asked: Recording) -> Audit:
+    def remembered(asked: Recording, progress: Progress = SILENT) -> Audit:
         if asked.truth is None and asked.duration_s is None and asked.source in SCENARIOS:
             return _audited(recording.audit, asked.source, asked.keep, asked.seed)
-        return _audited_recording(asked)
+        return _audited_recording(asked, progress)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recording, "audited_recording", remembered)
@@ -127,6 +131,24 @@ def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have all work done in this process where nobody says in how many: each takes a second to start."""
     for module in (workers, pipeline):
         monkeypatch.setattr(module, "usable_cpus", lambda: 1)
+
+
+@pytest.fixture(scope="session")
+def _kept_tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def shared_cache(_kept_tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep tracks made of images for other tests on the same images; what is kept is found by its content."""
+    monkeypatch.setenv("VISLAM_CACHE", str(_kept_tracks))
+
+
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep tracks made of images where no other test finds them."""
+    monkeypatch.setenv("VISLAM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
 
 
 @pytest.fixture
@@ -146,3 +168,32 @@ def run_estimator() -> Callable[..., Run]:
         return runner.run(name, find(name).load(), sequence, start, SILENT)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def kitti_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a drive towards a textured wall 8 m ahead: its images are the texture, ever larger."""
+    root = tmp_path_factory.mktemp("kitti") / "drive"
+    rng = np.random.default_rng(2)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (900, 1200)), (0, 0), 2.5) * 4.0 - 382.0
+    texture = np.clip(texture, 0, 255).astype(np.float32)
+    poses = []
+    for k in range(KITTI_FRAMES):
+        depth = 8.0 - KITTI_STEP_M * k
+        for side, folder in enumerate(("image_0", "image_1")):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            u, v = np.meshgrid(np.arange(KITTI_SIZE[0], dtype=np.float32), np.arange(KITTI_SIZE[1], dtype=np.float32))
+            x = (u - 160.0) / KITTI_FOCAL_PX * depth + side * KITTI_BASELINE_M
+            y = (v - 100.0) / KITTI_FOCAL_PX * depth
+            columns, rows = (x * 80.0 + 600.0).astype(np.float32), (y * 80.0 + 450.0).astype(np.float32)
+            image = cv2.remap(texture, columns, rows, cv2.INTER_LINEAR) + rng.normal(0.0, 1.0, KITTI_SIZE[::-1])
+            cv2.imwrite(str(root / folder / f"{k:06d}.png"), np.clip(image, 0, 255).astype(np.uint8))
+        poses.append(f"1 0 0 0 0 1 0 0 0 0 1 {KITTI_STEP_M * k:.6f}\n")
+    projection = [
+        f"P{i}: {KITTI_FOCAL_PX} 0 160 {-i * KITTI_FOCAL_PX * KITTI_BASELINE_M} 0 {KITTI_FOCAL_PX} 100 0 0 0 1 0\n"
+        for i in (0, 1)
+    ]
+    (root / "calib.txt").write_text("".join(projection) + "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (root / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(KITTI_FRAMES)))
+    (root / "poses.txt").write_text("".join(poses))
+    return root

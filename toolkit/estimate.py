@@ -18,9 +18,11 @@ class Estimate:
 
     ``T_world_imu`` (4, 4); ``v_world`` (3,) m/s and ``bias`` (6,) [accel, gyro] where they are estimated;
     ``cov`` (d, d) whose first six rows are the pose in GTSAM's order and side (rotation, position, body
-    frame), followed by velocity and biases for d = 15 or by the gyro bias for d = 9. ``info`` holds
-    diagnostics by name; the metrics understand ``nis``, ``nis_dof`` and, where a gate truncates the innovations,
-    ``nis_expected``, what ``nis`` is on average in a consistent estimator (``nis_dof`` where it is not given).
+    frame), followed by velocity and biases for d = 15, by the gyro bias for d = 9, or by velocity and turn rate
+    for d = 12, where no motion was measured: the turn rate, with the sign changed, then stands for a gyro bias.
+    ``info`` holds diagnostics by name; the metrics understand ``nis``, ``nis_dof`` and, where a gate truncates the
+    innovations, ``nis_expected``, what ``nis`` is on average in a consistent estimator (``nis_dof`` where it is not
+    given).
     """
 
     t_ns: int

@@ -11,14 +11,14 @@ import ast
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, cast
+from typing import Protocol, cast
 
 from toolkit.discovery import FoundModule, MissingDependency, announced
 from toolkit.errors import EstimatorError, no_such
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import MotionNoise, Packet, Prior, StereoRig
+from toolkit.sequence import MotionKind, MotionNoise, Packet, Prior, StereoRig
 from toolkit.settings import DEFAULTS, Scalar, Settings
 
 ENTRY_POINT_GROUP = "toolkit.estimators"
@@ -37,7 +37,7 @@ class Setup:
     noise: MotionNoise
     prior: Prior
     gravity_world: Array
-    motion_kind: Literal["twist", "imu"]
+    motion_kind: MotionKind
     settings: Settings = DEFAULTS
     options: Mapping[str, Scalar] = field(default_factory=dict)
     progress: Progress = SILENT

@@ -1,6 +1,8 @@
 """The state every estimator starts from, found without truth: from the first stereo frames and the motion samples.
 
-A twist needs none of it: the world is the first IMU frame. With raw IMU samples roll and pitch come from the
+A twist needs none of it: the world is the first IMU frame. So it is where no motion was measured; velocity and turn
+rate then come from a short bundle adjustment over the first frames, with the motion model of the smoothers. With raw
+IMU samples roll and pitch come from the
 specific force, velocity and gyro bias from a short visual-inertial bundle adjustment over the first frames,
 with the factors the smoothers use. Heading and position are the gauge and start at zero.
 """
@@ -17,13 +19,27 @@ from toolkit.models import stereo
 from toolkit.models.factors import B, L, StereoFactors, X, joint_cov
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuMotion, ImuNoise, Packet, Prior, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import (
+    ImuMotion,
+    ImuNoise,
+    Motion,
+    Packet,
+    Prior,
+    Sequence,
+    StereoFrame,
+    StereoRig,
+    TwistChangeNoise,
+    TwistNoise,
+)
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
 # What the gauge is held to (rad, m), and the biases' before any measurement (m/s^2, rad/s).
 GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02
 # Without enough vision: unknown speed (m/s), and the tilt (rad) an acceleration of 1 m/s^2 feigns.
 _BLIND_VELOCITY_SIGMA, _BLIND_TILT_SIGMA = 10.0, 0.1
+# What a turn rate that nobody measured may be at first (rad/s).
+_TURN_SIGMA = 2.0
+_SOURCE = {"imu": "the specific force and stereo of the first", "none": "stereo alone, of the first"}
 # The estimators read the window's measurements again: in the start they count for a ninth.
 _INFLATION = 9.0
 # The start's own, whatever the estimators use: each frame is triangulated by itself, so its landmarks need a depth that
@@ -39,14 +55,15 @@ def start_from_measurements(sequence: Sequence) -> Prior:
     """
     if sequence.prior is not None:
         return sequence.prior
-    if not isinstance(sequence.noise, ImuNoise):
+    if isinstance(sequence.noise, TwistNoise):
         return _own_frame()
     packets = _first_packets(sequence)
-    motions = [p.motion for p in packets if isinstance(p.motion, ImuMotion)]
-    attitudes = _attitudes(motions)
+    motions = [p.motion for p in packets if p.motion is not None]
+    measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
+    attitudes = _attitudes(measured) if measured else [np.eye(3)] * len(packets)
     tracks = _tracks_worth_using([p.frame for p in packets])
     if len(packets) < FEWEST_FRAMES or tracks.size < FEWEST_TRACKS:
-        return _blind(attitudes[0], "there are too few tracks in the first frames")
+        return _blind(attitudes[0], "there are too few tracks in the first frames", sequence)
     return _adjusted([_only(p.frame, tracks) for p in packets], motions, attitudes, sequence)
 
 
@@ -103,8 +120,12 @@ def _attitudes(motions: list[ImuMotion]) -> list[Array]:
     return [level @ turn for turn in turns]
 
 
-def _blind(attitude: Array, why: str) -> Prior:
-    """Return the start from the specific force alone, and in its source why vision was not used."""
+def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
+    """Return the start from the specific force alone, if there is any, and in its source why vision was not used."""
+    if isinstance(sequence.noise, TwistChangeNoise):
+        sigmas = [GAUGE_SIGMA, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, _TURN_SIGMA]
+        source = f"the first frame as the world; velocity and turn rate unknown and taken for zero, for {why}"
+        return Prior(np.eye(4), np.zeros(3), np.zeros(6), np.diag(np.repeat(sigmas, 3) ** 2), source)
     tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
     cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
     cov[:3, :3] = attitude.T @ tilt_cov @ attitude
@@ -140,7 +161,7 @@ def _positions(frames: list[StereoFrame], attitudes: list[Array], rig: StereoRig
     return np.array(positions)
 
 
-def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: list[Array], sequence: Sequence) -> Prior:
+def _adjusted(frames: list[StereoFrame], motions: list[Motion], attitudes: list[Array], sequence: Sequence) -> Prior:
     """Adjust poses, velocities, biases and landmarks of the first frames and return the state at the first."""
     model = motion_model(sequence.noise, sequence.gravity_world)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -148,7 +169,10 @@ def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: li
     stamps_s = np.array([f.t_ns - frames[0].t_ns for f in frames]) / NS_PER_S
     velocities = np.gradient(positions, stamps_s, axis=0)
     maker = StereoFactors(sequence.rig, gtsam.noiseModel.mEstimator.Huber.Create(_HUBER))
-    _hold_gauge(graph, attitudes[0])
+    if isinstance(sequence.noise, ImuNoise):
+        _hold_gauge(graph, attitudes[0])
+    else:
+        _hold_first_frame(graph)
     for k, frame in enumerate(frames):
         T_world_imu = se3(attitudes[k], positions[k])
         model.insert(values, Estimate(frame.t_ns, T_world_imu, v_world=velocities[k], bias=np.zeros(6)), k)
@@ -164,11 +188,11 @@ def _adjusted(frames: list[StereoFrame], motions: list[ImuMotion], attitudes: li
     try:
         solved = optimizer.optimize()
         if np.isfinite(optimizer.error()):
-            return _first_state(graph, solved, model, len(frames))
+            return _first_state(graph, solved, model, f"{_SOURCE[sequence.motion_kind]} {len(frames)} frames")
     except RuntimeError as refusal:
         if "Indeterminate" not in str(refusal):
             raise
-    return _blind(attitudes[0], "the adjustment of the first frames has no sound solution")
+    return _blind(attitudes[0], "the adjustment of the first frames has no sound solution", sequence)
 
 
 def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:
@@ -183,10 +207,25 @@ def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:
     )
 
 
-def _first_state(graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, model: MotionModel, frames: int) -> Prior:
+def _hold_first_frame(graph: gtsam.NonlinearFactorGraph) -> None:
+    """Pin the whole pose, which is the world, and say how large a turn rate may be."""
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, GAUGE_SIGMA)))
+    graph.add(gtsam.PriorFactorVector(B(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, _TURN_SIGMA)))
+
+
+def _first_state(graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, model: MotionModel, source: str) -> Prior:
     first = model.read(solved, 0, 0)
     assert first.v_world is not None and first.bias is not None
     cov = joint_cov(gtsam.Marginals(graph, solved), model.keys(0))
     cov = _INFLATION * model.estimate_cov(cov, first.T_world_imu[:3, :3])
-    source = f"the specific force and stereo of the first {frames} frames"
+    if model.layout.accel_bias is None:
+        cov = _with_accel_bias(cov)
     return Prior(first.T_world_imu, first.v_world, first.bias, cov, source)
+
+
+def _with_accel_bias(cov: Array) -> Array:
+    """Return the covariance (15, 15) of a prior from that of pose, velocity and turn rate (12, 12)."""
+    whole = np.diag(np.full(15, ACCEL_BIAS_SIGMA**2))
+    kept = np.r_[0:9, 12:15]
+    whole[np.ix_(kept, kept)] = cov
+    return whole

@@ -99,7 +99,21 @@ class ImuNoise:
     gyro_random_walk: float
 
 
-MotionNoise = TwistNoise | ImuNoise
+@dataclass(frozen=True, eq=False)
+class TwistChangeNoise:
+    """Densities of the white noise on the change of a twist that nobody measured, per axis (3,), in the IMU frame.
+
+    Units: m/s^2/sqrt(Hz) of the velocity, rad/s^2/sqrt(Hz) of the turn rate.
+    """
+
+    velocity_change_density: Array
+    turn_change_density: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, velocity_change_density=(3,), turn_change_density=(3,))
+
+
+MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +155,28 @@ class ImuSamples:
         return np.hstack([self.accel_mps2, self.gyro_radps])
 
 
-MotionSamples = TwistSamples | ImuSamples
+@dataclass(frozen=True, eq=False)
+class NoSamples:
+    """No motion was measured: only the stamps (S,) of the frames, which it spans."""
+
+    t_ns: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, t_ns=(None,))
+
+    @property
+    def values(self) -> Array:
+        """Return rows (S, 0) without a value."""
+        return np.empty((self.t_ns.size, 0))
+
+
+MotionSamples = TwistSamples | ImuSamples | NoSamples
+MotionKind = Literal["twist", "imu", "none"]
+_KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
+    (TwistSamples, TwistNoise, "twist"),
+    (ImuSamples, ImuNoise, "imu"),
+    (NoSamples, TwistChangeNoise, "none"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +262,14 @@ class ImuMotion:
     noise_scale: Array | None = None
 
 
-Motion = TwistMotion | ImuMotion
+@dataclass(frozen=True, eq=False)
+class UnmeasuredMotion:
+    """An interval in which no motion was measured: its duration (1,) s."""
+
+    dt_s: Array
+
+
+Motion = TwistMotion | ImuMotion | UnmeasuredMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,13 +325,13 @@ class Sequence:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, frames_t_ns=(None,), gravity_world=(3,))
-        if isinstance(self.motion, TwistSamples) != isinstance(self.noise, TwistNoise):
+        if not any(isinstance(self.motion, one) and isinstance(self.noise, other) for one, other, _ in _KINDS):
             raise DataError(f"{self.name}: the motion noise is not of the kind of the motion samples")
 
     @property
-    def motion_kind(self) -> Literal["twist", "imu"]:
+    def motion_kind(self) -> MotionKind:
         """Return the kind of motion samples the sequence has."""
-        return "twist" if isinstance(self.motion, TwistSamples) else "imu"
+        return next(kind for samples, _, kind in _KINDS if isinstance(self.motion, samples))
 
     @property
     def frame_count(self) -> int:
@@ -391,6 +433,10 @@ def check_stated(sequence: Sequence) -> None:
 
 def _cut(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None) -> Iterator[Motion]:
     """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
+    if isinstance(samples, NoSamples):
+        for dt_s in np.diff(frames_t_ns) / NS_PER_S:
+            yield UnmeasuredMotion(read_only([dt_s]))
+        return
     twist = isinstance(samples, TwistSamples)
     pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
     pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, pairing)

@@ -17,6 +17,7 @@ from toolkit.errors import DataError, VislamError, did_you_mean
 from toolkit.inputs import read_text_input
 
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
+Tracks = Literal["auto", "images", "simulated"]
 Scalar = bool | int | float | str
 
 
@@ -95,6 +96,49 @@ class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(name for name in self.__struct_fields__ if getattr(self, name))
 
 
+class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
+    """How stereo tracks are made of images; the same tracks for every estimator."""
+
+    tracks: Annotated[
+        Tracks,
+        Meta(description="where a recording with images has its tracks from; auto: images, where nearly all are there"),
+    ] = "auto"
+    max_tracks: Annotated[int, Meta(ge=20, le=2000, description="stereo tracks a frame at most")] = 200
+    spacing_px: Annotated[
+        float,
+        Meta(ge=3.0, le=200.0, description="least distance of two tracks in the left image", extra={"unit": "px"}),
+    ] = 12.0
+    window_px: Annotated[
+        int, Meta(ge=7, le=63, description="side of the window that KLT compares", extra={"unit": "px"})
+    ] = 15
+    levels: Annotated[int, Meta(ge=0, le=8, description="halvings of the image in KLT's pyramid")] = 3
+    nearest_m: Annotated[
+        float, Meta(gt=0.0, le=100.0, description="depth of the nearest point looked for", extra={"unit": "m"})
+    ] = 0.5
+    forward_backward_px: Annotated[
+        float,
+        Meta(
+            gt=0.0, le=10.0, description="how far KLT there and back may end from where it began", extra={"unit": "px"}
+        ),
+    ] = 0.3
+    epipolar_px: Annotated[
+        float, Meta(gt=0.0, le=20.0, description="how far the rows of left and right may differ", extra={"unit": "px"})
+    ] = 1.5
+    ransac_px: Annotated[
+        float,
+        Meta(gt=0.0, le=20.0, description="distance from the motion most tracks agree on", extra={"unit": "px"}),
+    ] = 2.0
+    patch_px: Annotated[
+        float,
+        Meta(
+            gt=0.0, le=20.0, description="how far a track may be from where its first patch fits", extra={"unit": "px"}
+        ),
+    ] = 1.5
+    patch_correlation: Annotated[
+        float, Meta(gt=0.0, lt=1.0, description="least correlation with the track's first patch")
+    ] = 0.8
+
+
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """The whole record, by section. ``estimators`` holds options of single estimators by name, as they define them."""
 
@@ -102,6 +146,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     window: Window = Window()
     noise: Noise = Noise()
     metrics: Metrics = Metrics()
+    frontend: Frontend = Frontend()
     start: Annotated[
         Literal["measurements", "truth"], Meta(description="where the first state comes from; the truth is labelled")
     ] = "measurements"

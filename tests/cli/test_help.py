@@ -2,15 +2,17 @@
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from toolkit.cli import simulate
 
-COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "list", "simulate")
+COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "list", "simulate", "tracks")
 STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 
@@ -46,9 +48,13 @@ def test_help_has_an_example_and_the_exit_statuses(helps: dict[str, str], comman
     assert tuple(told) == STATUSES
 
 
-@pytest.mark.usefixtures("one_process", "unrendered")
+@pytest.mark.usefixtures("one_process", "unrendered", "own_cache")
 @pytest.mark.parametrize("command", COMMANDS)
-def test_examples_in_help_run(helps: dict[str, str], command: str, vislam: Callable[..., int]) -> None:
+def test_examples_in_help_run(
+    helps: dict[str, str], command: str, vislam: Callable[..., int], kitti_drive: Path
+) -> None:
+    if command == "tracks":
+        shutil.copytree(kitti_drive, "kitti/sequences/06")
     examples = re.findall(r"^  \$ vislam (.*)$", helps[command], flags=re.MULTILINE)
     assert examples
     for example in examples:

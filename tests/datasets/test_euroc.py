@@ -12,7 +12,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.datasets import euroc, formats, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
-from toolkit.datasets.io.opencv_yaml import read_fields
+from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import ImuMotion, ImuNoise, ImuSamples, Sequence
@@ -289,8 +289,8 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
         "imu0/data.csv: missing column w_RS_S_y",
     ),
     ("seconds", lambda d: replace_in(d, "imu0/data.csv", f"{START_NS},", "1403715273.26,"), "whole nanoseconds"),
-    ("open list", lambda d: replace_in(d, "cam0/sensor.yaml", "248.0]", "248.0"), "line 15 has no end"),
-    ("no key", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz: 20", "rate_hz 20"), "no 'key: value'"),
+    ("open list", lambda d: replace_in(d, "cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
+    ("no key", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz: 20", "rate_hz 20"), "line 14: .* it is no YAML"),
     ("twice", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
     ("not rigid", lambda d: replace_in(d, "cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
     ("exchanged", lambda d: replace_in(d, "cam1/sensor.yaml", "-0.06", "0.2"), "cam1 is not to the right of cam0"),

@@ -3,7 +3,7 @@
 import argparse
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
@@ -173,6 +173,25 @@ def settings_asked(options: argparse.Namespace) -> "Settings":
 def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:
     """Add the number of processes; None stands for one a CPU."""
     parser.add_argument("--workers", metavar="N", type=at_least(1), help=f"{what} (default: one a CPU)")
+
+
+def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
+    """Add where tracks come from; read it with :func:`with_tracks`."""
+    parser.add_argument(
+        "--tracks",
+        choices=("auto", "images", "simulated"),
+        help="of a recording with images and truth: made of the images, or simulated along the truth (default: auto, "
+        "of the images where nearly all are there)",
+    )
+
+
+def with_tracks(values: Mapping[str, Any], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the nested values of settings with --tracks put in where it was given."""
+    if options.tracks is None:
+        return dict(values)
+    from toolkit.settings import with_assignments
+
+    return with_assignments(values, (f"frontend.tracks={options.tracks}",))
 
 
 def add_repair_arguments(parser: argparse.ArgumentParser) -> None:

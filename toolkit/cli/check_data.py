@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_repair_arguments, at_least, epilog, kept_faults
+from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, kept_faults, with_tracks
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -24,6 +24,7 @@ def add_to(subcommands: Subcommands) -> None:
     parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")
     parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth, to check that the two overlap")
     add_repair_arguments(parser)
+    add_tracks_argument(parser)
     parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of a simulated sequence (default: 0)")
     parser.set_defaults(command=command)
 
@@ -32,10 +33,15 @@ def command(options: argparse.Namespace) -> int:
     """Print the audit and return 1 where a fault stays that must not."""
     from toolkit.audit import faults
     from toolkit.experiment.recording import Recording, audited_recording
+    from toolkit.progress import of_this_process
     from toolkit.report.prose import width_of_output
     from toolkit.report.terminal import audit_text
+    from toolkit.settings import settings_of
 
     keep = kept_faults(options, faults())
-    audited = audited_recording(Recording(options.sequence, options.seed, options.truth, keep))
+    frontend = settings_of(with_tracks({}, options), "the command line").frontend
+    recording = Recording(options.sequence, options.seed, options.truth, keep, frontend=frontend)
+    with of_this_process()(options.sequence) as progress:
+        audited = audited_recording(recording, progress)
     print(audit_text(audited, width_of_output()))
     return 1 if any(finding.blocking for finding in audited.findings) else 0

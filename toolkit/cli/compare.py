@@ -11,12 +11,14 @@ from toolkit.cli.arguments import (
     add_estimators_argument,
     add_repair_arguments,
     add_settings_arguments,
+    add_tracks_argument,
     add_workers_argument,
     at_least,
     epilog,
     kept_faults,
     named_file,
     names,
+    with_tracks,
 )
 from toolkit.errors import printable
 
@@ -66,6 +68,7 @@ def add_to(subcommands: Subcommands) -> None:
         choices=("measurements", "truth"),
         help="where the first state comes from; a start from the truth is labelled (default: measurements)",
     )
+    add_tracks_argument(parser)
     parser.add_argument("--seed", metavar="N", type=at_least(0), help="of simulated sequences (default: 0)")
     parser.add_argument(
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
@@ -140,6 +143,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     settings |= {key: value for key, value in named.items() if value is not None}
     switches = () if options.columns == ("all",) else requests_of(options.columns)
     settings = with_assignments(settings, [f"metrics.{switch}=true" for switch in switches])
+    settings = with_tracks(settings, options)
     return configuration(request, settings, place)
 
 

@@ -1,8 +1,9 @@
 """Read recordings. Every module here is a format or offers built-in sequences, found by being here.
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
-estimates of other systems is :class:`BringsReferences` too, and one that simulates a part of them is
-:class:`DrawnFromASeed`. It imports nothing heavy at its top, because all modules are imported to recognise a path.
+estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
+:class:`DrawnFromASeed`, and one that has tracks made of images is :class:`HasImages`. It imports nothing heavy at its
+top, because all modules are imported to recognise a path.
 Read ``course_npz`` first, then the others; parts they share are in ``io``, formats of trajectories in ``trajectories``.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
@@ -12,15 +13,18 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
 from toolkit.discovery import MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
+from toolkit.frontend import ImageRecording
 from toolkit.inputs import is_regular, open_input, unreadable
+from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, check_stated
+from toolkit.settings import DEFAULTS, Frontend, Tracks
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -57,6 +61,20 @@ class DrawnFromASeed(Protocol):
 
     def load_with_seed(self, path: Path, seed: int) -> Sequence:
         """Read the recording and draw the simulated part from the seed; ``load`` does so with seed 0."""
+
+
+@runtime_checkable
+class HasImages(Protocol):
+    """A format whose recordings may hold images, of which tracks are made (:mod:`toolkit.frontend`)."""
+
+    def uses_images(self, path: Path, tracks: Tracks) -> bool:
+        """Say whether the tracks are made of images where these are asked for."""
+
+    def load_from_images(self, path: Path, frontend: Frontend, progress: Progress) -> Sequence:
+        """Read the recording with tracks made of its images; raise DataError where it cannot be."""
+
+    def images_of(self, path: Path) -> ImageRecording:
+        """Return the image pairs that tracks are made of and their cameras; raise DataError where there are none."""
 
 
 @runtime_checkable
@@ -120,11 +138,14 @@ def built_in_names() -> tuple[str, ...]:
     return tuple(built_ins())
 
 
-def load_sequence(source: str, seed: int = 0) -> Sequence:
+def load_sequence(
+    source: str, seed: int = 0, frontend: Frontend = DEFAULTS.frontend, progress: Progress = SILENT
+) -> Sequence:
     """Load a built-in sequence by its name, made with the seed, or a recording by its path.
 
-    The seed is also that of what a format simulates; whatever was recorded is the same under every seed. Raises
-    DataError where the source is neither, no format recognises it, or it cannot be read.
+    The seed is also that of what a format simulates; whatever was recorded is the same under every seed. ``frontend``
+    says whether and how tracks are made of images. Raises DataError where the source is neither, no format recognises
+    it, or it cannot be read.
     """
     if source in built_ins():
         return built_ins()[source](seed)
@@ -132,12 +153,38 @@ def load_sequence(source: str, seed: int = 0) -> Sequence:
     reader = _reader_of(path, source)
     # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
     with np.errstate(all="ignore"):
-        sequence = reader.load_with_seed(path, seed) if isinstance(reader, DrawnFromASeed) else reader.load(path)
+        if _of_images(reader, path, frontend):
+            sequence = reader.load_from_images(path, frontend, progress)
+        elif isinstance(reader, DrawnFromASeed):
+            sequence = reader.load_with_seed(path, seed)
+        else:
+            sequence = reader.load(path)
         check_stated(sequence)
     return sequence
 
 
-def is_drawn_from_a_seed(source: str) -> bool:
+def _of_images(reader: RecordingFormat, path: Path, frontend: Frontend) -> TypeGuard[HasImages]:
+    """Say whether a recording's tracks are made of its images; raise DataError where they must be and it has none."""
+    if not isinstance(reader, HasImages):
+        if frontend.tracks == "images":
+            raise DataError(f"{path}: its format has tracks and no images; leave --tracks images out")
+        return False
+    return reader.uses_images(path, frontend.tracks)
+
+
+def load_images(source: str) -> ImageRecording:
+    """Return the image pairs of a recording and their cameras.
+
+    Raises DataError where the source is no recording with images, or they cannot be used.
+    """
+    path = Path(source).expanduser()
+    reader = None if source in built_ins() else _reader_of(path, source)
+    if not isinstance(reader, HasImages):
+        raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
+    return reader.images_of(path)
+
+
+def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:
     """Say whether a source is another recording under another seed, as simulations are.
 
     Raises DataError where it is no source at all.
@@ -145,7 +192,9 @@ def is_drawn_from_a_seed(source: str) -> bool:
     if source in built_ins():
         make = built_ins()[source]
         return make(0).content_hash() != make(1).content_hash()
-    return isinstance(_reader_of(Path(source).expanduser(), source), DrawnFromASeed)
+    path = Path(source).expanduser()
+    reader = _reader_of(path, source)
+    return isinstance(reader, DrawnFromASeed) and not _of_images(reader, path, frontend)
 
 
 def load_references(source: str) -> dict[str, Trajectory]:

@@ -1,43 +1,51 @@
-"""EuRoC (ASL) recordings: the real IMU, with stereo tracks simulated along the true trajectory.
+"""EuRoC (ASL) recordings: the real IMU, with stereo tracks from the images or simulated along the true trajectory.
 
-A folder with ``mav0/`` (or ``mav0`` itself), or a lean one: imu.csv, cam_timestamps_ns.txt and a truth table. No front
-end undistorts its images here, so what the pair would see is simulated at the real camera stamps: a rectified pair
-with the left camera's intrinsics and extrinsic and the real baseline, in a room around the trajectory. The sequence's
-name and provenance state this, and with them every report.
+A folder with ``mav0/`` (or ``mav0`` itself), or a lean one: imu.csv, cam_timestamps_ns.txt and a truth table. Where
+nearly all stamps have both images, the tracks are made of them (:mod:`toolkit.frontend`): undistorted and rectified
+with the folder's calibration, sensor.yaml or Kalibr's camchain, as TUM-VI has it. Otherwise what the pair would see is
+simulated at the real camera stamps: a rectified pair with the left camera's intrinsics and extrinsic and the real
+baseline, in a room around the trajectory. The sequence's name and provenance state which, and with them every report.
 
-Errors of the truth reach the estimators as disagreement of tracks and IMU; ``io/euroc_calibration`` has
-the noise densities that allow for it.
+Where tracks are simulated, errors of the truth reach the estimators as disagreement of tracks and IMU;
+``io/euroc_calibration`` has the noise densities that allow for it.
 The body is the IMU; quaternions are Hamilton, w first.
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import (
-    ACCEL_FACTOR,
-    GYRO_FACTOR,
     PIXEL_SIGMA_PX,
     Calibration,
     published,
     read_calibration,
 )
-from toolkit.datasets.io.euroc_truth import choose_truth
-from toolkit.datasets.io.fields import check_frame_count
+from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
+from toolkit.datasets.io.fields import check_frame_count, observations
+from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_of_asl, rig_of
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.errors import DataError
+from toolkit.frontend import ImageRecording, rectified, track_images
 from toolkit.geometry import Array, IntArray, interpolate_poses
+from toolkit.inputs import is_regular
+from toolkit.progress import Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import ImuSamples, Provenance, Sequence, Truth
+from toolkit.settings import Frontend, Tracks
 from toolkit.simulation.world import Camera
 
+REAL = "real IMU, stereo tracks from the images"
 SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
+# With fewer of its images a recording is cut short or a sample: tracks from them would be of another recording.
+_NEARLY_ALL = 0.9
 # Up to 14 m the disparity stays five standard deviations above zero.
 _DEPTH_M = (0.5, 14.0)
 # Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
@@ -67,8 +75,53 @@ def recognises(path: Path) -> bool:
 
 
 def load(path: Path) -> Sequence:
-    """Read a recording with the noise of seed 0; see :func:`load_with_seed`."""
+    """Read a recording with simulated tracks and the noise of seed 0; see :func:`load_with_seed`."""
     return load_with_seed(path, 0)
+
+
+def uses_images(path: Path, tracks: Tracks) -> bool:
+    """Say whether the tracks are made of the images: as asked for, or where nearly all stamps have both of theirs."""
+    layout = _layout(path)
+    if tracks != "auto" or layout is None or layout.mav0 is None:
+        return tracks == "images"
+    return _share_with_images(layout.mav0, layout.stamps) >= _NEARLY_ALL
+
+
+def images_of(path: Path) -> ImageRecording:
+    """Return the image pairs within the IMU's time and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    mav0 = _with_images(layout)
+    return _filmed(layout, mav0, _imu(layout), read_calibration(layout.root, mav0))[0]
+
+
+def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
+    """Read IMU and calibration, and make the tracks of the image pairs within the IMU's time; a truth may be missing.
+
+    Raises DataError where a part is missing or damaged, or the images cannot be used.
+    """
+    layout = _whole(path)
+    mav0 = _with_images(layout)
+    imu, calibration = _imu(layout), read_calibration(layout.root, mav0)
+    filmed, remarks = _filmed(layout, mav0, imu, calibration)
+    tracks = track_images(filmed.pairs, filmed.rig, frontend, progress)
+    check_frame_count(layout.root, tracks.t_ns.size)
+    choice = find_truth(layout.root, mav0, imu)
+    facts = (
+        *facts_of(tracks, len(filmed.pairs)),
+        *remarks,
+        *(() if choice is None else (choice.reason,)),
+        *(calibration.source, calibration.noise_source),
+    )
+    return Sequence(
+        name=layout.root.name,
+        rig=rig_of(filmed.rig, calibration.T_imu_left),
+        noise=calibration.noise,
+        frames_t_ns=tracks.t_ns,
+        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
+        motion=imu,
+        provenance=Provenance("euroc", f"{path}: {REAL}", facts),
+        truth=None if choice is None else _at(choice.truth, _near(tracks.t_ns, choice.truth.t_ns)),
+    )
 
 
 def load_with_seed(path: Path, seed: int) -> Sequence:
@@ -77,12 +130,9 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     The seed draws the pixel noise and the ends of tracks; the landmarks are the same under every seed. Raises
     DataError where a part is missing or damaged, or there is no truth to simulate along.
     """
-    layout = _layout(path)
-    if layout is None:
-        raise DataError(f"{path}: neither mav0/imu0 nor {_LEAN_IMU} beside {_STAMPS}; give the folder of the recording")
-    table = read_table(layout.imu, _ACCEL + _GYRO)
-    imu = ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
-    calibration = published() if layout.mav0 is None else read_calibration(layout.mav0)
+    layout = _whole(path)
+    imu = _imu(layout)
+    calibration = published() if layout.mav0 is None else read_calibration(layout.root, layout.mav0)
     choice = choose_truth(layout.root, layout.mav0, imu)
     stamps = read_stamps(layout.stamps)
     frames_t_ns = _within(stamps, imu.t_ns, choice.truth.t_ns)
@@ -96,9 +146,61 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         frames_t_ns=frames_t_ns,
         observations=tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
         motion=imu,
-        provenance=Provenance("euroc", f"{path}: {SIMULATED}, seed {seed}", _facts(choice.reason, calibration)),
+        provenance=Provenance(
+            "euroc", f"{path}: {SIMULATED}, seed {seed}", (*_facts(choice.reason, calibration), *_few_images(layout))
+        ),
         truth=truth,
     )
+
+
+def _whole(path: Path) -> _Layout:
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(f"{path}: neither mav0/imu0 nor {_LEAN_IMU} beside {_STAMPS}; give the folder of the recording")
+    return layout
+
+
+def _imu(layout: _Layout) -> ImuSamples:
+    table = read_table(layout.imu, _ACCEL + _GYRO)
+    return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
+
+
+def _few_images(layout: _Layout) -> Iterator[str]:
+    """Yield why the images that a folder holds were not used, where it holds too few."""
+    share = 0.0 if layout.mav0 is None else _share_with_images(layout.mav0, layout.stamps)
+    if 0.0 < share < _NEARLY_ALL:
+        yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images uses those there are"
+
+
+def _with_images(layout: _Layout) -> Path:
+    if layout.mav0 is None:
+        raise DataError(f"{layout.root}: a lean recording has no images; its tracks can be simulated")
+    return layout.mav0
+
+
+def _filmed(
+    layout: _Layout, mav0: Path, imu: ImuSamples, calibration: Calibration
+) -> tuple[ImageRecording, tuple[str, ...]]:
+    """Return the pairs within the IMU's time with their cameras, and what had to be put right."""
+    if calibration.cameras is None:
+        raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
+    listed = pairs_of_asl(mav0)
+    within = tuple(p for p in listed.pairs if imu.t_ns.min() <= p.t_ns <= imu.t_ns.max())
+    check_frame_count(layout.root, len(within))
+    return ImageRecording(within, rectified(*calibration.cameras, calibration.T_right_left)), listed.remarks
+
+
+def _share_with_images(mav0: Path, stamps: Path) -> float:
+    """Return which share of the camera's stamps have both images; 0 where nothing can be read."""
+    if not any(images_in(mav0 / camera / "data") for camera in ("cam0", "cam1")):
+        return 0.0
+    try:
+        count = np.unique(read_stamps(stamps)).size if is_regular(stamps) else 0
+        listed = pairs_of_asl(mav0)
+    except DataError:
+        return 1.0  # there are images: what is wrong with their table is said when it is read
+    there = sum(is_regular(pair.left) and is_regular(pair.right) for pair in listed.pairs)
+    return there / max(count, listed.stamps, 1)
 
 
 def _layout(path: Path) -> _Layout | None:
@@ -116,8 +218,7 @@ def _facts(truth_reason: str, calibration: Calibration) -> tuple[str, ...]:
         f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU",
         truth_reason,
         calibration.source,
-        f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
-        "one, as measured in flight against the truth",
+        calibration.noise_source,
     )
 
 
@@ -127,6 +228,11 @@ def _within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) -> IntAr
     inside = stamps[(stamps >= first) & (stamps <= last)]
     after = np.clip(np.searchsorted(truth_t_ns, inside), 1, truth_t_ns.size - 1)
     return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= _LONGEST_TRUTH_GAP_NS])
+
+
+def _near(t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
+    """Return the stamps (K,) between truths close enough to interpolate."""
+    return _within(t_ns, truth_t_ns, truth_t_ns)
 
 
 def _at(truth: Truth, t_ns: IntArray) -> Truth:

@@ -23,12 +23,14 @@ from toolkit.sequence import (
     ImuSamples,
     MotionNoise,
     MotionSamples,
+    NoSamples,
     Observations,
     Prior,
     Provenance,
     Sequence,
     StereoRig,
     Truth,
+    TwistChangeNoise,
     TwistNoise,
     TwistSamples,
 )
@@ -187,9 +189,12 @@ def _arrays_again(fields: Text) -> Text:
 
 def _motion(text: Text, arrays: Arrays) -> tuple[MotionSamples, MotionNoise]:
     t_ns, values = arrays["motion_t_ns"], arrays["motion_values"]
-    if values.shape != (t_ns.size, 6):
-        raise DataError(f"motion_values has shape {values.shape}, expected ({t_ns.size}, 6)")
     kind, noise = text["motion"]["kind"], _arrays_again(text["noise"])
+    width = 0 if kind == "none" else 6
+    if values.shape != (t_ns.size, width):
+        raise DataError(f"motion_values has shape {values.shape}, expected ({t_ns.size}, {width})")
+    if kind == "none":
+        return NoSamples(t_ns), TwistChangeNoise(**noise)
     if kind == "imu":
         return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**noise)
     if kind == "twist":
@@ -197,7 +202,7 @@ def _motion(text: Text, arrays: Arrays) -> tuple[MotionSamples, MotionNoise]:
         if pairing not in get_args(Pairing):
             raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(get_args(Pairing))}")
         return TwistSamples(t_ns, values[:, :3], values[:, 3:], pairing), TwistNoise(**noise)
-    raise DataError(f"motion.kind is {kind!r}, expected imu or twist")
+    raise DataError(f"motion.kind is {kind!r}, expected imu, twist or none")
 
 
 def _provenance(fields: Text) -> Provenance:

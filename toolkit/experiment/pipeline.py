@@ -51,7 +51,14 @@ class Plan:
         """Return a source of the plan under a seed."""
         settings = self.settings
         return Recording(
-            source, seed, self.truth, self.keep, settings.start, max_frames=self.max_frames, noise=settings.noise
+            source,
+            seed,
+            self.truth,
+            self.keep,
+            settings.start,
+            max_frames=self.max_frames,
+            noise=settings.noise,
+            frontend=settings.frontend,
         )
 
 
@@ -103,14 +110,14 @@ def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = sil
 def _prepared(recordings: Sequence[Recording], workers: Workers, progress: Progress) -> list[Prepared]:
     """Prepare recordings: several side by side, a single one here, where it is there at once."""
     if len(recordings) == 1:
-        return [prepare(recordings[0])]
+        return [prepare(recordings[0], progress)]
     with closing(workers.results(recordings, _prepare, progress)) as coming:
         found = dict(coming)
     return [_unless_lost(found[place], recording) for place, recording in enumerate(recordings)]
 
 
-def _prepare(recording: Recording, _progress: Progress) -> Prepared:
-    return prepare(recording)
+def _prepare(recording: Recording, progress: Progress) -> Prepared:
+    return prepare(recording, progress)
 
 
 def _unless_lost(result: Prepared | Lost, recording: Recording) -> Prepared:
@@ -189,7 +196,9 @@ def _comparison(
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:
-    if len(plan.seeds) > 1 and (isinstance(source, Recorded) or not is_drawn_from_a_seed(source)):
+    if len(plan.seeds) > 1 and (
+        isinstance(source, Recorded) or not is_drawn_from_a_seed(source, plan.settings.frontend)
+    ):
         raise DataError(f"{_name(source)} is the same under every seed; only simulated ones are repeated over seeds")
 
 

@@ -12,9 +12,10 @@ from toolkit.audit import Audit, Finding, audit
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence
-from toolkit.settings import DEFAULTS, Noise
+from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence, TwistChangeNoise
+from toolkit.settings import DEFAULTS, Frontend, Noise
 from toolkit.simulation import SCENARIOS, simulate
 
 Start = Literal["measurements", "truth"]
@@ -41,6 +42,7 @@ class Recording:
     max_frames: int | None = None
     duration_s: float | None = None
     noise: Noise = DEFAULTS.noise
+    frontend: Frontend = DEFAULTS.frontend
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,20 +59,20 @@ class Prepared:
     undecided: Mapping[str, str] = field(default_factory=dict)
 
 
-def prepare(recording: Recording) -> Prepared:
+def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     """Load, audit, cut and find the start.
 
     Raises DataError where the source or the truth cannot be used, VislamError where ``keep`` names no fault.
     """
-    audited = audited_recording(recording)
+    audited = audited_recording(recording, progress)
     whole = _with_noise(audited.sequence, recording.noise)
     sequence = _cut(whole, recording)
     return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
 
 
-def audited_recording(recording: Recording) -> Audit:
+def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:
     """Load a recording and audit it whole: slow faults (a bias, a lag) show better so. Raises as :func:`prepare`."""
-    sequence = _loaded(recording)
+    sequence = _loaded(recording, progress)
     # The audit looks for what is not finite: what NumPy would say of it on the way says nothing more.
     with np.errstate(all="ignore"):
         return audit(sequence, recording.keep)
@@ -82,14 +84,14 @@ def prepare_once(recording: Recording) -> Prepared:
     return prepare(recording)
 
 
-def _loaded(recording: Recording) -> Sequence:
+def _loaded(recording: Recording, progress: Progress) -> Sequence:
     source = recording.source
     if isinstance(source, Sequence):
         sequence = source
     elif source in SCENARIOS and recording.duration_s is not None:
         sequence = simulate(replace(SCENARIOS[source], duration_s=recording.duration_s), recording.seed)
     else:
-        sequence = load_sequence(source, recording.seed)
+        sequence = load_sequence(source, recording.seed, recording.frontend, progress)
     return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))
 
 
@@ -114,5 +116,8 @@ def _scaled(noise: MotionNoise, factor: float) -> MotionNoise:
     if isinstance(noise, ImuNoise):
         gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
         return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
+    if isinstance(noise, TwistChangeNoise):
+        changes = (factor * noise.velocity_change_density, factor * noise.turn_change_density)
+        return TwistChangeNoise(*changes)
     velocity = factor * noise.velocity_noise_density
     return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)

@@ -41,7 +41,15 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
     """
     source, truth = located(case.source), None if case.truth is None else Path(located(case.truth))
     return [
-        Recording(source, seed, truth, start=settings.start, duration_s=case.duration_s, noise=settings.noise)
+        Recording(
+            source,
+            seed,
+            truth,
+            start=settings.start,
+            duration_s=case.duration_s,
+            noise=settings.noise,
+            frontend=settings.frontend,
+        )
         for seed in case.seeds
     ]
 

@@ -2,7 +2,8 @@
 
 A motion model integrates what was measured between two frames, once, about a bias. A filter predicts from that
 increment (mean, F, Q), a smoother makes its factors of the same one. There is one implementation a file:
-:mod:`toolkit.models.twist` and :mod:`toolkit.models.imu`.
+:mod:`toolkit.models.twist`, :mod:`toolkit.models.imu` and, where nothing was measured,
+:mod:`toolkit.models.smooth_twist`.
 """
 
 from collections.abc import Mapping
@@ -14,9 +15,10 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array
 from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
+from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
-from toolkit.sequence import Motion, MotionNoise, Prior, TwistNoise
+from toolkit.sequence import Motion, MotionNoise, Prior, TwistChangeNoise, TwistNoise
 from toolkit.settings import Window
 
 
@@ -84,6 +86,8 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     """Return the model for the kind of motion whose noise this is; ``gravity_world`` (3,) m/s^2."""
     if isinstance(noise, TwistNoise):
         return TwistModel(noise)
+    if isinstance(noise, TwistChangeNoise):
+        return SmoothTwist(noise)
     return ImuModel(noise, gravity_world)
 
 

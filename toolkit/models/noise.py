@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import TwistNoise
+from toolkit.sequence import TwistChangeNoise, TwistNoise
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
 TRACKED_PIXEL_SIGMA_PX = 0.5
@@ -13,8 +13,16 @@ LEAST_VELOCITY_SIGMA_MPS = 0.05
 LEAST_GYRO_SIGMA_RADPS = 0.005
 # Walk of a gyro bias (rad/s^2/sqrt(Hz)) of a good MEMS unit: moves it by 2e-4 rad/s in 100 s.
 GYRO_RANDOM_WALK = 2e-5
+# How much a motion that nobody measured changes (m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)): a second of braking at 3 m/s^2, or
+# of a hand that turns at 1 rad/s. The tracks say the rest; a wrong guess by three costs them little.
+VELOCITY_CHANGE, TURN_CHANGE = 3.0, 1.0
 
 _MAD_TO_SIGMA = 1.4826
+
+
+def unmeasured_motion() -> TwistChangeNoise:
+    """Return the noise of a motion that nobody measured, the same for cars and hands."""
+    return TwistChangeNoise(np.full(3, VELOCITY_CHANGE), np.full(3, TURN_CHANGE))
 
 
 def pixel_covariance(rows_averaged: int) -> Array:

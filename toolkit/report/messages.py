@@ -38,7 +38,9 @@ def sequence_line(sequence: Sequence) -> str:
         f"{len(sequence.observations)} stereo observations" if len(sequence.observations) else "no image features"
     )
     path = "no ground truth" if path_m is None else f"true path {path_m:.0f} m"
-    motion = {"twist": "body twists", "imu": "raw IMU"}[sequence.motion_kind]
+    motion = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}[
+        sequence.motion_kind
+    ]
     return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
 
 

@@ -9,7 +9,7 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
 from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, TwistSamples, check_runnable
+from toolkit.sequence import NoSamples, Sequence, TwistSamples, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30
@@ -31,9 +31,9 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Put both side by side; None where too few intervals are known."""
+    """Put both side by side; None where too few intervals are known, or no motion was measured."""
     rows = np.flatnonzero(camera.known)
-    if rows.size < LEAST_INTERVALS:
+    if isinstance(sequence.motion, NoSamples) or rows.size < LEAST_INTERVALS:
         return None
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)[rows]
     v_mps = mean[:, :3] if isinstance(sequence.motion, TwistSamples) else None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.geometry import BoolArray, IntArray
-from toolkit.sequence import MotionSamples, Observations, Sequence, TwistSamples
+from toolkit.sequence import MotionSamples, NoSamples, Observations, Sequence, TwistSamples
 
 
 def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
@@ -34,6 +34,8 @@ def keep_samples(sequence: Sequence, kept: BoolArray | IntArray) -> Sequence:
     samples: MotionSamples
     if isinstance(motion, TwistSamples):
         samples = replace(motion, t_ns=t_ns, v_mps=motion.v_mps[kept], w_radps=motion.w_radps[kept])
+    elif isinstance(motion, NoSamples):
+        samples = NoSamples(t_ns)
     else:
         samples = replace(motion, t_ns=t_ns, accel_mps2=motion.accel_mps2[kept], gyro_radps=motion.gyro_radps[kept])
     return replace(sequence, motion=samples)

@@ -1,6 +1,7 @@
-"""Calibration of EuRoC's sensor: read from the sensor.yaml files of a recording, or as published for all of them.
+"""Calibration of an ASL folder: its sensor.yaml files, Kalibr's camchain, or as published for all EuRoC recordings.
 
-Camera 1 serves for the baseline only: the pair that is simulated is rectified, with the left camera as it is mounted.
+Where tracks are simulated camera 1 serves for the baseline only: that pair is rectified, with the left camera as it is
+mounted. Real images are rectified with both cameras.
 
 The stated white noise is that of the sensor at rest. In flight, integrated over the 50 ms between frames and compared
 with the truth that the tracks are simulated on, rotation and velocity scatter as densities of 1.5 to 2.8 times (gyro)
@@ -15,15 +16,21 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.datasets.io.cameras import camera_of, part
 from toolkit.datasets.io.fields import Fields, rigid
-from toolkit.datasets.io.opencv_yaml import read_fields
+from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.errors import DataError
+from toolkit.frontend import Camera, Pinhole
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import ImuNoise, StereoRig
 from toolkit.simulation.scenarios import stereo_cov_px2
 
 PIXEL_SIGMA_PX = 0.5
 ACCEL_FACTOR, GYRO_FACTOR = 8.0, 3.0
+_INFLATED = (
+    f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
+    "one, as measured in flight against the truth"
+)
 _DENSITIES = {
     "accel_noise_density": "accelerometer_noise_density",
     "gyro_noise_density": "gyroscope_noise_density",
@@ -49,45 +56,116 @@ _STATED_NOISE = ImuNoise(
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The rectified rig, the image size, the IMU's noise in flight, and where all this is from."""
+    """The rig of simulated tracks, the image size, the IMU's noise, and where all this is from.
+
+    ``cameras`` are those of real images, None where they are not known; ``T_right_left`` (4, 4) takes coordinates of
+    the left one to the right one, ``T_imu_left`` to the IMU.
+    """
 
     rig: StereoRig
     size_px: tuple[int, int]
     noise: ImuNoise
     source: str
+    noise_source: str
+    T_imu_left: Array
+    T_right_left: Array
+    cameras: tuple[Camera, Camera] | None = None
 
 
 def published() -> Calibration:
     """Return the calibration that came with every recording of the set."""
-    baseline_m = float(np.linalg.norm(_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3]))
-    rig = StereoRig(*_PINHOLE_PX, baseline_m, _T_IMU_CAM0, stereo_cov_px2(PIXEL_SIGMA_PX))
-    source = "the folder has no sensor.yaml: calibration as published with all EuRoC recordings"
-    return Calibration(rig, _SIZE_PX, _in_flight(_STATED_NOISE), source)
+    T_left_right = np.eye(4)
+    T_left_right[:3, 3] = _T_IMU_CAM0[:3, :3].T @ (_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])
+    return Calibration(
+        _simulated_rig(_PINHOLE_PX, float(np.linalg.norm(_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])), _T_IMU_CAM0),
+        _SIZE_PX,
+        _in_flight(_STATED_NOISE),
+        "the folder has no sensor.yaml: calibration as published with all EuRoC recordings",
+        _INFLATED,
+        _T_IMU_CAM0,
+        se3_inverse(T_left_right),
+    )
 
 
-def read_calibration(mav0: Path) -> Calibration:
-    """Read the sensor.yaml of both cameras and the IMU; extrinsics are made relative to the IMU.
+def read_calibration(root: Path, mav0: Path) -> Calibration:
+    """Read Kalibr's camchain where there is one, else the sensor.yaml of both cameras and the IMU.
 
-    Raises DataError where one is missing, damaged or incomplete, or the right camera is not right of the left one.
+    Extrinsics are made relative to the IMU. Raises DataError where a file is missing, damaged or incomplete, or the
+    right camera is not right of the left one.
     """
+    chain = next((path for path in _chains(root, mav0)), None)
+    return _of_sensor_files(mav0) if chain is None else _of_kalibr(chain, root, mav0)
+
+
+def _of_sensor_files(mav0: Path) -> Calibration:
     left, right, imu = (read_fields(mav0 / sensor / "sensor.yaml") for sensor in ("cam0", "cam1", "imu0"))
     left.require("T_BS.data", "intrinsics", "resolution")
-    imu.require(*_DENSITIES.values())
-    T_imu_body = se3_inverse(extrinsic(imu))
+    stated = _stated_noise(imu)
+    T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
+    sides = _Sides(left, right, T_imu_left, T_left_right)
+    return _calibration(sides, _in_flight(stated), "the folder's sensor.yaml files", _INFLATED)
+
+
+def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
+    """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
+    fields = read_fields(chain)
+    fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
+    left, right = (part(fields, name) for name in ("cam0", "cam1"))
+    T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
+    mounted = "T_cam_imu" in right
+    T_right_left = right.rigid("T_cam_imu") @ T_imu_left if mounted else right.rigid("T_cn_cnm1")
+    imu = next((path for folder in (chain.parent, root, mav0) for path in sorted(folder.glob("imu*.yaml"))), None)
+    noise = _stated_noise(
+        read_fields(mav0 / "imu0/sensor.yaml" if imu is None else imu), "" if imu is None else "imu0."
+    )
+    source = str(chain.relative_to(root))
+    sides = _Sides(left, right, T_imu_left, se3_inverse(T_right_left))
+    return _calibration(sides, noise, source, "the noise of the IMU is as its file states it")
+
+
+def _chains(root: Path, mav0: Path) -> list[Path]:
+    folders = [root, mav0, root / "dso"]
+    return [path for folder in folders for path in sorted(folder.glob("*camchain*.yaml"))]
+
+
+def _stated_noise(imu: Fields, prefix: str = "") -> ImuNoise:
+    """Return the densities that a file states, at its top or under the name of the sensor."""
+    nested = prefix if f"{prefix}{_DENSITIES['accel_noise_density']}" in imu else ""
+    imu.require(*(nested + theirs for theirs in _DENSITIES.values()))
+    return ImuNoise(**{ours: imu.positive(nested + theirs) for ours, theirs in _DENSITIES.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """What a calibration says of both cameras."""
+
+    left: Fields
+    right: Fields
+    T_imu_left: Array
+    T_left_right: Array
+
+
+def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> Calibration:
+    left, right, T_left_right = sides.left, sides.right, sides.T_left_right
     if T_left_right[0, 3] <= 0.0:
         raise DataError(f"{right.path}: cam1 is not to the right of cam0; exchange the two")
+    left.require("intrinsics", "resolution")
     fx_px, fy_px, cx_px, cy_px = left.constant("intrinsics", 4)
     width_px, height_px = left.constant("resolution", 2)
-    rig = StereoRig(
-        *(fx_px, fy_px, cx_px, cy_px, float(np.linalg.norm(T_left_right[:3, 3]))),
-        T_imu_cam=T_imu_body @ extrinsic(left),
-        cov_uv_px2=stereo_cov_px2(PIXEL_SIGMA_PX),
-    )
-    stated = ImuNoise(**{ours: imu.positive(theirs) for ours, theirs in _DENSITIES.items()})
+    rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
+    whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
+    cameras = (camera_of(left), camera_of(right)) if whole else None
     return Calibration(
-        rig, (int(width_px), int(height_px)), _in_flight(stated), "calibration from the folder's sensor.yaml files"
+        *(rig, (int(width_px), int(height_px)), noise, f"calibration from {source}", noise_source),
+        T_imu_left=sides.T_imu_left,
+        T_right_left=se3_inverse(T_left_right),
+        cameras=cameras,
     )
+
+
+def _simulated_rig(pinhole_px: Pinhole, baseline_m: float, T_imu_left: Array) -> StereoRig:
+    return StereoRig(*pinhole_px, baseline_m, T_imu_left, stereo_cov_px2(PIXEL_SIGMA_PX))
 
 
 def extrinsic(sensor: Fields) -> Array:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import extrinsic
-from toolkit.datasets.io.opencv_yaml import read_fields
 from toolkit.datasets.io.tables import columns_of, read_table
 from toolkit.datasets.io.truth_file import load_truth
+from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse, so3_log
@@ -49,12 +49,20 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
 
     Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged.
     """
-    found = {path: _read(path, mav0) for path in _tables(root, mav0)}
-    if not found:
+    choice = find_truth(root, mav0, imu)
+    if choice is None:
         raise DataError(
             f"{root}: no ground truth in mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it, "
             "and the stereo tracks are simulated along it; add the truth"
         )
+    return choice
+
+
+def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
+    """Return the truth of a recording as :func:`choose_truth`, or None where there is none."""
+    found = {path: _read(path, mav0) for path in _tables(root, mav0)}
+    if not found:
+        return None
     scatter = {path: rate_scatter_radps(truth, imu) for path, truth in found.items()}
     ranked = sorted(scatter.items(), key=lambda item: item[1])
     best, least = ranked[0]
@@ -66,7 +74,9 @@ def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
 
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
-    inside = [] if mav0 is None else [mav0 / "state_groundtruth_estimate0" / "data.csv"]
+    # TUM-VI's motion capture, already moved to the IMU and its clock.
+    folders = () if mav0 is None else ("state_groundtruth_estimate0", "mocap0")
+    inside = [] if mav0 is None else [mav0 / folder / "data.csv" for folder in folders]
     beside = [path for path in sorted(root.glob("*.csv")) if _heading(path) is not None]
     return [*(path for path in inside if path.is_file()), *beside, *sorted(root.glob("*.tum"))]
 

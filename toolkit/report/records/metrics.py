@@ -13,7 +13,7 @@ from toolkit.metrics import contract_keys
 PROMISED_KEYS = contract_keys()
 ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
 
-MotionKind = Literal["twist", "imu"]
+MotionKind = Literal["twist", "imu", "none"]
 Motion = Annotated[MotionKind, Meta(description="body velocities or raw IMU between the frames")]
 Count = Annotated[int, Meta(ge=0)]
 # A count stays an integer when it is read and written again.

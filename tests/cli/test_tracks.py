@@ -1,0 +1,98 @@
+"""``vislam tracks`` and folders of images on the command line: what is written, said and refused."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+
+pytestmark = pytest.mark.usefixtures("shared_cache")
+Vislam = Callable[..., int]
+
+
+@pytest.fixture
+def folder(kitti_drive: Path, vislam: Vislam) -> Path:
+    """Return a folder of images in this test's directory."""
+    return Path(shutil.copytree(kitti_drive, "06"))
+
+
+def test_stills_show_both_images_with_the_tracks(
+    folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert vislam("tracks", "06", "--out", "stills", "--count", "3") == 0
+    written = sorted(path.name for path in Path("stills").iterdir())
+    assert len(written) == 3
+    still, plain = (cv2.imread(str(path)) for path in (Path("stills") / written[-1], folder / "image_0/000007.png"))
+    assert still is not None
+    assert plain is not None
+    assert still.shape == (200, 640, 3)
+    coloured = (still.max(axis=2).astype(int) - still.min(axis=2)) > 60
+    assert coloured[:, :320].sum() > 200
+    assert coloured[:, 320:].sum() > 200
+    said = capsys.readouterr().out
+    assert "8 pairs" in said
+    assert "tracks a frame" in said
+
+
+def test_a_video_has_every_frame(folder: Path, vislam: Vislam) -> None:
+    assert vislam("tracks", str(folder), "--out", "film", "--video") == 0
+    video = cv2.VideoCapture("film/tracks.avi")
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 8
+
+
+def test_stills_replace_stills_and_nothing_else(
+    folder: Path, vislam: Vislam, one_line: Callable[[], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for _ in range(2):
+        assert vislam("tracks", str(folder), "--out", "stills", "--count", "2") == 0
+    capsys.readouterr()
+    Path("stills/mine.txt").write_text("mine")
+    assert vislam("tracks", str(folder), "--out", "stills", "--count", "2") == 4
+    assert "mine.txt" in one_line()
+    assert Path("stills/mine.txt").read_text() == "mine"
+
+
+def test_bad_images_are_named(folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "image_1/000004.png").write_bytes(b"")
+    assert vislam("tracks", str(folder), "--out", "stills", "--count", "1") == 0
+    assert "left out: 06/image_1/000004.png (it is empty)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "complaint"),
+    [
+        (("tracks", "drive", "--out", "x"), 3, "drive: holds no images"),
+        (("tracks", "nowhere", "--out", "x"), 3, "no such file"),
+        (("tracks", "06", "--out", "x", "--set", "frontend.window=9"), 2, "did you mean frontend.window_px?"),
+        (("compare", "06", "--tracks", "simulated"), 3, "EuRoC folders only"),
+        (("compare", "06", "--seeds", "2"), 3, "the same under every seed"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    folder: Path, vislam: Vislam, one_line: Callable[[], str], words: tuple[str, ...], status: int, complaint: str
+) -> None:
+    assert vislam(*words) == status
+    assert complaint in one_line()
+    assert not Path("x").exists()
+
+
+@pytest.mark.usefixtures("one_process", "unrendered")
+def test_images_alone_are_compared_and_labelled(
+    folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert vislam("compare", str(folder), "--estimators", "ekf,batch", "--out", "run") == 0
+    table = capsys.readouterr().out
+    assert "no motion measured (smooth motion assumed)" in table
+    assert "no motion input" in Path("run/report.md").read_text()
+    assert vislam("compare", "--config", "run/manifest.json", "--out", "again") == 0
+
+
+@pytest.mark.usefixtures("one_process", "unrendered")
+def test_a_folder_without_its_calibration_leaves_nothing_behind(
+    folder: Path, vislam: Vislam, one_line: Callable[[], str]
+) -> None:
+    (folder / "calib.txt").unlink()
+    assert vislam("compare", str(folder), "--out", "run") == 3
+    assert "calib.txt" in one_line()
+    assert not Path("run").exists()

@@ -1,0 +1,151 @@
+"""KITTI odometry folders: axes, stamps and poses, what is missing or does not fit, and the real beginning of 06."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit.datasets import kitti_odometry, load_sequence
+from toolkit.errors import DataError
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.sequence import NoSamples, TwistChangeNoise
+from toolkit.settings import Frontend
+
+pytestmark = pytest.mark.usefixtures("shared_cache")
+
+# Of the rendered drive, as in conftest.
+FRAMES, FOCAL_PX, BASELINE_M, STEP_M = 8, 250.0, 0.4, 0.05
+
+
+@pytest.fixture
+def drive(kitti_drive: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(kitti_drive, tmp_path / "drive"))
+
+
+def test_a_folder_is_recognised_by_its_images(drive: Path) -> None:
+    assert kitti_odometry.recognises(drive)
+    assert not kitti_odometry.recognises(drive / "image_0")
+    (drive / "calib.txt").unlink()
+    assert kitti_odometry.recognises(drive)
+
+
+def test_no_motion_is_measured_and_that_is_said(drive: Path) -> None:
+    sequence = load_sequence(str(drive))
+    assert sequence.motion_kind == "none"
+    assert isinstance(sequence.motion, NoSamples)
+    assert isinstance(sequence.noise, TwistChangeNoise)
+    assert "no motion input" in sequence.provenance.facts[0]
+    np.testing.assert_array_equal(sequence.frames_t_ns, 100_000_000 * np.arange(FRAMES))
+
+
+def test_forward_is_the_bodys_x(drive: Path) -> None:
+    sequence = load_sequence(str(drive))
+    truth = sequence.truth
+    assert truth is not None
+    np.testing.assert_allclose(truth.T_world_imu[:, :3, 3], np.outer(STEP_M * np.arange(FRAMES), [1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(sequence.rig.T_imu_cam[:3, :3] @ [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    assert (sequence.rig.fx_px, sequence.rig.baseline_m) == (FOCAL_PX, pytest.approx(BASELINE_M))
+
+
+@pytest.mark.parametrize("name", ["ekf", "msckf", "batch"])
+def test_filters_and_smoothers_find_the_motion(drive: Path, name: str, run_estimator: Callable[..., Any]) -> None:
+    prepared = prepare(Recording(str(drive)))
+    assert prepared.prior.v_world[0] == pytest.approx(STEP_M / 0.1, abs=0.1)
+    run = run_estimator(name, prepared.sequence, prepared.prior)
+    assert run.status == "ok"
+    moved = run.final.T_world_imu[:, :3, 3]
+    # 12 px of disparity at 8 m: a tenth of a pixel is 7 cm of depth, and tens of tracks share it
+    np.testing.assert_allclose(moved[-1], [STEP_M * (FRAMES - 1), 0.0, 0.0], atol=0.03)
+
+
+def test_poses_of_the_download_are_found_beside_the_sequences(drive: Path, tmp_path: Path) -> None:
+    root = tmp_path / "dataset/sequences/06"
+    root.parent.mkdir(parents=True)
+    drive.rename(root)
+    (tmp_path / "dataset/poses").mkdir()
+    (root / "poses.txt").rename(tmp_path / "dataset/poses/06.txt")
+    assert load_sequence(str(root)).truth is not None
+
+
+def test_what_is_not_there_is_assumed_and_said_or_left_out(drive: Path) -> None:
+    (drive / "times.txt").unlink()
+    (drive / "poses.txt").unlink()
+    (drive / "image_1/000003.png").unlink()
+    sequence = load_sequence(str(drive))
+    assert sequence.truth is None
+    assert any("an image every 0.1 s is assumed" in fact for fact in sequence.provenance.facts)
+    assert any("000003.png (it is missing" in fact for fact in sequence.provenance.facts)
+    assert sequence.frames_t_ns.tolist() == [100_000_000 * k for k in range(FRAMES) if k != 3]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
+    ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: cannot be read"),
+    ("no P1", lambda d: edit(d / "calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
+    ("words", lambda d: edit(d / "calib.txt", "250.0 0 160", "250.0 o 160"), "line 1: could not convert"),
+    ("swapped rows", lambda d: edit(d / "calib.txt", "-100.0", "100.0"), "the right camera is not to the right"),
+    ("two focals", lambda d: edit(d / "calib.txt", "P1: 250.0", "P1: 260.0"), "not rectified"),
+    ("no focal", lambda d: edit(d / "calib.txt", "P0: 250.0", "P0: 0"), "P0 is no projection"),
+    ("few poses", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 8 images"),
+    ("poses cut", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1"), "poses.txt"),
+    ("times", lambda d: (d / "times.txt").write_text("0 0.1 x"), "times.txt: could not convert"),
+    ("no times", lambda d: (d / "times.txt").write_text(""), "0 frame"),
+    ("no right images", lambda d: shutil.rmtree(d / "image_1"), "8 of 8 image pairs cannot be used"),
+    (
+        "exchanged",
+        lambda d: [(d / a).rename(d / b) for a, b in (("image_0", "x"), ("image_1", "image_0"), ("x", "image_1"))],
+        "left and right images are exchanged",
+    ),
+]
+
+
+@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in BROKEN], ids=[m[0] for m in BROKEN])
+def test_a_folder_that_cannot_be_used_is_one_clear_line(
+    drive: Path, spoil: Callable[[Path], object], complaint: str
+) -> None:
+    spoil(drive)
+    with pytest.raises(DataError, match=complaint) as raised:
+        load_sequence(str(drive))
+    assert "\n" not in str(raised.value)
+
+
+def test_tracks_cannot_be_simulated(drive: Path) -> None:
+    with pytest.raises(DataError, match="EuRoC folders only"):
+        load_sequence(str(drive), 0, Frontend(tracks="simulated"))
+
+
+def test_a_recording_without_motion_is_kept_and_read_again(drive: Path, tmp_path: Path) -> None:
+    from toolkit.datasets import vislam_recording
+
+    sequence = load_sequence(str(drive))
+    vislam_recording.save(sequence, tmp_path / "kept")
+    assert load_sequence(str(tmp_path / "kept")).content_hash() == sequence.content_hash()
+
+
+def test_the_real_beginning_of_06_is_found_from_images_alone(
+    real: Callable[[str], Path], tmp_path: Path, run_estimator: Callable[..., Any]
+) -> None:
+    whole, root, frames = real("kitti06_images"), tmp_path / "06", 9
+    for side in ("image_l", "image_r"):
+        (root / side).mkdir(parents=True)
+        for image in sorted((whole / side).iterdir())[:frames]:
+            (root / side / image.name).symlink_to(image)
+    shutil.copy(whole / "calib.txt", root)
+    (root / "poses.txt").write_text("".join((whole / "poses.txt").read_text().splitlines(keepends=True)[:frames]))
+    prepared = prepare(Recording(str(root)))
+    assert np.bincount(prepared.sequence.observations.frame).min() >= 150
+    run = run_estimator("batch", prepared.sequence, prepared.prior)
+    assert run.status == "ok"
+    truth = prepared.sequence.truth
+    assert truth is not None
+    end, true = (np.linalg.norm(poses[-1, :3, 3]) for poses in (run.final.T_world_imu, truth.T_world_imu))
+    # nearly all of the drift is a scale error of 1.6 %, which a stereo pair alone cannot see
+    assert abs(end / true - 1.0) < 0.025

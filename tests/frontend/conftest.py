@@ -1,0 +1,235 @@
+"""Textured images of a scene whose geometry is known, through cameras with distortion, and folders of them.
+
+A wall with a texture and a board before it; each pixel's ray is cut with the nearer plane, so that places, disparities
+and occlusions are exact.
+"""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from toolkit.frontend import Camera, RectifiedPair, already_rectified, rectified
+from toolkit.frontend.cameras import Image
+from toolkit.geometry import Array, se3, so3_exp
+
+SIZE = (320, 240)
+BASELINE_M = 0.12
+RADTAN = Camera((230.0, 228.0, 163.0, 118.0), "radtan", np.array([-0.28, 0.07, 2e-4, 1e-4]), SIZE)
+EQUIDISTANT = Camera((150.0, 150.0, 160.0, 121.0), "equidistant", np.array([3e-3, 7e-4, -2e-3, 2e-4]), SIZE)
+PLAIN = Camera((230.0, 230.0, 160.0, 120.0), "none", np.zeros(4), SIZE)
+# The right camera is turned a little against the left one, as no pair is mounted perfectly.
+T_RIGHT_LEFT = se3(so3_exp(np.array([0.01, -0.006, 0.008])), np.array([-BASELINE_M, 0.001, -0.0015]))
+RECTIFIED = se3(np.eye(3), np.array([-BASELINE_M, 0.0, 0.0]))
+WALL_M, BOARD_M = 3.0, 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A wall at ``WALL_M`` and a board at ``BOARD_M`` before its right half, in the first left camera's axes."""
+
+    wall: Array
+    board: Array
+
+    def seen(self, camera: Camera, T_cam_scene: Array, noise: float = 1.0, seed: int = 0) -> Image:
+        """Return what a camera sees, with noise of some grey values."""
+        T_scene_cam = np.linalg.inv(T_cam_scene)
+        directions = _rays(camera) @ T_scene_cam[:3, :3].T
+        grey = _hit(self.wall, T_scene_cam[:3, 3], directions, WALL_M)[0]
+        before, x = _hit(self.board, T_scene_cam[:3, 3], directions, BOARD_M)
+        grey = np.where(x > 0.0, before, grey)
+        noisy = grey + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
+        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def scene(seed: int = 3) -> Scene:
+    """Return a scene whose textures have corners of several sizes."""
+    rng = np.random.default_rng(seed)
+    return Scene(_texture(rng), _texture(rng))
+
+
+def _texture(rng: np.random.Generator) -> Array:
+    coarse = cv2.resize(rng.uniform(40, 215, (60, 60)), (1200, 1200), interpolation=cv2.INTER_LINEAR)
+    fine = cv2.GaussianBlur(rng.uniform(-160, 160, (1200, 1200)), (0, 0), 2.0)
+    return np.asarray(coarse + 2.0 * fine, dtype=np.float64)
+
+
+def _rays(camera: Camera) -> Array:
+    """Return the direction (height, width, 3) of each pixel."""
+    width, height = camera.size_px
+    pixels = np.stack(np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float)), axis=-1)
+    flat = pixels.reshape(-1, 1, 2)
+    if camera.distortion == "equidistant":
+        plain = cv2.fisheye.undistortPoints(flat, camera.K, camera.coefficients)
+    else:
+        plain = cv2.undistortPoints(
+            flat, camera.K, camera.coefficients, criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+        )
+    return np.concatenate([plain.reshape(height, width, 2), np.ones((height, width, 1))], axis=2)
+
+
+def _hit(texture: Array, origin: Array, directions: Array, depth_m: float) -> tuple[Array, Array]:
+    """Return the texture where rays meet a plane, 4 mm a texel, and the x of the places."""
+    reach = (depth_m - origin[2]) / directions[..., 2]
+    places = origin + reach[..., None] * directions
+    column, row = (np.mod(places[..., i] / 0.004 + 600.0, 1198.0).astype(np.float32) for i in (0, 1))
+    return np.asarray(cv2.remap(texture, column, row, cv2.INTER_LINEAR)), places[..., 0]
+
+
+def along(k: int, speed_m: float = 0.015) -> Array:
+    """Return T_cam_scene (4, 4) of the left camera at frame k of a straight, level motion to the right and forward."""
+    return se3(np.eye(3), -k * speed_m * np.array([1.0, 0.2, 0.4]))
+
+
+Pair = tuple[Image, Image]
+FRAMES = 10
+START_NS, PERIOD_NS = 1_403_715_273_262_142_976, 50_000_000
+# The IMU looks ahead with its x, to the left with its y; the camera stands a little off it.
+T_IMU_LEFT = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.05, 0.06, 0.01]))
+
+
+@dataclass(frozen=True, eq=False)
+class Filmed:
+    """The rectified images of a pair along the motion, and its calibration."""
+
+    rig: RectifiedPair
+    images: list[Pair]
+
+    def depths_m(self, corners_px: Array, k: int) -> Array:
+        """Return how far before the first camera the points lie that corners (N, 4) of frame k show."""
+        rig = self.rig
+        depth = rig.fx_px * rig.baseline_m / (corners_px[:, 0] - corners_px[:, 2])
+        return np.asarray(self.points_m(corners_px, depth, k)[:, 2])
+
+    def points_m(self, corners_px: Array, depth_m: Array, k: int) -> Array:
+        """Return the points (N, 3) of corners with depths (N,), in the first camera's axes."""
+        rig = self.rig
+        x, y = (corners_px[:, 0] - rig.cx_px) / rig.fx_px, (corners_px[:, 1] - rig.cy_px) / rig.fy_px
+        points_rect = np.stack([x, y, np.ones_like(x)], axis=1) * depth_m[:, None]
+        return np.asarray(points_rect @ rig.R_rect_cam - along(k)[:3, 3])
+
+
+def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3) -> list[Pair]:
+    """Return the images of both cameras along the motion."""
+    shown = scene(seed)
+    return [
+        (
+            shown.seen(cameras[0], along(k), seed=2 * k),
+            shown.seen(cameras[1], T_right_left @ along(k), seed=2 * k + 1),
+        )
+        for k in range(frames)
+    ]
+
+
+@pytest.fixture(scope="session")
+def plain() -> Filmed:
+    """Return a film of cameras without distortion that are mounted perfectly."""
+    return Filmed(already_rectified(PLAIN.pinhole_px, BASELINE_M, SIZE), film((PLAIN, PLAIN), RECTIFIED, 10))
+
+
+@pytest.fixture(scope="session")
+def papered(plain: Filmed) -> Filmed:
+    """Return the plain film in which the wall and the board fade, from frame to frame, into others in their place."""
+    other = film((PLAIN, PLAIN), RECTIFIED, 6, seed=8)
+    images = []
+    for k, (pair, others) in enumerate(zip(plain.images[:6], other, strict=True)):
+        share = 0.14 * k
+        mixed = [np.rint((1.0 - share) * a + share * b).astype(np.uint8) for a, b in zip(pair, others, strict=True)]
+        images.append((mixed[0], mixed[1]))
+    return Filmed(plain.rig, images)
+
+
+@pytest.fixture(scope="session")
+def raw() -> dict[str, list[Pair]]:
+    """Return films of real lenses, as the cameras give them, by the model of their distortion."""
+    return {
+        camera.distortion: film((camera, camera), T_RIGHT_LEFT, frames)
+        for camera, frames in ((RADTAN, FRAMES), (EQUIDISTANT, 6))
+    }
+
+
+@pytest.fixture(scope="session", params=["none", "radtan", "equidistant"])
+def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pair]]) -> Filmed:
+    """Return a film for each model of distortion, rectified."""
+    if request.param == "none":
+        return plain
+    camera = {"radtan": RADTAN, "equidistant": EQUIDISTANT}[request.param]
+    rig = rectified(camera, camera, T_RIGHT_LEFT)
+    return Filmed(rig, [(rig.apply(left, 0), rig.apply(right, 1)) for left, right in raw[request.param][:6]])
+
+
+@pytest.fixture(autouse=True)
+def _shared_cache(shared_cache: None) -> None:
+    """Leave the user's own cache alone."""
+
+
+def write_images(folder: Path, images: list[Image], names: list[str]) -> None:
+    """Write images as PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for image, name in zip(images, names, strict=True):
+        cv2.imwrite(str(folder / name), image)
+
+
+def camera_yaml(camera: Camera, T_body_sensor: Array) -> str:
+    """Return the sensor.yaml of a camera."""
+    data = ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel())
+    model = {"radtan": "radial-tangential", "equidistant": "equidistant", "none": "none"}[camera.distortion]
+    return (
+        f"%YAML:1.0\nsensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\nrate_hz: 20\n"
+        f"resolution: [{camera.size_px[0]}, {camera.size_px[1]}]\ncamera_model: pinhole\n"
+        f"intrinsics: {list(camera.pinhole_px)}\ndistortion_model: {model}\n"
+        f"distortion_coefficients: {camera.coefficients.tolist()}\n"
+    )
+
+
+def imu_text(frames: int) -> str:
+    """Return the IMU of a level motion at constant speed, at 200 Hz, from 50 ms before the first frame on."""
+    columns = ",".join([f"w_RS_S_{a}" for a in "xyz"] + [f"a_RS_S_{a}" for a in "xyz"])
+    stamps = START_NS - PERIOD_NS + 5_000_000 * np.arange(10 * (frames + 2))
+    rng = np.random.default_rng(7)
+    gyro, accel = (
+        rng.normal(0.0, 0.002, (stamps.size, 3)),
+        rng.normal(0.0, 0.03, (stamps.size, 3)) + np.array([0.0, 0.0, 9.81]),
+    )
+    rows = zip(stamps.tolist(), np.hstack([gyro, accel]).tolist(), strict=True)
+    return f"#timestamp [ns],{columns}\n" + "".join(f"{t},{','.join(f'{x:.9g}' for x in row)}\n" for t, row in rows)
+
+
+def positions(frames: range) -> Array:
+    """Return where the IMU is (N, 3) m at frames, in a world whose axes are the IMU's at the first."""
+    moved = -np.stack([along(k)[:3, 3] for k in frames])
+    return np.asarray(moved @ T_IMU_LEFT[:3, :3].T)
+
+
+@pytest.fixture(scope="session")
+def asl_template(raw: dict[str, list[Pair]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return an ASL folder with real lenses' images, an IMU and a truth."""
+    root = tmp_path_factory.mktemp("film") / "film"
+    stamps = [START_NS + PERIOD_NS * k for k in range(FRAMES)]
+    names = [f"{t}.png" for t in stamps]
+    T_imu_right = T_IMU_LEFT @ np.linalg.inv(T_RIGHT_LEFT)
+    for side, (name, T) in enumerate((("cam0", T_IMU_LEFT), ("cam1", T_imu_right))):
+        write_images(root / "mav0" / name / "data", [pair[side] for pair in raw["radtan"]], names)
+        rows = "".join(f"{t},{file}\n" for t, file in zip(stamps, names, strict=True))
+        (root / "mav0" / name / "data.csv").write_text("#timestamp [ns],filename\n" + rows)
+        (root / "mav0" / name / "sensor.yaml").write_text(camera_yaml(RADTAN, T))
+    (root / "mav0/imu0").mkdir()
+    (root / "mav0/imu0/data.csv").write_text(imu_text(FRAMES))
+    densities = "gyroscope_noise_density: 1.7e-4\ngyroscope_random_walk: 1.9e-05\n"
+    densities += "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\n"
+    (root / "mav0/imu0/sensor.yaml").write_text(camera_yaml(PLAIN, np.eye(4)) + densities)
+    # Seconds as doubles are off by 1e-7: the truth begins before the first frame and ends behind the last.
+    frames = range(-1, FRAMES + 1)
+    rows = zip((START_NS + PERIOD_NS * k for k in frames), positions(frames).tolist(), strict=True)
+    lines = [f"{t / 1e9:.9f} {x:.9f} {y:.9f} {z:.9f} 0 0 0 1\n" for t, (x, y, z) in rows]
+    (root / "truth.tum").write_text("".join(lines))
+    return root
+
+
+@pytest.fixture
+def asl(asl_template: Path, tmp_path: Path) -> Path:
+    """Return a copy of the ASL folder that a test may spoil."""
+    return Path(shutil.copytree(asl_template, tmp_path / "film"))

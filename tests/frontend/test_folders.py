@@ -1,0 +1,304 @@
+"""ASL folders with images, from end to end: the choice of tracks, what is left out and named, what is refused."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from toolkit.datasets import is_drawn_from_a_seed, load_sequence
+from toolkit.datasets.io.euroc_calibration import read_calibration
+from toolkit.datasets.io.image_pairs import pairs_of_asl
+from toolkit.errors import DataError
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.frontend import rectified, track_images, tracking
+from toolkit.frontend.cameras import Image
+from toolkit.geometry import se3_inverse
+from toolkit.sequence import Sequence
+from toolkit.settings import Frontend
+
+FRAMES = 10
+IMAGES = "mav0/cam{}/data"
+
+
+def images(root: Path, camera: int) -> list[Path]:
+    return sorted((root / IMAGES.format(camera)).iterdir())
+
+
+def test_images_are_the_default_where_they_are_there(asl: Path) -> None:
+    sequence = load_sequence(str(asl))
+    assert sequence.name == "film"
+    assert sequence.frame_count == FRAMES
+    assert "stereo tracks from the images" in sequence.provenance.source
+    assert sequence.provenance.facts[0].startswith(f"stereo tracks made of {FRAMES} image pairs with OpenCV")
+    assert np.bincount(sequence.observations.frame).min() > 60
+    assert not is_drawn_from_a_seed(str(asl))
+    assert load_sequence(str(asl), 5).content_hash() == sequence.content_hash()
+
+
+def test_simulated_tracks_are_those_asked_for(asl: Path) -> None:
+    simulated = Frontend(tracks="simulated")
+    assert load_sequence(str(asl), 0, simulated).name == "film (simulated stereo)"
+    assert is_drawn_from_a_seed(str(asl), simulated)
+
+
+def test_a_folder_with_few_of_its_images_has_its_tracks_simulated_and_says_so(asl: Path) -> None:
+    for path in images(asl, 1)[:4]:
+        path.unlink()
+    facts = load_sequence(str(asl)).provenance.facts
+    assert "no image was read" in facts[0]
+    assert facts[-1].startswith("60.0 % of the camera's stamps have both images")
+    sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert sequence.frame_count == FRAMES - 4
+
+
+def test_images_can_do_without_a_truth(asl: Path) -> None:
+    (asl / "truth.tum").unlink()
+    assert load_sequence(str(asl)).truth is None
+
+
+def test_the_rig_is_the_rectified_one_as_it_is_mounted(asl: Path) -> None:
+    rig = load_sequence(str(asl)).rig
+    assert rig.baseline_m == pytest.approx(0.12, abs=1e-3)
+    T_imu_left = load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam
+    turned = se3_inverse(T_imu_left) @ rig.T_imu_cam
+    np.testing.assert_allclose(turned[:3, 3], 0.0, atol=1e-9)
+    assert 0.003 < np.arccos(0.5 * (np.trace(turned[:3, :3]) - 1.0)) < 0.03  # half of what the two differ by, and more
+
+
+def test_an_estimator_finds_the_motion_in_the_images(asl: Path, run_estimator: Callable[..., Any]) -> None:
+    prepared = prepare(Recording(str(asl)))
+    run = run_estimator("batch", prepared.sequence, prepared.prior)
+    assert run.status == "ok"
+    found = run.final.T_world_imu[:, :3, 3]
+    truth = prepared.sequence.truth
+    assert truth is not None
+    moved = np.linalg.norm(found - found[0], axis=1)
+    true = np.linalg.norm(truth.T_world_imu[:, :3, 3] - truth.T_world_imu[0, :3, 3], axis=1)
+    # 0.15 m of motion, seen at 1.6 to 3 m
+    np.testing.assert_allclose(moved, true, atol=0.005)
+
+
+def test_a_second_reading_tracks_nothing_and_is_the_same(
+    asl: Path, own_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = load_sequence(str(asl)).content_hash()
+    assert len(list((own_cache / "tracks").iterdir())) == 1
+    monkeypatch.setattr(tracking, "Tracker", None)
+    assert load_sequence(str(asl)).content_hash() == first
+
+
+def test_other_images_or_settings_are_tracked_anew(asl: Path, own_cache: Path) -> None:
+    def kept() -> int:
+        return len(list((own_cache / "tracks").iterdir()))
+
+    load_sequence(str(asl))
+    load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert kept() == 1
+    load_sequence(str(asl), 0, Frontend(window_px=21))
+    assert kept() == 2
+    shutil.copy(images(asl, 0)[3], images(asl, 0)[4])
+    load_sequence(str(asl))
+    assert kept() == 3
+
+
+def test_damaged_tracks_on_disk_are_made_again(asl: Path, own_cache: Path) -> None:
+    first = load_sequence(str(asl)).content_hash()
+    (kept,) = (own_cache / "tracks").iterdir()
+    kept.write_bytes(kept.read_bytes()[:500])
+    assert load_sequence(str(asl)).content_hash() == first
+
+
+def test_a_disk_that_takes_no_tracks_is_no_error(asl: Path, own_cache: Path) -> None:
+    own_cache.write_text("a file where the folder should be")
+    assert load_sequence(str(asl)).frame_count == FRAMES
+
+
+def rewrite(path: Path, change: Callable[[Image], Any]) -> None:
+    read = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert read is not None
+    cv2.imwrite(str(path), change(np.asarray(read, dtype=np.uint8)))
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def every(root: Path, camera: int, change: Callable[[Image], Any]) -> None:
+    for path in images(root, camera):
+        rewrite(path, change)
+
+
+def exchange(one: Path, other: Path) -> None:
+    aside = one.with_name("aside")
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+
+
+LEFT_OUT: list[tuple[str, Callable[[Path], object], str]] = [
+    ("truncated", lambda d: images(d, 0)[7].write_bytes(images(d, 0)[7].read_bytes()[:900]), "damaged or truncated"),
+    ("empty", lambda d: images(d, 1)[7].write_bytes(b""), "it is empty"),
+    ("missing", lambda d: images(d, 1)[7].unlink(), "missing"),
+    ("no image", lambda d: images(d, 0)[7].write_bytes(b"<html>"), "no image"),
+    ("smaller", lambda d: rewrite(images(d, 1)[7], lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
+    ("turned", lambda d: rewrite(images(d, 0)[7], np.rot90), "240x320 px, expected 320x240"),
+    ("mispaired", lambda d: rewrite(images(d, 1)[7], lambda i: i[::-1]), "not of the same instant"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in LEFT_OUT], ids=[m[0] for m in LEFT_OUT])
+def test_one_bad_image_is_named_and_left_out(asl: Path, spoil: Callable[[Path], object], complaint: str) -> None:
+    name = images(asl, 0)[7].name
+    spoil(asl)
+    sequence = load_sequence(str(asl))
+    assert sequence.frame_count == FRAMES - 1
+    fact = next(fact for fact in sequence.provenance.facts if "left out" in fact)
+    assert f"1 of {FRAMES} image pairs" in fact
+    assert name in fact
+    assert complaint in fact
+    seen = sequence.observations
+    across = np.intersect1d(seen.track_id[seen.frame == 6], seen.track_id[seen.frame == 7])
+    assert across.size > 20  # the tracks go on behind it
+
+
+USED: list[tuple[str, Callable[[Path], object]]] = [
+    ("colour", lambda d: [every(d, c, lambda i: cv2.merge([i, i, i])) for c in (0, 1)]),
+    ("one colour, one grey", lambda d: every(d, 0, lambda i: cv2.merge([i, i, i]))),
+    ("16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)]),
+    ("12 of 16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 16) for c in (0, 1)]),
+    ("no table", lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)]),
+    ("crlf", lambda d: edit(d / "mav0/cam0/data.csv", "\n", "\r\n")),
+]
+
+
+@pytest.mark.parametrize("change", [m[1] for m in USED], ids=[m[0] for m in USED])
+def test_the_same_images_in_another_guise_give_the_same_tracks(asl: Path, change: Callable[[Path], object]) -> None:
+    before = load_sequence(str(asl))
+    change(asl)
+    after = load_sequence(str(asl), 0, Frontend(tracks="images"))
+    np.testing.assert_array_equal(after.observations.uv_px, before.observations.uv_px)
+    np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
+
+
+def reverse_rows(path: Path) -> None:
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *rows[::-1]]) + "\n")
+
+
+def test_stamps_out_of_order_are_sorted_and_said(asl: Path) -> None:
+    before = load_sequence(str(asl))
+    reverse_rows(asl / "mav0/cam0/data.csv")
+    after = load_sequence(str(asl))
+    np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
+    assert any("out of order" in fact for fact in after.provenance.facts)
+
+
+def test_a_left_image_without_a_right_one_is_said(asl: Path) -> None:
+    lines = (asl / "mav0/cam1/data.csv").read_text().splitlines()
+    (asl / "mav0/cam1/data.csv").write_text("\n".join([*lines[:5], *lines[6:]]) + "\n")
+    after = load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert after.frame_count == FRAMES - 1
+    assert any("1 left images have no right one" in fact for fact in after.provenance.facts)
+
+
+YAML = "mav0/cam{}/sensor.yaml"
+REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
+    ("folders exchanged", lambda d: exchange(d / "mav0/cam0/data", d / "mav0/cam1/data"), "images are exchanged"),
+    ("cameras exchanged", lambda d: exchange(d / "mav0/cam0", d / "mav0/cam1"), "not to the right of cam0"),
+    ("yaml exchanged", lambda d: exchange(d / YAML.format(0), d / YAML.format(1)), "not to the right of cam0"),
+    ("no left yaml", lambda d: (d / YAML.format(0)).unlink(), "cam0/sensor.yaml: cannot be read"),
+    ("no right yaml", lambda d: (d / YAML.format(1)).unlink(), "cam1/sensor.yaml: cannot be read"),
+    ("no imu", lambda d: (d / "mav0/imu0/data.csv").unlink(), "imu0/data.csv.*cannot be read"),
+    ("no imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").unlink(), "imu0/sensor.yaml: cannot be read"),
+    ("empty imu", lambda d: (d / "mav0/imu0/data.csv").write_text(""), "imu0/data.csv: missing column"),
+    ("other model", lambda d: edit(d / YAML.format(0), "model: pinhole", "model: omni"), "camera_model omni"),
+    ("other lens", lambda d: edit(d / YAML.format(0), "radial-tangential", "fov"), "distortion_model fov is unknown"),
+    ("few numbers", lambda d: edit(d / YAML.format(1), "[-0.28, ", "["), "has 3 values, expected 4 or 5"),
+    ("no focal", lambda d: edit(d / YAML.format(0), "[230.0, 228.0", "[0.0, 228.0"), "intrinsics 0 228"),
+    ("other size", lambda d: edit(d / YAML.format(1), "[320, 240]", "[640, 480]"), "a pair needs one size"),
+    ("both other size", lambda d: [edit(d / YAML.format(c), "[320, 240]", "[640, 480]") for c in (0, 1)], "320x240 px"),
+    ("mirrored pose", lambda d: edit(d / YAML.format(0), "[0, 0, 1,", "[0, 0, -1,"), "a reflection|not a rotation"),
+    ("cut yaml", lambda d: (d / YAML.format(0)).write_text("T_BS:\n  data: [1, 2"), "no YAML, or truncated"),
+    ("no yaml", lambda d: (d / YAML.format(0)).write_bytes(b"\x89PNG\r\n\x1a\n\xff"), "not a text file"),
+    ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
+    ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "0 frame"),
+    ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
+    ("stamps in seconds", lambda d: edit(d / "mav0/cam0/data.csv", "\n14", "\n1.4"), "not in whole nanoseconds"),
+    ("wrong tilt", lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
+    ("same images", lambda d: [every(d, 1, lambda i: i[::-1, ::-1])], "the calibration is not that of these"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in REFUSED], ids=[m[0] for m in REFUSED])
+def test_a_folder_that_cannot_be_used_is_one_clear_line(
+    asl: Path, spoil: Callable[[Path], object], complaint: str
+) -> None:
+    spoil(asl)
+    with pytest.raises(DataError, match=complaint) as raised:
+        load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert "\n" not in str(raised.value)
+
+
+def kalibr(root: Path, rows: Callable[[int], str], model: str = "radtan") -> None:
+    """Put Kalibr's files in the place of sensor.yaml."""
+    for camera in (0, 1):
+        (root / YAML.format(camera)).unlink()
+    (root / "mav0/imu0/sensor.yaml").unlink()
+    lens = "distortion_coeffs: [-0.28, 0.07, 2.0e-4, 1.0e-4]\n"
+    common = (
+        f"  camera_model: pinhole\n  {lens}  distortion_model: {model}\n"
+        "  intrinsics: [230.0, 228.0, 163.0, 118.0]\n  resolution: [320, 240]\n  rostopic: /cam/image_raw\n"
+    )
+    chain = "".join(f"cam{c}:\n{rows(c)}  cam_overlaps: [{1 - c}]\n{common}" for c in (0, 1))
+    (root / "camchain-imucam.yaml").write_text(f"%YAML:1.0\n{chain}")
+    (root / "imu0.yaml").write_text(
+        "accelerometer_noise_density: 2.0e-3\naccelerometer_random_walk: 3.0e-3\ngyroscope_noise_density: 1.7e-4\n"
+        "gyroscope_random_walk: 1.9e-5\nrostopic: /imu0\nupdate_rate: 200.0\n"
+    )
+
+
+def as_rows(key: str, T: Any) -> str:
+    return f"  {key}:\n" + "".join(f"  - [{', '.join(f'{x:.12g}' for x in row)}]\n" for row in T)
+
+
+@pytest.mark.parametrize("key", ["T_cam_imu", "T_cn_cnm1"])
+def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str) -> None:
+    before = load_sequence(str(asl))
+    T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
+    T_right_left = _right_left(asl)
+    second = T_right_left if key == "T_cn_cnm1" else T_right_left @ T_left_imu
+    kalibr(asl, lambda c: as_rows("T_cam_imu", T_left_imu) if c == 0 else as_rows(key, second))
+    after = load_sequence(str(asl))
+    np.testing.assert_allclose(after.rig.T_imu_cam, before.rig.T_imu_cam, atol=1e-9)
+    assert after.rig.baseline_m == pytest.approx(before.rig.baseline_m, rel=1e-9)
+    # twelve printed digits move a rectified pixel by nothing that shows
+    np.testing.assert_allclose(np.sort(after.observations.uv_px[:, 0])[::50], _left_columns(before)[::50], atol=0.05)
+    assert any("camchain-imucam.yaml" in fact for fact in after.provenance.facts)
+
+
+def _right_left(root: Path) -> Any:
+    return read_calibration(root, root / "mav0").T_right_left
+
+
+def _left_columns(sequence: Sequence) -> Any:
+    return np.sort(sequence.observations.uv_px[:, 0])
+
+
+def test_the_first_seconds_of_a_real_flight_have_tracks_enough(real: Callable[[str], Path]) -> None:
+    root = real("euroc/MH_01_easy_8s")
+    calibration = read_calibration(root, root / "mav0")
+    assert calibration.cameras is not None
+    rig = rectified(*calibration.cameras, calibration.T_right_left)
+    tracks = track_images(pairs_of_asl(root / "mav0").pairs[:12], rig, Frontend())
+    a_frame = np.bincount(tracks.frame)
+    assert tracks.skipped == ()
+    assert a_frame.mean() > 110
+    assert a_frame.min() > 60
+    lives = np.bincount(tracks.track_id)
+    assert lives.mean() > 4

@@ -1,0 +1,145 @@
+"""Which image files belong together: listed in the tables of an ASL folder, or paired by the numbers of their names."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.datasets.io.tables import read_stamps
+from toolkit.errors import DataError
+from toolkit.frontend import ImageTracks, RectifiedPair, StampedPair
+from toolkit.geometry import Array, IntArray
+from toolkit.inputs import is_regular, read_text_input
+from toolkit.models.noise import pixel_covariance
+from toolkit.sequence import StereoRig
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
+# Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
+_SAME_INSTANT_NS = 1_000_000
+# So many of the pairs left out are told by name.
+_NAMED = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Listed:
+    """Pairs in order of time, how many stamps the left camera has, and what had to be put right, in words."""
+
+    pairs: tuple[StampedPair, ...]
+    stamps: int
+    remarks: tuple[str, ...] = ()
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the image files of a folder by name; none where there is no such folder."""
+    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+
+
+def pairs_of_asl(mav0: Path) -> Listed:
+    """Pair the images of cam0 and cam1 by their stamps; files that are listed and missing stay in, to be named.
+
+    Raises DataError where a table is damaged.
+    """
+    left, right = (_files(mav0 / camera) for camera in ("cam0", "cam1"))
+    remarks = []
+    if not np.array_equal(np.sort(left.t_ns), left.t_ns):
+        remarks.append(f"the stamps of {left.folder.name}/data.csv were out of order and have been sorted")
+    t_ns, first = np.unique(left.t_ns, return_index=True)
+    if t_ns.size < left.t_ns.size:
+        remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.folder.name} had the stamp of another; left out")
+    partner = _nearest(right.t_ns, t_ns)
+    alone = int((partner < 0).sum())
+    if alone:
+        remarks.append(f"{alone} left images have no right one within 1 ms and are left out")
+    pairs = tuple(
+        StampedPair(int(t), left.path(int(i)), right.path(int(j)))
+        for t, i, j in zip(t_ns, first, partner, strict=True)
+        if j >= 0
+    )
+    return Listed(pairs, t_ns.size, tuple(remarks))
+
+
+def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
+    """Pair images whose names are the same number; ``t_ns`` has the stamp of each number.
+
+    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said.
+    """
+    numbers = {int(path.stem): path.suffix for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    names = {int(path.stem): path.stem for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
+    remarks = []
+    if len(stamped) < len(numbers):
+        remarks.append(f"{len(numbers) - len(stamped)} images have no stamp and are left out")
+    if [number for _, number in stamped] != sorted(number for _, number in stamped):
+        remarks.append("the stamps of the images were out of order and have been sorted")
+    pairs: list[StampedPair] = []
+    for stamp, number in stamped:
+        if pairs and pairs[-1].t_ns == stamp:
+            remarks.append(f"image {names[number]} has the stamp of another and is left out")
+            continue
+        name = f"{names[number]}{numbers[number]}"
+        pairs.append(StampedPair(stamp, left / name, right / name))
+    return Listed(tuple(pairs), len(numbers), tuple(remarks))
+
+
+def rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
+    """Return the rig of rectified images; ``T_imu_left`` (4, 4) is where the left camera is mounted."""
+    T_imu_rect = T_imu_left.copy()
+    T_imu_rect[:3, :3] = T_imu_left[:3, :3] @ pair.R_rect_cam.T
+    pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
+    return StereoRig(*pinhole_px, pair.baseline_m, T_imu_rect, pixel_covariance(2))
+
+
+def facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
+    """Return what a reader must know of tracks from so many pairs, and which of these were left out."""
+    used = tracks.t_ns.size
+    a_frame = np.bincount(tracks.frame, minlength=used)
+    facts = [
+        f"stereo tracks made of {used} image pairs with OpenCV: {a_frame.mean():.0f} a frame, {a_frame.min()} at least"
+    ]
+    if tracks.skipped:
+        named = ", ".join(tracks.skipped[:_NAMED])
+        more = f" and {len(tracks.skipped) - _NAMED} more" if len(tracks.skipped) > _NAMED else ""
+        facts.append(f"{len(tracks.skipped)} of {pairs} image pairs could not be used and are left out: {named}{more}")
+    return tuple(facts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Files:
+    """The stamps (N,) and names of one camera's images."""
+
+    folder: Path
+    t_ns: IntArray
+    names: tuple[str, ...]
+
+    def path(self, row: int) -> Path:
+        return self.folder / "data" / self.names[row]
+
+
+def _files(folder: Path) -> _Files:
+    """Return what a camera's table lists, or the images there are, whose names are stamps."""
+    table = folder / "data.csv"
+    if not is_regular(table):
+        found = [path for path in images_in(folder / "data") if path.stem.isdigit()]
+        t_ns = np.array([int(path.stem[:19]) for path in found], dtype=np.int64)
+        return _Files(folder, t_ns, tuple(path.name for path in found))
+    t_ns = read_stamps(table, header_lines=1)
+    rows = [row for row in read_text_input(table, "copy it again").splitlines()[1:] if row.strip() and row[0] != "#"]
+    names = tuple(row.partition(",")[2].strip() for row in rows)
+    if len(names) != t_ns.size or any("/" in name or "\\" in name for name in names):
+        raise DataError(f"{table}: expected a stamp and the name of an image in each row; export it again")
+    return _Files(folder, t_ns, tuple(name or f"{t}.png" for name, t in zip(names, t_ns.tolist(), strict=True)))
+
+
+def _nearest(t_ns: IntArray, asked_ns: IntArray) -> IntArray:
+    """Return the row of the stamp nearest to each asked one, -1 where none is of the same instant."""
+    if t_ns.size == 0:
+        return np.full(asked_ns.size, -1)
+    order = np.argsort(t_ns, kind="stable")
+    after = np.clip(np.searchsorted(t_ns[order], asked_ns), 1, max(t_ns.size - 1, 1))
+    before = after - 1
+    after = np.minimum(after, t_ns.size - 1)
+    nearer = np.where(
+        np.abs(t_ns[order[after]] - asked_ns) < np.abs(t_ns[order[before]] - asked_ns), order[after], order[before]
+    )
+    return np.where(np.abs(t_ns[nearer] - asked_ns) <= _SAME_INSTANT_NS, nearer, -1)

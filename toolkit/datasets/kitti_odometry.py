@@ -1,0 +1,191 @@
+"""KITTI odometry sequences: rectified stereo images, calib.txt, and times.txt and poses where they are there.
+
+A folder with ``image_0`` and ``image_1`` (or ``image_2`` and ``image_3``, or ``image_l`` and ``image_r``). There is no
+motion input: estimators assume a smooth motion (:mod:`toolkit.models.smooth_twist`), which every report says. The body,
+called IMU everywhere, is camera 0 with the axes forward, left, up. Poses are camera 0's, in the folder or, as the
+download has it, in ``../../poses/<name>.txt``.
+Source: Geiger, Lenz & Urtasun, "Are we ready for autonomous driving? The KITTI vision benchmark suite" (CVPR 2012).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, pairs_by_name, rig_of
+from toolkit.datasets.trajectories import read_poses
+from toolkit.errors import DataError
+from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
+from toolkit.geometry import Array, IntArray, se3
+from toolkit.inputs import is_regular, read_text_input
+from toolkit.models.noise import unmeasured_motion
+from toolkit.progress import SILENT, Progress
+from toolkit.sequence import NoSamples, Provenance, Sequence, Truth
+from toolkit.settings import DEFAULTS, Frontend, Tracks
+
+NO_MOTION = "no motion input: all estimators assume a motion that is smooth, and say so"
+# Grey or colour, and the rows of calib.txt that are theirs.
+_FOLDERS = (("image_0", "image_1", 0), ("image_2", "image_3", 2), ("image_l", "image_r", 0))
+_PERIOD_S = 0.1
+# Axes right, down, forward of a camera, from forward, left, up.
+T_FLU_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The folders of both cameras' images, and the row of calib.txt of the left one."""
+
+    root: Path
+    left: Path
+    right: Path
+    row: int
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is a folder with the images of a rectified pair, named as KITTI odometry names them."""
+    return _layout(path) is not None
+
+
+def load(path: Path) -> Sequence:
+    """Read a sequence with the front end's default settings; see :func:`load_from_images`."""
+    return load_from_images(path, DEFAULTS.frontend, SILENT)
+
+
+def uses_images(path: Path, tracks: Tracks) -> bool:
+    """Say that the tracks are made of the images; raise DataError where simulated ones are asked for."""
+    if tracks == "simulated":
+        raise DataError(f"{path}: tracks are simulated for EuRoC folders only; leave --tracks simulated out")
+    return True
+
+
+def images_of(path: Path) -> ImageRecording:
+    """Return the image pairs and their cameras; raises DataError as :func:`load_from_images`."""
+    layout = _whole(path)
+    return ImageRecording(_listed(layout, _stamps(layout)[0]).pairs, _pair(layout))
+
+
+def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
+    """Read calibration, stamps and poses, and make the tracks of the images.
+
+    Raises DataError where a part is missing or damaged, or the images cannot be used.
+    """
+    layout = _whole(path)
+    pair = _pair(layout)
+    stamps, how = _stamps(layout)
+    listed = _listed(layout, stamps)
+    tracks = track_images(listed.pairs, pair, frontend, progress)
+    check_frame_count(layout.root, tracks.t_ns.size)
+    left = _projections(layout)[0]
+    T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
+    truth = _truth(layout, stamps, tracks.t_ns)
+    facts = (NO_MOTION, *facts_of(tracks, len(listed.pairs)), *listed.remarks, *how)
+    return Sequence(
+        name=layout.root.name,
+        rig=rig_of(pair, T_FLU_CAM @ T_cam0_left),
+        noise=unmeasured_motion(),
+        frames_t_ns=tracks.t_ns,
+        observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
+        motion=NoSamples(tracks.t_ns),
+        provenance=Provenance("kitti-odometry", f"{path}: stereo tracks from the images", facts),
+        truth=truth,
+    )
+
+
+def _whole(path: Path) -> _Layout:
+    layout = _layout(path)
+    if layout is None:
+        raise DataError(f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images")
+    return layout
+
+
+def _pair(layout: _Layout) -> RectifiedPair:
+    left, right = _projections(layout)
+    baseline_m = (left[0, 3] - right[0, 3]) / left[0, 0]
+    if not baseline_m > 0.0:
+        raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
+    fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
+    size_px = size_of(_first_readable(layout))
+    return already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
+
+
+def _listed(layout: _Layout, stamps: IntArray) -> Listed:
+    listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
+    check_frame_count(layout.root, len(listed.pairs))
+    return listed
+
+
+def _layout(path: Path) -> _Layout | None:
+    root = path.resolve()
+    for left, right, row in _FOLDERS:
+        if images_in(root / left) or images_in(root / right):
+            return _Layout(root, root / left, root / right, row)
+    return None
+
+
+def _projections(layout: _Layout) -> tuple[Array, Array]:
+    """Return the projections (3, 4) of both cameras from calib.txt, whose rows may or may not be named P0, P1, ..."""
+    file = layout.root / "calib.txt"
+    rows: dict[str, Array] = {}
+    for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
+        name, colon, rest = line.partition(":")
+        words = (rest if colon else line).split()
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError as error:
+            raise DataError(f"{file}: line {number}: {error}; expected a name and twelve numbers") from error
+        if values.size == 12:
+            rows[name.strip() if colon else f"P{len(rows)}"] = values.reshape(3, 4)
+    wanted = [f"P{layout.row}", f"P{layout.row + 1}"]
+    missing = [name for name in wanted if name not in rows]
+    if missing:
+        raise DataError(
+            f"{file}: missing {', '.join(missing)}, twelve numbers each; it has {', '.join(rows) or 'none'}"
+        )
+    left, right = (rows[name] for name in wanted)
+    for name, P in zip(wanted, (left, right), strict=True):
+        if not (np.isfinite(P).all() and P[0, 0] > 0.0 and P[1, 1] > 0.0):
+            raise DataError(f"{file}: {name} is no projection: its focal lengths must be positive")
+    if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6):
+        raise DataError(f"{file}: {wanted[0]} and {wanted[1]} differ in more than the baseline; they are not rectified")
+    return left, right
+
+
+def _first_readable(layout: _Layout) -> Path:
+    """Return the first image that can be read, or the first, whose fault is then told."""
+    found = images_in(layout.left) or images_in(layout.right)
+    for path in found[:10]:
+        try:
+            size_of(path)
+        except DataError:
+            continue
+        return path
+    return found[0]
+
+
+def _stamps(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:
+    """Return the stamp (N,) of each image number, and what must be known of them."""
+    file = layout.root / "times.txt"
+    if not is_regular(file):
+        last = max((int(p.stem) for p in images_in(layout.left) if p.stem.isdecimal()), default=-1)
+        period_ns = round(_PERIOD_S * 1e9)
+        return period_ns * np.arange(last + 1), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
+    try:
+        seconds = np.array([float(word) for word in read_text_input(file, "times.txt is text").split()])
+    except ValueError as error:
+        raise DataError(f"{file}: {error}; expected seconds, one a line") from error
+    return stamps_ns(file, "stamp", seconds), ()
+
+
+def _truth(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
+    """Return the poses of the frames used, as those of the body; None where there are no poses."""
+    beside = layout.root.parent.parent / "poses" / f"{layout.root.name}.txt"
+    file = next((path for path in (layout.root / "poses.txt", beside) if is_regular(path)), None)
+    if file is None:
+        return None
+    T_world_cam = read_poses(file).T_world_imu
+    if len(T_world_cam) != stamps.size:
+        raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence")
+    T_cam_flu = np.linalg.inv(T_FLU_CAM)
+    used = np.flatnonzero(np.isin(stamps, t_ns))
+    return Truth(stamps[used], T_FLU_CAM @ T_world_cam[used] @ T_cam_flu)

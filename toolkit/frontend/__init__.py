@@ -1,0 +1,21 @@
+"""From images to stereo tracks, with OpenCV: what every estimator reads, made once for all of them.
+
+Read ``tracker`` first: it is the algorithm. ``tracking`` runs it over a recording.
+"""
+
+from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified
+from toolkit.frontend.images import StampedPair, size_of
+from toolkit.frontend.tracking import ImageRecording, ImageTracks, track_images
+
+__all__ = [
+    "Camera",
+    "ImageRecording",
+    "ImageTracks",
+    "Pinhole",
+    "RectifiedPair",
+    "StampedPair",
+    "already_rectified",
+    "rectified",
+    "size_of",
+    "track_images",
+]

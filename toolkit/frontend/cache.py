@@ -1,0 +1,81 @@
+"""Tracks kept on disk under the hash of what they were made of: images, calibration, settings and this front end.
+
+``VISLAM_CACHE`` names the folder, by default ``vislam`` in the user's folder for caches. Any of it may be deleted.
+"""
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.errors import DataError, OutputError
+from toolkit.files import content_digest, replaced_file
+from toolkit.frontend.cameras import RectifiedPair
+from toolkit.frontend.images import StampedPair
+from toolkit.inputs import read_input
+from toolkit.settings import Frontend
+
+# Raised with every change of the front end that changes its tracks.
+_FRONT_END = 1
+_ARRAYS = ("t_ns", "frame", "track_id", "corners_px")
+_HASHERS = 2
+
+
+def key_of(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend) -> str:
+    """Return the hash of the content of all images, in their order, and of all else that the tracks depend on."""
+    paths = [path for pair in pairs for path in (pair.left, pair.right)]
+    with ThreadPoolExecutor(_HASHERS) as hashers:
+        images = list(hashers.map(_digest, paths))
+    asked = {name: getattr(settings, name) for name in settings.__struct_fields__ if name != "tracks"}
+    stamps = np.array([pair.t_ns for pair in pairs], dtype=np.int64)
+    made_by = f"{_FRONT_END} {version('opencv-python-headless')} {version('numpy')}"
+    return content_digest((made_by, repr(asked), rig, stamps, *images))
+
+
+def load(key: str) -> dict[str, Any] | None:
+    """Return the tracks kept under a key, or None where there are none or they are damaged."""
+    path = _path(key)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            kept: dict[str, Any] = {name: archive[name] for name in _ARRAYS}
+            kept["skipped"] = tuple(archive["skipped"].tolist())
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile):
+        return None
+    return kept
+
+
+def save(key: str, tracks: Mapping[str, Any]) -> None:
+    """Keep tracks under a key; a disk that cannot take them only means that they are made again."""
+    path = _path(key)
+    arrays = {name: tracks[name] for name in _ARRAYS}
+    with suppress(OSError, OutputError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced_file(path) as partial, partial.open("wb") as stream:
+            np.savez(stream, skipped=np.array(tracks["skipped"], dtype=np.str_), **arrays)
+
+
+def folder() -> Path:
+    """Return the folder of what is kept."""
+    given = os.environ.get("VISLAM_CACHE")
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "vislam"
+
+
+def _path(key: str) -> Path:
+    return folder() / "tracks" / f"{key}.npz"
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(read_input(path)).hexdigest()
+    except DataError:
+        return "missing"

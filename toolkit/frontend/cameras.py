@@ -1,0 +1,146 @@
+"""Two calibrated cameras made one rectified pair: maps that undistort and rectify images, and the pair's calibration.
+
+After rectification both image planes are parallel to the baseline, so that a point has the same row in both images.
+Models of distortion: radial-tangential (Brown 1966) and equidistant (Kannala & Brandt 2006), as Kalibr and OpenCV
+have them.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray
+
+Image = npt.NDArray[np.uint8]
+Pinhole = tuple[float, float, float, float]
+Distortion = Literal["none", "radtan", "equidistant"]
+# A rectified pair sees nearly what its cameras see; cameras that look apart by more are no stereo pair.
+_MOST_TURNED_RAD = 0.5
+# Bilinear interpolation at the border of what a camera sees mixes in what it does not see.
+_BORDER_PX = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera: (fx, fy, cx, cy) px, the model and coefficients (n,) of its distortion, and (width, height) px."""
+
+    pinhole_px: Pinhole
+    distortion: Distortion
+    coefficients: Array
+    size_px: tuple[int, int]
+
+    @property
+    def K(self) -> Array:
+        """Return the calibration matrix (3, 3)."""
+        fx, fy, cx, cy = self.pinhole_px
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """Where each pixel of a rectified image is in the camera's, as cv2.remap takes it, and whether it is seen."""
+
+    columns: npt.NDArray[np.int16]
+    rows: npt.NDArray[np.uint16]
+    seen: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """The calibration of rectified images, and the maps of both cameras; no maps where images come rectified.
+
+    ``R_rect_cam`` (3, 3) turns left-camera coordinates into the rectified camera's. ``raw_size_px`` is the size that
+    images must have, ``size_px`` what they have once rectified.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    baseline_m: float
+    raw_size_px: tuple[int, int]
+    size_px: tuple[int, int]
+    R_rect_cam: Array
+    maps: tuple[Maps, Maps] | None = None
+
+    def apply(self, image: Image, side: int) -> Image:
+        """Return a rectified image of the left (0) or right (1) camera."""
+        if self.maps is None:
+            return image
+        import cv2
+
+        maps = self.maps[side]
+        return np.asarray(cv2.remap(image, maps.columns, maps.rows, cv2.INTER_LINEAR), dtype=np.uint8)
+
+    def seen(self, side: int) -> BoolArray:
+        """Return which pixels (height, width) of a rectified image the camera sees."""
+        width, height = self.size_px
+        if self.maps is None:
+            seen = np.zeros((height, width), dtype=bool)
+            seen[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = True
+            return seen
+        return self.maps[side].seen
+
+
+def already_rectified(pinhole_px: Pinhole, baseline_m: float, size: tuple[int, int]) -> RectifiedPair:
+    """Return the pair of images that come rectified: they pass through as they are."""
+    return RectifiedPair(*pinhole_px, baseline_m, raw_size_px=size, size_px=size, R_rect_cam=np.eye(3))
+
+
+def rectified(left: Camera, right: Camera, T_right_left: Array) -> RectifiedPair:
+    """Rectify two cameras; ``T_right_left`` (4, 4) takes left-camera coordinates to the right camera's.
+
+    Both are turned by half of what they differ by, then together until the baseline is their x-axis (Bouguet, as
+    cv2.stereoRectify). Raises DataError where they are no stereo pair.
+    """
+    import cv2
+
+    _check_pair(left, right, T_right_left)
+    # OpenCV wants contiguous arrays, and the translation as a column.
+    turn, shift = np.ascontiguousarray(T_right_left[:3, :3]), np.ascontiguousarray(T_right_left[:3, 3:4])
+    coefficients = [c.coefficients if c.distortion == "radtan" else np.zeros(4) for c in (left, right)]
+    R_rect_left, R_rect_right, projection_left, projection_right, *_ = cv2.stereoRectify(
+        left.K, coefficients[0], right.K, coefficients[1], left.size_px, turn, shift, alpha=0
+    )
+    baseline_m = -float(projection_right[0, 3] / projection_right[0, 0])
+    K = np.array(projection_left[:, :3], dtype=np.float64)
+    if "equidistant" in (left.distortion, right.distortion):
+        K = _keeping_resolution(left, right)
+    maps = (_maps(left, np.asarray(R_rect_left), K), _maps(right, np.asarray(R_rect_right), K))
+    fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return RectifiedPair(fx, fy, cx, cy, baseline_m, left.size_px, left.size_px, np.array(R_rect_left), maps)
+
+
+def _check_pair(left: Camera, right: Camera, T_right_left: Array) -> None:
+    if left.size_px != right.size_px:
+        raise DataError(f"the cameras have images of {left.size_px} and {right.size_px} px; a pair needs one size")
+    turned = float(np.arccos(np.clip(0.5 * (np.trace(T_right_left[:3, :3]) - 1.0), -1.0, 1.0)))
+    if turned > _MOST_TURNED_RAD:
+        raise DataError(f"the cameras look {np.rad2deg(turned):.0f} deg apart; a stereo pair looks the same way")
+    x, y, z = T_right_left[:3, 3]
+    if -x < max(abs(y), abs(z)):
+        where = "left" if x > max(abs(y), abs(z)) else "above, below or behind"
+        raise DataError(f"the right camera stands {where} of the left one; exchange the two, or mend the extrinsics")
+
+
+def _keeping_resolution(left: Camera, right: Camera) -> Array:
+    """Return K (3, 3) of a pinhole with the resolution that wide-angle cameras have in the middle of their view."""
+    focal_px = float(np.mean([left.pinhole_px[:2], right.pinhole_px[:2]]))
+    width, height = left.size_px
+    return np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+
+
+def _maps(camera: Camera, R_rect_cam: Array, K: Array) -> Maps:
+    import cv2
+
+    make = cv2.fisheye.initUndistortRectifyMap if camera.distortion == "equidistant" else cv2.initUndistortRectifyMap
+    u, v = make(camera.K, camera.coefficients, R_rect_cam, K, camera.size_px, cv2.CV_32FC1)
+    columns, rows = cv2.convertMaps(u, v, cv2.CV_16SC2)
+    width, height = camera.size_px
+    inside = (u > 0.0) & (u < width - 1.0) & (v > 0.0) & (v < height - 1.0)
+    size = 2 * _BORDER_PX + 1
+    seen = cv2.erode(inside.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0)
+    return Maps(np.asarray(columns), np.asarray(rows), np.asarray(seen > 0))

@@ -1,0 +1,103 @@
+"""Tracks drawn over the images they were made of: what a reader looks at before believing a number."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.files import replaced_directory
+from toolkit.frontend.cameras import Image
+from toolkit.frontend.images import Unusable, bit_depth
+from toolkit.frontend.tracking import ImageRecording, ImageTracks, read_pair
+from toolkit.geometry import Array, IntArray
+from toolkit.progress import SILENT, Progress
+
+# How many past positions a track drags behind it, and the age (frames) at which it has its last colour.
+_TRAIL, _OLD = 12, 20
+_VIDEO, _VIDEO_HZ = "tracks.avi", 10.0
+
+
+def write_stills(
+    recording: ImageRecording, tracks: ImageTracks, directory: Path, count: int, progress: Progress = SILENT
+) -> tuple[str, ...]:
+    """Write so many stills, spread over the recording, to a directory, whole or not at all; return their names.
+
+    A still is a left image beside its right one: a circle a track, blue where it is new and red where it is old, with
+    its way over the last frames. Raises OutputError where the directory holds anything else.
+    """
+    import cv2
+
+    frames = np.unique(np.linspace(0, tracks.t_ns.size - 1, count).astype(int))
+    names = []
+    with replaced_directory(directory, _written_by_us) as partial:
+        for k, image in _drawn(recording, tracks, frames, progress):
+            name = f"{int(tracks.t_ns[k])}.png"
+            cv2.imwrite(str(partial / name), image)
+            names.append(name)
+    return tuple(names)
+
+
+def write_video(
+    recording: ImageRecording, tracks: ImageTracks, directory: Path, progress: Progress = SILENT
+) -> tuple[str, ...]:
+    """Write every frame as a video (Motion JPEG) to a directory, as :func:`write_stills`."""
+    import cv2
+
+    width, height = recording.rig.size_px
+    with replaced_directory(directory, _written_by_us) as partial:
+        code = cv2.VideoWriter.fourcc(*"MJPG")
+        video = cv2.VideoWriter(str(partial / _VIDEO), code, _VIDEO_HZ, (2 * width, height))
+        for _, image in _drawn(recording, tracks, np.arange(tracks.t_ns.size), progress):
+            video.write(image)
+        video.release()
+    return (_VIDEO,)
+
+
+def _written_by_us(directory: Path) -> frozenset[str]:
+    """Return the names that stills and videos have: nothing else is replaced."""
+    stills = {path.name for path in directory.glob("*.png") if path.stem.lstrip("-").isdecimal()}
+    return frozenset({*stills, _VIDEO})
+
+
+def _drawn(
+    recording: ImageRecording, tracks: ImageTracks, frames: IntArray, progress: Progress
+) -> Iterator[tuple[int, Image]]:
+    pair_at = {pair.t_ns: pair for pair in recording.pairs}
+    ends = [recording.pairs[i] for i in sorted({0, len(recording.pairs) // 2, len(recording.pairs) - 1})]
+    bits = bit_depth(path for pair in ends for path in (pair.left, pair.right))
+    for done, k in enumerate(frames.tolist(), start=1):
+        images = read_pair(pair_at[int(tracks.t_ns[k])], recording.rig, bits)
+        if isinstance(images, Unusable):
+            raise DataError(f"{images}: it was there when the tracks were made; copy it again")
+        yield k, _still(images, tracks, k)
+        progress.advance(done, frames.size, "drawing")
+
+
+def _still(images: tuple[Image, Image], tracks: ImageTracks, k: int) -> Image:
+    """Return both images (height, 2 width, 3) with the tracks of frame k."""
+    import cv2
+
+    canvas = cv2.cvtColor(np.hstack(images), cv2.COLOR_GRAY2BGR)
+    rows = np.flatnonzero((tracks.frame <= k) & (tracks.frame > k - max(_TRAIL, _OLD)))
+    now = rows[tracks.frame[rows] == k]
+    for row in now.tolist():
+        past = rows[tracks.track_id[rows] == tracks.track_id[row]]
+        colour = _colour(past.size)
+        way = np.rint(tracks.corners_px[past[-_TRAIL:], :2]).astype(np.int32)
+        cv2.polylines(canvas, [way[:, None]], False, colour, 1, cv2.LINE_AA)
+        left, right = tracks.corners_px[row, :2], tracks.corners_px[row, 2:] + [images[0].shape[1], 0.0]
+        for place in (left, right):
+            cv2.circle(canvas, _pixel(place), 3, colour, 1, cv2.LINE_AA)
+    return np.asarray(canvas, dtype=np.uint8)
+
+
+def _pixel(place: Array) -> tuple[int, int]:
+    return round(float(place[0])), round(float(place[1]))
+
+
+def _colour(age: int) -> tuple[int, int, int]:
+    """Return blue, green and red of a track that was seen so many frames: from blue over green to red."""
+    share = min(age / _OLD, 1.0)
+    blue, red = max(1.0 - 2.0 * share, 0.0), max(2.0 * share - 1.0, 0.0)
+    return round(255 * blue), round(255 * (1.0 - blue - red)), round(255 * red)

@@ -1,0 +1,171 @@
+"""Stereo tracks from one rectified pair of images to the next: follow, verify, begin anew where there is room.
+
+A corner is matched along its row at birth; from then on it is followed in time in the left image and from left to
+right. It ends, and its id with it, where one of the tests says that it is no longer the same point of the scene: KLT
+there and back, the motion most tracks agree on (RANSAC), the first patch, the row and the sign of the disparity.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.frontend.cameras import Image, RectifiedPair
+from toolkit.frontend.corners import corners, count_in_cells, grid_of
+from toolkit.frontend.flow import Flow
+from toolkit.frontend.motion import StereoMotion
+from toolkit.frontend.patches import Patches, as_floats
+from toolkit.frontend.rows import halved, match_rows
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.settings import Frontend
+
+# Almost all loss is at birth: so many times more corners are matched than are wanted.
+_CANDIDATES = 3
+# A corner that found no partner is not tried again for so many frames, within so many pixels.
+_COOL_DOWN_FRAMES, _COOL_DOWN_PX = 5, 4
+# Fewer than this share of the tracks found in the right image, and of no fewer tracks: it belongs to another instant.
+_LEAST_PAIRED, _FEWEST_TO_JUDGE = 0.25, 20
+_LEVELS_RIGHT = 1
+_LEAST_DISPARITY_PX = 0.5
+
+
+class Sightings(NamedTuple):
+    """The tracks of one pair: ids (N,) and corners (N, 4) px: uL, vL, uR, vR."""
+
+    track_ids: IntArray
+    corners_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Tracks as the last pair has them: ids (N,), places left and right (N, 2) px, and their first patches."""
+
+    ids: IntArray
+    left_px: Array
+    right_px: Array
+    patches: Patches
+
+    def select(self, rows: BoolArray | IntArray) -> "_Tracks":
+        return _Tracks(self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows))
+
+    def joined(self, others: "_Tracks") -> "_Tracks":
+        return _Tracks(
+            np.concatenate([self.ids, others.ids]),
+            np.concatenate([self.left_px, others.left_px]),
+            np.concatenate([self.right_px, others.right_px]),
+            self.patches.joined(others.patches),
+        )
+
+
+_NO_TRACKS = _Tracks(np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2)), Patches.none())
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Tracks over consecutive pairs of one rectified rig."""
+
+    rig: RectifiedPair
+    settings: Frontend
+    _tracks: _Tracks = field(default=_NO_TRACKS, init=False)
+    _before: Image | None = field(default=None, init=False)
+    _next_id: int = field(default=0, init=False)
+    _hopeless: list[Array] = field(default_factory=list, init=False)
+    tried: int = field(default=0, init=False)  # corners that were looked for in a right image
+
+    def __post_init__(self) -> None:
+        asked = self.settings
+        self._flow = Flow(asked.window_px, asked.levels, asked.forward_backward_px)
+        self._across = Flow(asked.window_px, _LEVELS_RIGHT, 2.0 * asked.forward_backward_px)
+        self._motion = StereoMotion(self.rig, asked.ransac_px)
+        self._seen = self.rig.seen(0), self.rig.seen(1)
+        self._grid = grid_of(self.rig.size_px, asked.max_tracks)
+
+    def step(self, left: Image, right: Image) -> Sightings | None:
+        """Follow the tracks into the next pair and begin new ones.
+
+        Return None, and stay at the pair before, where the right image is not of the same instant as the left one.
+        """
+        floats = as_floats(left)
+        found, motion = self._followed(left, floats)
+        paired = self._paired(left, right, found)
+        agrees = motion.agrees(paired.left_px, paired.right_px, paired.ids)
+        if len(found.ids) >= _FEWEST_TO_JUDGE and agrees.sum() < _LEAST_PAIRED * len(found.ids):
+            return None
+        self._motion = motion
+        tracks = paired.select(agrees)
+        tracks = tracks.joined(self._begun(left, right, floats, tracks))
+        self._motion = self._motion.at(tracks.left_px, tracks.right_px, tracks.ids)
+        self._tracks, self._before = tracks, left
+        return Sightings(tracks.ids, np.hstack([tracks.left_px, tracks.right_px]))
+
+    def _followed(self, left: Image, floats: Array) -> tuple[_Tracks, StereoMotion]:
+        """Return the tracks that are found in the left image, still paired as before, and how the camera moved."""
+        before = self._tracks
+        if self._before is None or len(before.ids) == 0:
+            return _NO_TRACKS, self._motion
+        guesses_px = self._motion.predicted(before.left_px)
+        left_px, found = self._flow.follow(self._before, left, before.left_px, guesses_px)
+        found &= self._inside(left_px, 0)
+        rows = np.flatnonzero(found)
+        motion, moved_alike = self._motion.moved(rows, left_px[rows])
+        rows = rows[moved_alike]
+        patches, fitted_px, correlation = before.patches.select(rows).fitted(floats, left_px[rows])
+        off_px = np.linalg.norm(fitted_px - left_px[rows], axis=1)
+        same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
+        rows, patches = rows[same], patches.select(same)
+        shift_px = left_px[rows] - before.left_px[rows]
+        return _Tracks(before.ids[rows], left_px[rows], before.right_px[rows] + shift_px, patches), motion
+
+    def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
+        """Return the tracks found in the right image, near where they are in ``right_px``."""
+        right_px, found = self._found_right(left, right, tracks.left_px, tracks.right_px)
+        return _Tracks(tracks.ids, tracks.left_px, right_px, tracks.patches).select(found)
+
+    def _found_right(self, left: Image, right: Image, left_px: Array, near_px: Array) -> tuple[Array, BoolArray]:
+        """Return where points (N, 2) of the left image are in the right one, sought near (N, 2), and if found (N,)."""
+        right_px, found = self._across.follow(left, right, left_px, near_px)
+        disparity_px = left_px[:, 0] - right_px[:, 0]
+        found &= np.abs(left_px[:, 1] - right_px[:, 1]) < self.settings.epipolar_px
+        found &= (disparity_px > _LEAST_DISPARITY_PX) & (disparity_px < self._most_disparity_px)
+        return right_px, found & self._inside(right_px, 1)
+
+    @property
+    def _most_disparity_px(self) -> float:
+        return min(self.rig.fx_px * self.rig.baseline_m / self.settings.nearest_m, 0.5 * self.rig.size_px[0])
+
+    def _begun(self, left: Image, right: Image, floats: Array, tracks: _Tracks) -> _Tracks:
+        """Return new tracks where there is room for them."""
+        wanted = self.settings.max_tracks - len(tracks.ids)
+        if wanted <= 0:
+            return _NO_TRACKS
+        present = count_in_cells(tracks.left_px, self.rig.size_px, self._grid)
+        free = self._free(tracks.left_px)
+        places_px = corners(left, free, present, self.settings.spacing_px, _CANDIDATES * wanted)
+        self.tried += len(places_px)
+        near_px, found = match_rows(halved(left), halved(right), places_px, self._most_disparity_px)
+        rows = np.flatnonzero(found)
+        right_px, paired = self._found_right(left, right, places_px[rows], near_px[rows])
+        found[rows] = paired
+        self._hopeless = [places_px[~found], *self._hopeless[: _COOL_DOWN_FRAMES - 1]]
+        begun_px, right_px = places_px[found][:wanted], right_px[paired][:wanted]
+        new_ids = self._next_id + np.arange(len(begun_px))
+        self._next_id += len(begun_px)
+        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px))
+
+    def _free(self, taken_px: Array) -> BoolArray:
+        """Return for each pixel whether a track may begin there."""
+        import cv2
+
+        free = self._seen[0].astype(np.uint8)
+        radius = int(self.settings.spacing_px)
+        for points, r in ((taken_px, radius), *((hopeless, _COOL_DOWN_PX) for hopeless in self._hopeless)):
+            for x, y in np.rint(points).astype(int).tolist():
+                cv2.circle(free, (x, y), r, 0, -1)
+        return np.asarray(free > 0)
+
+    def _inside(self, points_px: Array, side: int) -> BoolArray:
+        """Say of points (N, 2) whether the camera sees them."""
+        width, height = self.rig.size_px
+        column, row = np.rint(points_px).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        return np.asarray(inside & self._seen[side][np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])

@@ -1,0 +1,137 @@
+"""A recording's images made stereo tracks: read, rectified, tracked, and kept for the next time.
+
+A pair that cannot be used is named and left out; the tracks go on behind it. Before the first step it is checked that
+left and right are what they are called, and that the calibration is theirs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.frontend import cache
+from toolkit.frontend.cameras import Image, RectifiedPair
+from toolkit.frontend.images import StampedPair, Unusable, bit_depth, read_ahead, read_image
+from toolkit.frontend.tracker import Sightings, Tracker
+from toolkit.geometry import Array, IntArray
+from toolkit.progress import SILENT, Progress
+from toolkit.settings import Frontend
+
+# Pairs that are looked at before all others, spread over the recording.
+_LOOKED_AT = 5
+# Of the wanted corners a sound pair finds a third or more in the right image; one that is no pair hardly any.
+_LEAST_MATCHED, _MOST_SWAPPED = 0.08, 2.0
+_MISPAIRED = "left and right image are not of the same instant"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRecording:
+    """The image pairs of a recording in order of time, and the pair of cameras that took them."""
+
+    pairs: tuple[StampedPair, ...]
+    rig: RectifiedPair
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTracks:
+    """Tracks of the usable pairs: stamps (K,), sightings as frame (N,), id (N,), corners (N, 4) px, and what was not.
+
+    A corner is uL, vL, uR, vR in the rectified images; ``skipped`` names each pair left out, with the reason.
+    """
+
+    t_ns: IntArray
+    frame: IntArray
+    track_id: IntArray
+    corners_px: Array
+    skipped: tuple[str, ...] = ()
+
+
+def track_images(
+    pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, progress: Progress = SILENT
+) -> ImageTracks:
+    """Return the tracks over pairs in order of time, from the cache where the same images were tracked so before.
+
+    The same images and settings give the same bits. Raises DataError where half the pairs or more cannot be used, left
+    and right are exchanged, or the calibration is not that of the images.
+    """
+    key = cache.key_of(pairs, rig, settings)
+    kept = cache.load(key)
+    if kept is not None:
+        return ImageTracks(**kept)
+    ends = [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
+    bits = bit_depth(path for pair in ends for path in (pair.left, pair.right))
+    _check_sides(pairs, rig, settings, bits)
+    found = _tracked(pairs, rig, settings, bits, progress)
+    cache.save(key, vars(found))
+    return found
+
+
+def read_pair(
+    pair: StampedPair, rig: RectifiedPair, bits: int, sides: tuple[int, int] = (0, 1)
+) -> tuple[Image, Image] | Unusable:
+    """Read and rectify both images of a pair, or return what is wrong with the first that cannot be used.
+
+    ``sides`` says which camera, left (0) or right (1), either file is of.
+    """
+    images = []
+    for side, path in zip(sides, (pair.left, pair.right), strict=True):
+        image = read_image(path, bits, rig.raw_size_px)
+        if isinstance(image, Unusable):
+            return image
+        images.append(rig.apply(image, side))
+    return images[0], images[1]
+
+
+def _tracked(
+    pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int, progress: Progress
+) -> ImageTracks:
+    tracker, skipped = Tracker(rig, settings), []
+    seen: list[tuple[int, Sightings]] = []
+    for i, images in enumerate(read_ahead(pairs, lambda pair: read_pair(pair, rig, bits))):
+        sightings = None if isinstance(images, Unusable) else tracker.step(*images)
+        if sightings is not None:
+            seen.append((pairs[i].t_ns, sightings))
+        else:
+            skipped.append(str(images if isinstance(images, Unusable) else Unusable(pairs[i].right, _MISPAIRED)))
+        progress.advance(i + 1, len(pairs), "tracking")
+    if 2 * len(skipped) >= len(pairs):
+        raise DataError(
+            f"{pairs[0].left.parent}: {len(skipped)} of {len(pairs)} image pairs cannot be used, as {skipped[0]}; "
+            "copy the images again"
+        )
+    return ImageTracks(
+        np.array([t_ns for t_ns, _ in seen], dtype=np.int64),
+        np.repeat(np.arange(len(seen)), [len(s.track_ids) for _, s in seen]),
+        np.concatenate([s.track_ids for _, s in seen]),
+        np.concatenate([s.corners_px for _, s in seen]),
+        tuple(skipped),
+    )
+
+
+def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> None:
+    """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
+    places = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
+    matched = swapped = wanted = 0
+    for place in places.tolist():
+        images = read_pair(pairs[place], rig, bits)
+        exchanged = read_pair(pairs[place], rig, bits, (1, 0))
+        if isinstance(images, Unusable) or isinstance(exchanged, Unusable):
+            continue
+        as_called = Tracker(rig, settings)
+        matched += _count(as_called, *images)
+        swapped += _count(Tracker(rig, settings), exchanged[1], exchanged[0])
+        wanted += as_called.tried
+    folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
+    if swapped > _MOST_SWAPPED * matched and swapped > _LEAST_MATCHED * wanted:
+        raise DataError(f"{folders}: left and right images are exchanged; exchange the two folders")
+    if matched < _LEAST_MATCHED * wanted:
+        raise DataError(
+            f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "
+            "ones; the calibration is not that of these images, or they are no pairs"
+        )
+
+
+def _count(tracker: Tracker, left: Image, right: Image) -> int:
+    found = tracker.step(left, right)
+    return 0 if found is None else len(found.track_ids)
