@@ -17,7 +17,7 @@ from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
 from toolkit.inputs import open_input, read_text_input
-from toolkit.resampling import Pairing
+from toolkit.resampling import ImuPairing, Pairing
 from toolkit.sequence import (
     ImuNoise,
     ImuSamples,
@@ -107,8 +107,7 @@ def _to_text(sequence: Sequence) -> Text:
         "units": "SI and px; time int64 ns; poses take the IMU frame to the world; bias and prior in [accel, gyro]",
         "gravity_world": sequence.gravity_world.tolist(),
         "rig": _plain(sequence.rig),
-        "motion": {"kind": sequence.motion_kind}
-        | ({"pairing": motion.pairing} if isinstance(motion, TwistSamples) else {}),
+        "motion": {"kind": sequence.motion_kind, "pairing": motion.pairing},
         "noise": _plain(sequence.noise),
         "prior": None if prior is None else {"source": prior.source},
         "truth": None if truth is None else {"independent": truth.independent},
@@ -191,13 +190,20 @@ def _motion(text: Text, arrays: Arrays) -> tuple[MotionSamples, MotionNoise]:
         raise DataError(f"motion_values has shape {values.shape}, expected ({t_ns.size}, 6)")
     kind, noise = text["motion"]["kind"], _arrays_again(text["noise"])
     if kind == "imu":
-        return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**noise)
+        imu_noise = ImuNoise(**noise)
+        # Recordings saved before an IMU had a choice do not say.
+        pairing = _one_of(text["motion"].get("pairing", "mean"), get_args(ImuPairing))
+        return ImuSamples(t_ns, values[:, :3], values[:, 3:], pairing), imu_noise
     if kind == "twist":
-        pairing = text["motion"]["pairing"]
-        if pairing not in get_args(Pairing):
-            raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(get_args(Pairing))}")
+        pairing = _one_of(text["motion"]["pairing"], get_args(Pairing))
         return TwistSamples(t_ns, values[:, :3], values[:, 3:], pairing), TwistNoise(**noise)
     raise DataError(f"motion.kind is {kind!r}, expected imu or twist")
+
+
+def _one_of(pairing: Any, known: tuple[Any, ...]) -> Any:
+    if pairing not in known:
+        raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(known)}")
+    return pairing
 
 
 def _provenance(fields: Text) -> Provenance:
