@@ -20,7 +20,7 @@ from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians"
+RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose"
 
 
 def build(setup: Setup) -> Estimator:

@@ -17,7 +17,6 @@ from toolkit.models.imu import ImuModel
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
 from toolkit.sequence import Motion, MotionNoise, Prior, TwistNoise
-from toolkit.settings import Window
 
 
 class Increment(Protocol):
@@ -49,9 +48,6 @@ class MotionModel(Protocol):
 
     def integrate(self, motion: Motion, bias: Array) -> Increment:
         """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
-
-    def clones(self, window: Window) -> int:
-        """Return how many past poses a windowed filter keeps where the IMU moves like this."""
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""
