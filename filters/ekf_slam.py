@@ -13,7 +13,7 @@ from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along their inverse depth"
+RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along inverse depth"
 
 
 def build(setup: Setup) -> Estimator:

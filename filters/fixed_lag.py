@@ -22,7 +22,7 @@ from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
-RUNG, CHANGE = 90, "+ relinearisation of the window, every sighting used at once, every landmark a variable"
+RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
 
 
 def build(setup: Setup) -> Estimator:

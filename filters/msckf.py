@@ -6,10 +6,7 @@ from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = (
-    60,
-    "+ window of past poses, tracks used at their end; usual errors, no iteration, no landmark kept",
-)
+RUNG, CHANGE = 60, "+ window of past poses, tracks used at their end; usual errors, one step a frame"
 
 
 def build(setup: Setup) -> Estimator:

@@ -26,10 +26,7 @@ from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
-RUNG, CHANGE = (
-    100,
-    "+ landmarks eliminated at every iteration, more than one of them; none outlives the window",
-)
+RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration, of several; none outlives the window"
 
 
 def build(setup: Setup) -> Estimator:
