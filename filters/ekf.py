@@ -16,7 +16,7 @@ from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE
 from toolkit.sequence import Packet
 
-RUNG, CHANGE = 20, "+ gates, landmark noise in the innovation"
+RUNG, CHANGE = 20, "+ gate and loss, landmark noise in the innovation, biases; the pose before the map"
 DEFAULT = True
 
 

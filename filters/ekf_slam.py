@@ -5,14 +5,18 @@ together reduce the variance of its heading, though nothing measures it. Here ev
 estimates, with which global position and heading stay exactly unobservable (Huang, Mourikis & Roumeliotis 2010).
 """
 
+from functools import partial
+
+from filters.kalman.inverse_depth import InverseDepthBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 30, "+ cross-covariances"
+RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along inverse depth"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(JointEkf(setup, AtFirstEstimates()))
+    belief = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam)
+    return OnlineOutput(JointEkf(setup, AtFirstEstimates(), belief))

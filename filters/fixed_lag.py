@@ -1,4 +1,4 @@
-"""Incremental smoother over the last two seconds; older states are marginalised (Kaess et al. 2012, iSAM2).
+"""Incremental smoother over a window of seconds; older states are marginalised (Kaess et al. 2012, iSAM2).
 
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
 causal answer is the newest state, its final answer each state as it left the window, with the covariance the window
@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from filters.kalman.thinning import Thinned
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
@@ -21,12 +22,12 @@ from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
-RUNG, CHANGE = 90, "+ relinearisation"
+RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return FixedLag(setup, setup.settings.window.lag_s)
+    return Thinned(setup, FixedLag(setup, setup.settings.window.lag_s))
 
 
 class FixedLag:

@@ -4,9 +4,9 @@ What it approximates: as `riekf`, but a frame corrects to the most probable stat
 of one Gauss-Newton step. The prediction stays Gaussian and past sightings stay linearised where they were, so it begins
 to matter in which coordinates the prediction is Gaussian: iterated over landmarks in metres, the mean is biased along
 their depth (NEES of the pose 3 to 9 in flight and on the road, where one step has 1), with Jacobians of the covariance
-at first estimates even more. Landmarks therefore move along their inverse depth from the camera that saw them first,
-in which a stereo sighting is linear. The covariance is that of the right-invariant error, reduced by Jacobians at the
-corrected estimate: global position and heading stay as unknown as they were.
+at first estimates even more. Landmarks move along their inverse depth from the camera that saw them first, as in
+`riekf`: in that a stereo sighting is linear. The covariance is that of the right-invariant error, reduced by Jacobians
+at the corrected estimate: global position and heading stay as unknown as they were.
 """
 
 from functools import partial

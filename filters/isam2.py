@@ -24,7 +24,8 @@ from toolkit.models.factors import L
 from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
-RUNG, CHANGE = 110, "+ every state and landmark kept"
+RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
+IGNORES = {"window": "it keeps every state"}
 
 
 def build(setup: Setup) -> Estimator:

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from filters.kalman.correction import correct_landmarks
+from filters.kalman.correction import correct_landmarks_below
 from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
@@ -17,13 +18,17 @@ def build(setup: Setup) -> Estimator:
 
 
 class Mapping:
-    """Takes the predicted pose for true and corrects every landmark by what is seen from it (Kang, eqs. 3-10)."""
+    """Takes the predicted pose for true and corrects every landmark by what is seen from it (Kang, eqs. 3-10).
+
+    The report has no gate; here a sighting outside that of the outlier policy corrects nothing.
+    """
 
     def __init__(self, setup: Setup) -> None:
         self._rig = setup.rig
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
+        self._nis_bound = chi2_bound(3, setup.settings.outliers.gate_probability)
 
     def step(self, packet: Packet) -> Estimate:
         """Integrate the motion, then map from where it leads."""
@@ -31,7 +36,7 @@ class Mapping:
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
-            seen = correct_landmarks(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig).landmarks
+            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, self._nis_bound)
         self._map.keep(seen, packet.frame, T_world_imu)
         return self._belief.estimate(packet.frame.t_ns)
 

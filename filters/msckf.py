@@ -3,11 +3,12 @@
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
 from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 60, "+ window of past poses"
+RUNG, CHANGE = 60, "+ window of past poses, tracks used at their end; usual errors, one step a frame"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates()))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates())))

@@ -3,6 +3,7 @@
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
 from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 RUNG, CHANGE = 70, "+ first-estimate Jacobians"
@@ -10,4 +11,4 @@ RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates()))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates())))

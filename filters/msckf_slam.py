@@ -3,11 +3,12 @@
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
 from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 80, "+ long-lived landmarks"
+RUNG, CHANGE = 80, "+ long-lived landmarks, in metres"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks)))

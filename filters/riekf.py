@@ -6,17 +6,24 @@ measures. Here pose, velocity and landmarks are one element of a Lie group and s
 turn the world is the same error at every estimate, the Jacobians are blind to it wherever they are taken, and so they
 may be taken at the latest estimates. Only the biases are outside the group, and only through them does the propagation
 of the error depend on what is estimated.
+
+A landmark is in the group by its anchor, the camera that saw it first, and moves along its inverse depth from there. In
+metres the squared position error was 2.2 times what it is on drive-imu, and 1.3 times in flight. What is left: an
+update is one Gauss-Newton step, and a landmark's first estimate one stereo sighting whose depth is not Gaussian.
 """
 
-from filters.kalman.invariant import InvariantBelief
+from functools import partial
+
+from filters.kalman.anchored import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
-RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians"
+RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), InvariantBelief))
+    belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief))

@@ -1,4 +1,4 @@
-"""Fixed-lag smoother over the last two seconds whose landmarks are eliminated: smart stereo factors.
+"""Fixed-lag smoother over a window of seconds whose landmarks are eliminated: smart stereo factors.
 
 What it approximates: a track is a factor on the poses that saw it, linearised anew at every iteration, and its landmark
 is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When the oldest state leaves, its tracks are
@@ -13,6 +13,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from filters.kalman.thinning import Thinned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera
 from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
@@ -25,12 +26,12 @@ from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
-RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration"
+RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration, of several; none outlives the window"
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Smart(setup, setup.settings.window.lag_s)
+    return Thinned(setup, Smart(setup, setup.settings.window.lag_s))
 
 
 class Smart:
@@ -39,8 +40,8 @@ class Smart:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
-        self._camera = RobustCamera(setup.rig, outliers.smoother_huber)
-        self._outlier_check = OutlierCheck(setup.rig, outliers.gate_probability)
+        self._camera = RobustCamera.of(setup.rig, outliers.smoother_huber)
+        self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
         self._tracked = TrackedWindow.empty()

@@ -23,6 +23,7 @@ from toolkit.experiment import pipeline, recording, workers
 from toolkit.experiment.recording import Recording
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Prior, Sequence
+from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import SCENARIOS
 
 PROJECT = Path(__file__).parents[1]
@@ -162,10 +163,10 @@ def unrendered() -> Iterator[None]:
 def run_estimator() -> Callable[..., Run]:
     """Return a function that runs an estimator, by its name, over a sequence from its own or a given prior."""
 
-    def run(name: str, sequence: Sequence, prior: Prior | None = None) -> Run:
+    def run(name: str, sequence: Sequence, prior: Prior | None = None, settings: Settings = DEFAULTS) -> Run:
         start = sequence.prior if prior is None else prior
         assert start is not None
-        return runner.run(name, find(name).load(), sequence, start, SILENT)
+        return runner.run(name, find(name).load(), sequence, start, SILENT, settings=settings)
 
     return run
 

@@ -63,6 +63,16 @@ def test_pairing_says_which_sample_moves_from_frame_to_frame(pairing, expected):
         np.testing.assert_allclose(packet.motion.w_radps, -packet.motion.v_mps)
 
 
+def test_a_sample_in_the_middle_stands_for_the_time_around_it_and_is_shared_out_by_the_frames():
+    stamps = at_ms(-5, 5, 15, 25, 35)
+    motion = ImuSamples(stamps, ramp(stamps), -ramp(stamps), "middle")
+    _, first, second = sequence_of(at_ms(0, 20, 27), motion).packets()
+    np.testing.assert_allclose(first.motion.dt_s, [0.01, 0.01], rtol=1e-9)
+    np.testing.assert_allclose(first.motion.accel_mps2[:, 0], [0.005, 0.015], atol=1e-12)
+    np.testing.assert_allclose(second.motion.dt_s, [0.007], rtol=1e-9)
+    np.testing.assert_allclose(second.motion.accel_mps2[:, 0], [0.025], atol=1e-12)
+
+
 def test_imu_samples_are_cut_and_interpolated_at_the_frames():
     """Frames between the samples: the pieces are the trapezoids of the linear interpolation, none lost or doubled."""
     stamps = at_ms(*np.arange(0.0, 101.0, 5.0))

@@ -57,6 +57,15 @@ class Trajectory:
         """Positions of the IMU in the world (N, 3) m."""
         return self.T_world_imu[:, :3, 3]
 
+    def states(self) -> "list[Estimate]":
+        """Return each state by itself."""
+
+        def parts(stacked: Array | None) -> list[Array | None]:
+            return [None] * len(self) if stacked is None else list(stacked)
+
+        fields = (parts(self.cov), parts(self.v_world), parts(self.bias))
+        return [Estimate(*row) for row in zip(self.t_ns.tolist(), self.T_world_imu, *fields, strict=True)]
+
     @classmethod
     def of(cls, estimates: "list[Estimate]") -> "Trajectory":
         """Stack estimates; a field that some of them lack is left out."""

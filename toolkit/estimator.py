@@ -4,7 +4,8 @@ An installed package announces, in the entry-point group ``toolkit.estimators``,
 estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its
 summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
 ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
-where no estimator is named; ``OPTIONS`` names the settings that it alone reads.
+where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``IGNORES`` names the common rules
+("outliers", "window") that it does not obey, each with the reason.
 """
 
 import ast
@@ -85,6 +86,11 @@ class EstimatorEntry:
         """Return the names of the settings that this estimator alone reads: its module's constant ``OPTIONS``."""
         options = self._constants().get("OPTIONS", ())
         return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
+
+    def ignores(self) -> Mapping[str, str]:
+        """Return the common rules that the estimator does not obey, and why: its module's constant ``IGNORES``."""
+        ignores = self._constants().get("IGNORES", {})
+        return {str(k): str(v) for k, v in ignores.items()} if isinstance(ignores, dict) else {}
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""

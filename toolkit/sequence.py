@@ -24,7 +24,7 @@ from toolkit.geometry import (
     rotation_from_quaternion,
     se3,
 )
-from toolkit.resampling import NS_PER_S, Bridges, Pairing, cut_at
+from toolkit.resampling import NS_PER_S, Bridges, ImuPairing, Pairing, cut_at
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
@@ -140,11 +140,16 @@ class TwistSamples:
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
-    """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame."""
+    """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame.
+
+    ``pairing`` says what stands for the motion: the mean of two neighbours from one stamp to the next, or each sample
+    for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
+    """
 
     t_ns: IntArray
     accel_mps2: Array
     gyro_radps: Array
+    pairing: ImuPairing = "mean"
 
     def __post_init__(self) -> None:
         freeze_arrays(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
@@ -438,8 +443,7 @@ def _cut(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None)
             yield UnmeasuredMotion(read_only([dt_s]))
         return
     twist = isinstance(samples, TwistSamples)
-    pairing = samples.pairing if isinstance(samples, TwistSamples) else "mean"
-    pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, pairing)
+    pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, samples.pairing)
     for begin_ns, (dt_s, rows) in zip(frames_t_ns[:-1].tolist(), pieces, strict=True):
         scale = None if bridges is None else bridges.scale_over(begin_ns, dt_s)
         part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]), scale)

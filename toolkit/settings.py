@@ -13,9 +13,10 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import DataError, VislamError, did_you_mean
+from toolkit.errors import DataError, VislamError, did_you_mean, no_such
 from toolkit.inputs import read_text_input
 
+_NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Scalar = bool | int | float | str
@@ -27,44 +28,85 @@ class SettingsError(VislamError):
     exit_status: ClassVar[int] = 2
 
 
-class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
-    """What an estimator does about measurements that disagree with it."""
+PolicyName = Literal["robust", "gate", "none", "classic"]
+HuberThreshold = Annotated[float, Meta(gt=0.0, extra={"unit": "sigma"})] | None
 
+
+class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
+    """What every estimator does about measurements that disagree with it: a named policy and what it consists of.
+
+    A threshold in sigma is a length of three whitened residuals; a track of more degrees of freedom has the one that is
+    exceeded as often. None is no gate, no loss.
+    """
+
+    policy: Annotated[
+        PolicyName, Meta(description="the policy all of these are taken from, but for what is set by itself")
+    ] = "classic"
     gate_probability: Annotated[
-        Probability, Meta(description="chi-square probability below which filters accept a measurement")
+        Probability | None, Meta(description="chi-square probability below which a measurement is accepted")
     ] = 0.95
-    filter_huber: Annotated[
-        float, Meta(gt=0.0, description="Huber threshold of the decoupled filters", extra={"unit": "sigma"})
-    ] = 1.5
-    smoother_huber: Annotated[
-        float, Meta(gt=0.0, description="Huber threshold of the incremental smoothers", extra={"unit": "sigma"})
-    ] = 2.7954834829151074  # the filters' 95 % gate of three degrees of freedom, as a length
-    batch_huber: Annotated[
-        float, Meta(gt=0.0, description="Huber threshold of batch's first solve", extra={"unit": "sigma"})
-    ] = 1.5
-    batch_cauchy: Annotated[
-        float, Meta(gt=0.0, description="Cauchy scale of batch's second solve", extra={"unit": "sigma"})
-    ] = 2.0
+    smoother_gate_factor: Annotated[
+        float, Meta(ge=1.0, description="the incremental smoothers' gate, as a multiple of the filters'")
+    ] = 4.0
+    joint_huber: Annotated[
+        HuberThreshold, Meta(description="Huber threshold of the joint and the windowed filters")
+    ] = None
+    filter_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of the decoupled filters")] = 1.5
+    smoother_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of the incremental smoothers")] = (
+        2.7954834829151074  # a 95 % gate of three degrees of freedom, as a length
+    )
+    batch_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of batch's first solve")] = 1.5
+    batch_cauchy: Annotated[HuberThreshold, Meta(description="Cauchy scale of batch's second solve")] = 2.0
     batch_cut_probability: Annotated[
-        Probability, Meta(description="probability below which batch's last solve leaves a sighting out")
+        Probability | None, Meta(description="probability below which batch's last solve leaves a sighting out")
     ] = 1e-3
+    batch_last_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of batch's last solve")] = None
+
+
+def _alike(policy: PolicyName, gate_probability: float | None, huber: float | None) -> Outliers:
+    """Return a policy with one gate and one loss for every estimator."""
+    return Outliers(
+        policy=policy,
+        gate_probability=gate_probability,
+        smoother_gate_factor=1.0,
+        joint_huber=huber,
+        filter_huber=huber,
+        smoother_huber=huber,
+        batch_huber=1.5 if gate_probability else huber,
+        batch_cauchy=2.0 if gate_probability else None,
+        batch_cut_probability=1.0 - gate_probability if gate_probability else None,
+        # Beyond the cut there is nothing to hold, and a loss would weigh sound sightings down.
+        batch_last_huber=None,
+    )
+
+
+POLICIES: Mapping[PolicyName, Outliers] = {
+    "robust": _alike("robust", 0.999, 2.7954834829151074),
+    "gate": _alike("gate", 0.999, None),
+    "none": _alike("none", None, None),
+    "classic": Outliers(),
+}
 
 
 class Window(Struct, frozen=True, forbid_unknown_fields=True):
-    """How much of the past an estimator keeps."""
+    """How much of the past a windowed estimator keeps, filter or smoother."""
 
     lag_s: Annotated[
-        float, Meta(gt=0.0, le=3600.0, description="window of the fixed-lag smoothers", extra={"unit": "s"})
-    ] = 2.0
-    imu_clones: Annotated[
-        int, Meta(ge=2, le=200, description="past poses a windowed filter keeps with raw IMU samples")
-    ] = 12
-    twist_clones: Annotated[
-        int, Meta(ge=2, le=200, description="past poses a windowed filter keeps with measured twists")
-    ] = 5
+        float, Meta(gt=0.0, le=3600.0, description="window of the windowed filters and smoothers", extra={"unit": "s"})
+    ] = 1.4
+    most_states: Annotated[
+        int, Meta(ge=2, le=10_000, description="states in the window at most; of more frames they are thinned evenly")
+    ] = 30
     landmarks: Annotated[
         int, Meta(ge=0, le=500, description="landmarks msckf-slam keeps in its state for as long as they are seen")
     ] = 50
+
+    def interval(self, since_ns: int) -> int:
+        """Return which interval of time an instant after the first frame is in; of each one frame has a state.
+
+        They are as long as the window never holds more than its most.
+        """
+        return int(since_ns * (self.most_states - 1) // round(self.lag_s * _NS_PER_S))
 
 
 class Noise(Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,7 +116,10 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[
             float,
             Meta(
-                gt=0.0, le=100.0, description="standard deviation of uL and uR; v in proportion", extra={"unit": "px"}
+                gt=0.0,
+                le=100.0,
+                description="standard deviation of uL and uR; v in proportion",
+                extra={"unit": "px", "none": "the recording's"},
             ),
         ]
         | None
@@ -162,6 +207,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DEFAULTS = Settings()
+_POLICY = "outliers.policy"
 
 
 class Described(NamedTuple):
@@ -182,9 +228,27 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     """
     _check_keys(given, Settings, "", place)
     try:
-        return msgspec.convert(dict(given), Settings)
+        return msgspec.convert(_with_policy(given, place), Settings)
     except msgspec.ValidationError as error:
         raise SettingsError(f"{place}: {_in_words(str(error))}") from error
+
+
+def _with_policy(given: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """Return nested values with what a named outlier policy consists of, where they do not say otherwise."""
+    values, outliers = dict(given), given.get("outliers")
+    if isinstance(outliers, Mapping) and "policy" in outliers:
+        policy = outliers["policy"]
+        if policy not in POLICIES:
+            raise SettingsError(f"{place}: {no_such('outlier policy', str(policy), POLICIES)}")
+        values["outliers"] = {**msgspec.to_builtins(POLICIES[policy]), **outliers}
+    return values
+
+
+def outliers_in_words(outliers: Outliers) -> str:
+    """Return the name of an outlier policy, and what was set by itself."""
+    named = msgspec.to_builtins(POLICIES[outliers.policy])
+    changed = {key: value for key, value in msgspec.to_builtins(outliers).items() if value != named[key]}
+    return f"{outliers.policy}{''.join(f', {key} {value}' for key, value in changed.items())}"
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -211,6 +275,9 @@ def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> di
             if not isinstance(at, dict):
                 raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
         at[name] = _value(value.strip())
+        if key.strip() == _POLICY:
+            # A policy is named whole: what was set of another is no part of it.
+            result["outliers"] = {"policy": at[name]}
     return result
 
 
@@ -277,15 +344,14 @@ def _one(key: str, hint: Any, default: Any) -> Described:
     words = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
     words += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
     meaning = next(meta.description for meta in metas if meta.description)
-    return Described(key, extra.get("unit", ""), _shown(default), ", ".join(words), meaning)
+    shown = extra.get("none", "none") if default is None else _shown(default)
+    return Described(key, extra.get("unit", ""), shown, ", ".join(words), meaning)
 
 
 _BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def _shown(default: Any) -> str:
-    if default is None:
-        return "the recording's"
     return f"{default:.4g}" if isinstance(default, float) else str(default)
 
 

@@ -12,6 +12,7 @@ the same vectors whatever the estimate, as in the invariant belief that this one
 import numpy as np
 
 from filters.kalman.invariant import InvariantBelief
+from filters.kalman.inverse_depth import inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew, transform
 from toolkit.models.state import POSITION, ROTATION, Belief
@@ -78,17 +79,3 @@ class AnchoredBelief(InvariantBelief):
 
     def _anchored(self) -> Array:
         return transform(se3_inverse(self.anchors), self.points)
-
-
-def inverse_depth(points: Array) -> Array:
-    """Return (x / z, y / z, 1 / z) of points (..., 3); applied to such a triple it returns the point."""
-    return np.concatenate([points[..., :2], np.ones_like(points[..., 2:])], axis=-1) / points[..., 2:]
-
-
-def inverse_depth_jacobian(points: Array) -> Array:
-    """Return the Jacobian (..., 3, 3) of :func:`inverse_depth`."""
-    per_depth = 1.0 / points[..., 2]
-    result = np.zeros((*points.shape, 3))
-    result[..., 0, 0] = result[..., 1, 1] = per_depth
-    result[..., :, 2] = -inverse_depth(points) * per_depth[..., None]
-    return result

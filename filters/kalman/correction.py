@@ -27,7 +27,12 @@ class PoseCorrection(NamedTuple):
 
 
 def correct_pose(
-    belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate, huber_threshold: float
+    belief: Belief,
+    landmarks: LandmarkMap,
+    uvs_px: Array,
+    rig: StereoRig,
+    gate: FrameGate,
+    huber: float | None,
 ) -> PoseCorrection:
     """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation.
 
@@ -39,8 +44,7 @@ def correct_pose(
     own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2
     nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
     accepted = gate.accepts(nis, 3, predicted.depth_m > 0.0)
-    huber = huber_weights(mahalanobis_squared(residual_px, own_cov), huber_threshold)
-    weights = np.where(accepted, huber, 0.0)
+    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov), huber), 0.0)
     corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
     return PoseCorrection(corrected, accepted)
 
@@ -91,7 +95,7 @@ def correct_landmarks_below(
 class KnownPoseMapper:
     """Maps landmarks along given poses, each by its own EKF; a sighting outside the gate corrects nothing."""
 
-    def __init__(self, rig: StereoRig, gate_probability: float) -> None:
+    def __init__(self, rig: StereoRig, gate_probability: float | None) -> None:
         self._rig, self._map = rig, TrackedMap(rig)
         self._nis_bound = chi2_bound(3, gate_probability)
 

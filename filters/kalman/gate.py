@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.gating import chi2_bound, mean_below_bound
+from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, mean_below_bound
 
 
 @dataclass
 class FrameGate:
-    """Accepts innovations below the chi-square quantile of a probability and counts them.
+    """Accepts innovations below the chi-square quantile of a probability, counts them, and weighs them by Huber's loss.
+
+    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss.
 
     ``nis`` and ``dof`` are sums over what was accepted, and ``nis_expected`` what the first is expected to be where the
     innovations are as large as their covariance says: less than ``dof``, for the gate took the largest away. Robust
@@ -18,7 +20,8 @@ class FrameGate:
     ``unconverged`` the number of iterated updates that were broken off.
     """
 
-    probability: float
+    probability: float | None
+    huber: float | None = None
     nis: float = 0.0
     dof: int = 0
     nis_expected: float = 0.0
@@ -40,6 +43,12 @@ class FrameGate:
         self.tested += accepted.size
         self.accepted += int(accepted.sum())
         return accepted
+
+    def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
+        """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] of their norm."""
+        if self.huber is None:
+            return accepted.astype(float)
+        return np.where(accepted, huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
 
     def info(self) -> dict[str, float]:
         """Return the figures by the names an Estimate's info has."""

@@ -18,7 +18,7 @@ from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_landmarks import LandmarkSightings
 from filters.kalman.linearisation import Linearisation
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array
 from toolkit.sequence import StereoFrame, StereoRig
 
 # In standard deviations of what is known after the update.
@@ -52,16 +52,15 @@ class IterationResult(NamedTuple):
 def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct everything by the landmarks of the state, every one of which the frame must show.
 
-    The gate tests once, at the prediction. The covariance is reduced by Jacobians at the corrected estimate. An
-    iteration that does not converge ends at the lowest cost it has reached; where not even the first step
-    lowered it, the frame corrects nothing.
+    The gate tests once, at the prediction, and Huber's weights are those there. The covariance is reduced by Jacobians
+    at the corrected estimate. An iteration that does not converge ends at the lowest cost it has reached; where not
+    even the first step lowered it, the frame corrects nothing.
     """
     if not len(joint.landmark_ids):
         return
     seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
-    accepted = joint_landmarks.accepted(joint, seen, gate)
-    measurement = Measurement(joint, frame, at, rig, accepted)
-    if not measurement.rows.any():
+    measurement = Measurement(joint, frame, at, rig, joint_landmarks.weighed(joint, seen, gate))
+    if not measurement.weights.any():
         return
     best, converged = most_probable(measurement)
     gate.unconverged += not converged
@@ -73,21 +72,21 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A prediction and some landmarks (L,) of a frame that are to correct it."""
+    """A prediction and what the landmarks (L,) of a frame count for in correcting it."""
 
     prediction: JointBelief
     frame: StereoFrame
     at: Linearisation
     rig: StereoRig
-    rows: BoolArray
+    weights: Array
 
     def after(self, pull: Array) -> Iterate:
         """Return the correction of a pull (k,)."""
         delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
         seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
         prior = delta[joint_landmarks.columns(self.prediction)] @ pull
-        in_front = (seen.depth_m[self.rows] > 0.0).all()
-        cost = float(prior + np.square(seen.residuals[self.rows]).sum()) if in_front else np.inf
+        in_front = (seen.depth_m[self.weights > 0.0] > 0.0).all()
+        cost = float(prior + self.weights @ np.square(seen.residuals).sum(axis=1)) if in_front else np.inf
         return Iterate(delta, pull, seen, cost)
 
     def step(self, now: Iterate) -> PullStep:
@@ -104,8 +103,7 @@ class Measurement:
 
     def stacked(self, seen: LandmarkSightings) -> tuple[Array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
-        rows = joint_landmarks.stacked(self.prediction, seen)
-        return rows.H[self.rows].reshape(-1, rows.H.shape[2]), rows.residuals[self.rows].reshape(-1)
+        return joint_landmarks.stacked(self.prediction, seen).weighed(self.weights)
 
 
 def most_probable(measurement: Measurement) -> IterationResult:

@@ -46,7 +46,7 @@ class JointEkf:
         correct: Correct = joint_landmarks.correct,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
-        self._gate_probability = setup.settings.outliers.gate_probability
+        self._outliers = setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
@@ -60,7 +60,7 @@ class JointEkf:
         """Take in one packet and return the state at its frame."""
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        gate = FrameGate(self._gate_probability)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._start_new(packet.frame)

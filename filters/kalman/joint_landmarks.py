@@ -13,7 +13,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, IntArray
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -33,6 +33,12 @@ class StackedSightings(NamedTuple):
     residuals: Array
     H: Array
 
+    def weighed(self, weights: Array) -> tuple[Array, Array]:
+        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks (L,) that count, under each other."""
+        rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])
+        H = roots[:, None, None] * self.H[rows]
+        return H.reshape(-1, H.shape[2]), (roots[:, None] * self.residuals[rows]).reshape(-1)
+
 
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
@@ -46,11 +52,10 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
     if not len(joint.landmark_ids):
         return
     seen = linearise_sightings(joint, frame, at, rig)
-    passed = accepted(joint, seen, gate)
-    if passed.any():
-        rows = stacked(joint, seen)
-        H, residuals = rows.H[passed], rows.residuals[passed]
-        joint.update(H.reshape(-1, H.shape[2]), residuals.reshape(-1), columns(joint))
+    weights = weighed(joint, seen, gate)
+    if weights.any():
+        H, residuals = stacked(joint, seen).weighed(weights)
+        joint.update(H, residuals, columns(joint))
 
 
 def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
@@ -79,15 +84,15 @@ def columns(joint: JointBelief) -> slice:
     return slice(joint.clone_columns.start, joint.cov.shape[0])
 
 
-def accepted(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> BoolArray:
-    """Return which landmarks (L,) are in front of the camera with residuals that pass the gate, and count them.
+def weighed(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> Array:
+    """Return what landmarks (L,) count for: 0 unless in front of the camera with residuals that pass the gate.
 
     A point behind the camera has an image by the formula, which may be the measured one, but no camera sees it.
     """
     H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
     predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
     nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
-    return gate.accepts(nis, 3, seen.depth_m > 0.0)
+    return gate.weights(nis, 3, gate.accepts(nis, 3, seen.depth_m > 0.0))
 
 
 def _pose_and_landmark_cov(joint: JointBelief) -> Array:

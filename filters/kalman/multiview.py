@@ -38,6 +38,11 @@ class Linearised(NamedTuple):
         """Return those of some tracks."""
         return Linearised(*[array[rows] for array in self])
 
+    def scaled(self, factors: Array) -> "Linearised":
+        """Return all rows of each track multiplied by its factor (F,)."""
+        by = factors[:, None, None]
+        return Linearised(by * self.residuals, by[..., None] * self.H_pose, by[..., None] * self.H_point, self.depth_m)
+
     def joined(self, other: "Linearised") -> "Linearised":
         """Return both together."""
         return Linearised(*[np.concatenate(pair) for pair in zip(self, other, strict=True)])
@@ -76,6 +81,10 @@ class Constraints(NamedTuple):
     def select(self, rows: BoolArray | IntArray) -> "Constraints":
         """Return those of some tracks."""
         return Constraints(self.residuals[rows], self.H[rows], self.dof[rows])
+
+    def scaled(self, factors: Array) -> "Constraints":
+        """Return all rows of each track multiplied by its factor (F,)."""
+        return Constraints(factors[:, None] * self.residuals, factors[:, None, None] * self.H, self.dof)
 
     def joined(self, other: "Constraints") -> "Constraints":
         """Return both together."""

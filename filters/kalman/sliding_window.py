@@ -1,9 +1,10 @@
 """The multi-state constraint Kalman filter: a window of cloned poses, tied by tracks whose landmarks are eliminated.
 
-What it approximates: a track corrects once, when it ends or spans the window, and poses that left the window are
-never corrected again (Mourikis & Roumeliotis 2007). With ``landmarks`` the tracks that span the window stay in
-the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator
-design for vision-aided inertial navigation").
+What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that left
+the window are never corrected again (Mourikis & Roumeliotis 2007). A pose leaves once it is older than the window
+reaches, as a state does in the smoothers. With ``landmarks`` the tracks that span the window stay in the state, up to
+that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for vision-aided
+inertial navigation").
 """
 
 import numpy as np
@@ -20,20 +21,22 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 
 class SlidingWindowFilter:
-    """Propagate, clone, correct by landmarks and by finished tracks, drop the oldest pose.
+    """Propagate, clone, correct by landmarks and by finished tracks, drop the poses older than the window.
 
     ``landmarks`` is how many long-lived landmarks the state may have.
     """
 
     def __init__(self, setup: Setup, linearisation: Linearisation, landmarks: int = 0) -> None:
         self._rig, self._at = setup.rig, linearisation
-        self._gate_probability = setup.settings.outliers.gate_probability
+        self._outliers = setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._most_clones, self._most_landmarks = self._motion.clones(setup.settings.window), landmarks
+        self._lag_ns, self._most_landmarks = round(setup.settings.window.lag_s * NS_PER_S), landmarks
+        self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks = WindowTracks()
         self._memory = LandmarkMemory()
@@ -42,13 +45,14 @@ class SlidingWindowFilter:
         """Take in one packet and return the state at its frame."""
         propagate(self._joint, self._motion, self._at, packet.motion)
         self._joint.clone(packet.index)
-        gate = FrameGate(self._gate_probability)
+        self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._tracks.add_frame(_without(packet.frame, self._joint))
-        self._correct_by_tracks(gate)
-        if len(self._joint.clones) > self._most_clones:
-            self._forget_oldest_clone()
+        leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
+        self._correct_by_tracks(leaving, gate)
+        self._forget_clones(leaving)
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
@@ -56,19 +60,18 @@ class SlidingWindowFilter:
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
 
-    def _correct_by_tracks(self, gate: FrameGate) -> None:
-        """Correct by the tracks that ended, and by those that span a full window, for its oldest pose leaves next.
+    def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
+        """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
 
         All at once, unless there is room for landmarks: what a landmark is linearised at for life is triangulated
         after the window has been corrected by the others.
         """
         used = self._tracks.ended()
-        full = len(self._joint.clones) > self._most_clones
-        if full and not self._room:
-            used = used | self._tracks.spanning()
+        if not self._room:
+            used = used | self._tracks.seen_by(leaving)
         self._correct_by(self._tracks.take(used), gate)
-        if full and self._room:
-            self._correct_by(self._tracks.take(self._tracks.spanning()), gate)
+        if self._room and leaving.any():
+            self._correct_by(self._tracks.take(self._tracks.seen_by(leaving)), gate)
 
     @property
     def _room(self) -> int:
@@ -88,9 +91,11 @@ class SlidingWindowFilter:
         H, residuals = multiview.compressed(*_stacked(accepted.constraints))
         joint.update(H, residuals, joint.clone_columns)
 
-    def _forget_oldest_clone(self) -> None:
-        self._joint.forget_clones(np.arange(len(self._joint.clones)) == 0)
-        self._tracks.drop_column(0)
+    def _forget_clones(self, which: BoolArray) -> None:
+        if which.any():
+            self._joint.forget_clones(which)
+            self._tracks.drop_columns(which)
+            self._clone_t_ns = self._clone_t_ns[~which]
 
 
 class WindowTracks:
@@ -113,19 +118,18 @@ class WindowTracks:
         uvs_px[rows, -1], seen[rows, -1] = frame.uvs_px, True
         self._ids, self._uvs_px, self._seen = ids, uvs_px, seen
 
-    def drop_column(self, column: int) -> None:
-        """Forget what was seen from one pose."""
-        self._uvs_px = np.delete(self._uvs_px, column, axis=1)
-        self._seen = np.delete(self._seen, column, axis=1)
+    def drop_columns(self, which: BoolArray) -> None:
+        """Forget what was seen from some poses (W,)."""
+        self._uvs_px, self._seen = self._uvs_px[:, ~which], self._seen[:, ~which]
         self._keep(np.asarray(self._seen.any(axis=1)))
 
     def ended(self) -> BoolArray:
         """Say which tracks (A,) the newest pose does not see."""
         return np.asarray(~self._seen[:, -1])
 
-    def spanning(self) -> BoolArray:
-        """Say which tracks (A,) the oldest and the newest pose see."""
-        return np.asarray(self._seen[:, 0] & self._seen[:, -1])
+    def seen_by(self, which: BoolArray) -> BoolArray:
+        """Say which tracks (A,) any of some poses (W,) has seen."""
+        return np.asarray(self._seen[:, which].any(axis=1))
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""

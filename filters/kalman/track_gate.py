@@ -35,6 +35,11 @@ class AcceptedTracks(NamedTuple):
         linearised, constraints = self.linearised.select(rows), self.constraints.select(rows)
         return AcceptedTracks(self.track_ids[rows], self.seen[rows], self.points[rows], linearised, constraints)
 
+    def weighed(self, weights: Array) -> "AcceptedTracks":
+        """Return the tracks as if their noise were larger, each by its weight (F,)."""
+        roots = np.sqrt(weights)
+        return self._replace(linearised=self.linearised.scaled(roots), constraints=self.constraints.scaled(roots))
+
     def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
         """Return both together."""
         return AcceptedTracks(
@@ -71,12 +76,13 @@ class TrackGate:
         covs = self._covs(constraints)
         nis = mahalanobis_squared(constraints.residuals, covs)
         accepted = gate.accepts(nis, constraints.dof)
+        weights = gate.weights(nis, constraints.dof, accepted)
         tracks = AcceptedTracks(sightings.track_ids, sightings.seen, points, linearised, constraints)
         mismatched = np.asarray(nis > MISMATCHED_TRACK_FACTOR * gate.bound(constraints.dof))
         worst = _worst_sighting(tracks.select(mismatched), covs[mismatched])
         seen = sightings.seen[mismatched].copy()
         seen[np.arange(len(worst)), worst] = False
-        return tracks.select(accepted), sightings.select(mismatched)._replace(seen=seen)
+        return tracks.select(accepted).weighed(weights[accepted]), sightings.select(mismatched)._replace(seen=seen)
 
     def _covs(self, constraints: Constraints) -> Array:
         """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals."""

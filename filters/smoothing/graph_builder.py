@@ -14,7 +14,7 @@ from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors
+from toolkit.models.factors import L, StereoFactors, huber_loss
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
@@ -36,9 +36,8 @@ class GraphBuilder:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, outliers = setup.rig, setup.settings.outliers
-        huber = gtsam.noiseModel.mEstimator.Huber.Create(outliers.smoother_huber)
-        self._stereo = StereoFactors(setup.rig, huber)
-        self._outlier_check = OutlierCheck(setup.rig, outliers.gate_probability)
+        self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
+        self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)

@@ -11,14 +11,10 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
-from toolkit.models.gating import (
-    MISMATCHED_SIGHTING_FACTOR,
-    MOST_MISMATCHED,
-    chi2_bound,
-    mahalanobis_squared,
-)
+from toolkit.models.gating import MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.settings import Outliers
 
 
 def relative_to_its_map(belief: Belief) -> Belief:
@@ -33,10 +29,10 @@ def relative_to_its_map(belief: Belief) -> Belief:
 
 @dataclass(frozen=True, eq=False)
 class OutlierCheck:
-    """Leaves sightings out that are several times beyond the filters' gate of a probability."""
+    """Leaves sightings out that are beyond the gate of an outlier policy, or a multiple of it."""
 
     rig: StereoRig
-    gate_probability: float
+    policy: Outliers
 
     def without_outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> StereoFrame:
         """Return the frame without its outliers."""
@@ -56,7 +52,7 @@ class OutlierCheck:
         predicted = stereo.predict(landmarks, expected.T_world_imu, self.rig)
         H = predicted.d_uv_d_pose
         covs_px2 = 2.0 * self.rig.cov_uv_px2 + H @ expected.cov[POSE, POSE] @ np.swapaxes(H, 1, 2)
-        bound = MISMATCHED_SIGHTING_FACTOR * chi2_bound(3, self.gate_probability)
+        bound = self.policy.smoother_gate_factor * chi2_bound(3, self.policy.gate_probability)
         far = mahalanobis_squared(frame.uvs_px[known] - predicted.uv_px, covs_px2) > bound
         if far.mean() > MOST_MISMATCHED:
             return np.zeros_like(known)

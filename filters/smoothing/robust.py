@@ -16,7 +16,7 @@ from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X, kind_of
+from toolkit.models.factors import L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.progress import Progress
 from toolkit.sequence import StereoFrame, StereoRig
@@ -49,19 +49,27 @@ def solve_robustly(
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
     """
-    loss, values = gtsam.noiseModel.mEstimator, start
-    for robust, stopping, stage in (
-        (loss.Huber.Create(outliers.batch_huber), _HUBER_STOPPING, "solving with Huber's loss"),
-        (loss.Cauchy.Create(outliers.batch_cauchy), _CAUCHY_STOPPING, "solving with Cauchy's loss"),
-    ):
+    values = start
+    for robust, stopping, stage in _stages(outliers):
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
         values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
         frames = _without_those_behind(frames, values, rig)
-    bound = chi2_bound(3, 1.0 - outliers.batch_cut_probability)
+    cut = outliers.batch_cut_probability
+    bound = chi2_bound(3, None if cut is None else 1.0 - cut)
     frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
-    graph = _with_sightings(motion, frames, StereoFactors(rig))
+    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
     last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
     return Smoothed(last, graph, frames)
+
+
+def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Base, Stopping, str]]:
+    """Yield the losses before the last solve, with when to stop and what it is called."""
+    huber, cauchy = huber_loss(outliers.batch_huber), outliers.batch_cauchy
+    if huber is not None:
+        yield huber, _HUBER_STOPPING, "solving with Huber's loss"
+    if cauchy is not None:
+        loss = gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy)
+        yield loss, _CAUCHY_STOPPING, "solving with Cauchy's loss"
 
 
 def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:

@@ -19,6 +19,8 @@ from toolkit.sequence import StereoRig
 
 # A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
 _BEHIND_NORM = 100.0
+# Further off than any sighting is in standard deviations: a loss that begins here is none.
+_NO_LOSS = 1e6
 # Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
 _LEAST_INFORMATION_PER_M2 = 1e-12
 
@@ -29,6 +31,11 @@ class RobustCamera:
 
     rig: StereoRig
     huber: float
+
+    @classmethod
+    def of(cls, rig: StereoRig, huber: float | None) -> "RobustCamera":
+        """Return a camera whose loss begins at a threshold, or none."""
+        return cls(rig, _NO_LOSS if huber is None else huber)
 
 
 @dataclass(frozen=True, eq=False)

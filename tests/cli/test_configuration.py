@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from toolkit import runner
@@ -13,6 +14,7 @@ from toolkit.cli.compare import SEQUENCES
 from toolkit.datasets import built_in_names
 from toolkit.estimator import defaults
 from toolkit.metrics import cost, known_metrics
+from toolkit.settings import POLICIES
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
@@ -55,9 +57,33 @@ def test_a_file_says_what_is_compared_and_with_which_settings(vislam: Vislam) ->
     assert json.loads(Path("run/metrics.json").read_text())["sequence"]["frames"] == 8
 
 
+def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vislam) -> None:
+    words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK)
+    assert vislam(*words, "--outliers", "none", "--set", "outliers.filter_huber=3", "--out", "one") == 0
+    told = json.loads(Path("one/manifest.json").read_text())["settings"]["outliers"]
+    assert (told["policy"], told["gate_probability"], told["filter_huber"]) == ("none", None, 3.0)
+    again = (
+        "compare",
+        "--config",
+        "one/manifest.json",
+        "--outliers",
+        "robust",
+        "--window",
+        "1.5",
+        "--workers",
+        "1",
+        "--out",
+        "two",
+    )
+    assert vislam(*again) == 0
+    settings = json.loads(Path("two/manifest.json").read_text())["settings"]
+    assert settings["outliers"] == msgspec.to_builtins(POLICIES["robust"])
+    assert settings["window"]["lag_s"] == 1.5
+
+
 def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam) -> None:
     Path("run.toml").write_text(
-        'start = "truth"\nfirst_seed = 7\n[window]\nlag_s = 3.0\nimu_clones = 9\n'
+        'start = "truth"\nfirst_seed = 7\n[window]\nlag_s = 3.0\nmost_states = 9\n'
         '[compare]\nsequences = ["drive-imu"]\nestimators = ["batch"]\nmax_frames = 8\n'
     )
     words = ("drive", "--estimators", "dead-reckoning", "--max-frames", "5", "--seed", "2", "--start", "measurements")
@@ -65,7 +91,7 @@ def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam
     assert vislam("compare", "--config", "run.toml", *words, *given, "--out", "run") == 0
     told = manifest()
     settings = told["settings"]
-    assert (settings["window"]["lag_s"], settings["window"]["imu_clones"]) == (4.0, 9)
+    assert (settings["window"]["lag_s"], settings["window"]["most_states"]) == (4.0, 9)
     assert (settings["first_seed"], settings["start"]) == (2, "measurements")
     assert (told["compare"]["sequences"], told["compare"]["estimators"]) == (["drive"], ["dead-reckoning"])
     assert told["compare"]["max_frames"] == 5
@@ -77,7 +103,7 @@ def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam
         (("--set", "window.lag=3"), "there is no setting window.lag; did you mean window.lag_s?"),
         (("--set", "window.lag_s=soon"), "window.lag_s"),
         (("--set", "window.lag_s"), "--set takes KEY=VALUE"),
-        (("--set", "window.imu_clones=1"), "window.imu_clones"),
+        (("--set", "window.most_states=1"), "window.most_states"),
         (("--config", "wrong.toml"), "wrong.toml: there is no setting outliers.gate; did you mean"),
         (("--config", "asked.toml"), "asked.toml: there is no compare.estimator; did you mean estimators?"),
         (("--config", "typed.toml"), "typed.toml: compare: "),

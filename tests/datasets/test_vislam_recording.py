@@ -58,6 +58,13 @@ def test_pairing_and_gravity_come_back(drive: Sequence, tmp_path: Path) -> None:
     assert_same(loaded, changed)
 
 
+def test_an_imu_that_does_not_say_its_pairing_has_the_mean(flight: Sequence, tmp_path: Path) -> None:
+    """As saved before an IMU had a choice."""
+    vislam_recording.save(flight, tmp_path / "flight")
+    edit_text(lambda t: t["motion"].pop("pairing"))(tmp_path / "flight")
+    assert vislam_recording.load(tmp_path / "flight").motion.pairing == "mean"
+
+
 def test_faults_for_the_audit_survive(drive: Sequence, tmp_path: Path) -> None:
     uv_px = drive.observations.uv_px.copy()
     uv_px[3, 1] = np.nan
@@ -91,7 +98,7 @@ def test_the_text_is_for_people(flight: Sequence, tmp_path: Path) -> None:
     vislam_recording.save(flight, tmp_path / "flight")
     text = json.loads((tmp_path / "flight" / "recording.json").read_text())
     assert text["schema"] == "vislam.recording/1"
-    assert text["motion"] == {"kind": "imu"}
+    assert text["motion"] == {"kind": "imu", "pairing": "middle"}
     assert text["noise"]["gyro_noise_density"] == 1.7e-4
     assert text["counts"]["frames"] == 21
 

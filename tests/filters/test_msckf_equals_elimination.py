@@ -139,7 +139,9 @@ def test_the_filters_answer_is_that_of_the_batch_of_its_tracks(scenario, at, siz
     """Errors of 1e-6 of the stated noise: the gates are open and second orders out of sight."""
     clones, landmarks, frames = SIZES[size]
     recording = oracle.recorded(scenario_of(scenario, frames), 1e-6)
-    settings = Settings(window=WindowSettings(imu_clones=clones, twist_clones=clones))
+    # A pose leaves in the frame in which it is older than the window.
+    lag_s = (clones - 0.5) / scenario.camera.rate_hz
+    settings = Settings(window=WindowSettings(lag_s=lag_s))
     msckf = SlidingWindowFilter(replace(recording.setup, settings=settings), at, landmarks)
     for packet in recording.sequence.packets():
         estimate = msckf.step(packet)

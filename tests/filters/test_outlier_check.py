@@ -11,8 +11,10 @@ from toolkit.models import stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet, Sequence
+from toolkit.settings import POLICIES
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate
 
+POLICY = POLICIES["classic"]
 CLEAN = replace(DRIVE, duration_s=20.0)
 MISMATCHED = replace(CLEAN, camera=replace(CLEAN.camera, outlier_rate=0.05, outlier_px=(20.0, 30.0)))
 
@@ -49,7 +51,7 @@ def test_errors_of_twenty_pixels_are_told_from_sound_sightings():
     caught = missed = accused = sound = 0
     for packet, expected in expected_states(sequence):
         ids = packet.frame.track_ids.tolist()
-        found = OutlierCheck(sequence.rig, 0.95).outliers(
+        found = OutlierCheck(sequence.rig, POLICY).outliers(
             packet.frame, {i: points[i] for i in before & set(ids)}, expected
         )
         for i, is_outlier in zip(ids, found.tolist(), strict=True):
@@ -71,7 +73,7 @@ def test_a_wrong_state_blames_no_track(scenario):
     sequence, points = simulate(scenario, 0), landmarks_of(scenario, 0)
     packet, expected = expected_states(sequence)[2]
     beside = replace(expected, T_world_imu=expected.T_world_imu @ se3(np.eye(3), np.array([0.0, 1.0, 1.0])))
-    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, points, beside).any()
+    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, points, beside).any()
 
 
 def test_where_the_world_is_does_not_matter():
@@ -82,13 +84,13 @@ def test_where_the_world_is_does_not_matter():
     found = []
     for start in (sequence, replace(sequence, prior=vague)):
         packet, expected = expected_states(start)[20]
-        found.append(OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, points, relative_to_its_map(expected)))
+        found.append(OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, points, relative_to_its_map(expected)))
     np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_a_sighting_of_an_unknown_landmark_is_no_outlier():
     sequence = simulate(MISMATCHED, 3)
     packet, expected = expected_states(sequence)[0]
-    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, {}, expected).any()
+    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, {}, expected).any()
     moved = replace(expected, T_world_imu=se3_inverse(expected.T_world_imu))
-    assert not OutlierCheck(sequence.rig, 0.95).outliers(packet.frame, {}, moved).any()
+    assert not OutlierCheck(sequence.rig, POLICY).outliers(packet.frame, {}, moved).any()

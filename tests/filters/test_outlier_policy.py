@@ -15,6 +15,7 @@ import pytest
 from toolkit.estimate import Run
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.sequence import Sequence, is_held_out
+from toolkit.settings import POLICIES, PolicyName, Settings, Window
 from toolkit.simulation import DRIVE, simulate
 from toolkit.simulation.scenarios import noise_free
 
@@ -60,8 +61,9 @@ def scene() -> Scene:
 def pull(scene, run_estimator) -> Callable[[str, float], float]:
     """Return a function: the error (m) of the final position at FRAME that a sighting off by some sigmas makes."""
 
-    def pulled(name: str, sigmas: float) -> float:
-        return scene.error_m(run_estimator(name, scene.with_error(sigmas)))
+    def pulled(name: str, sigmas: float, policy: PolicyName = "classic") -> float:
+        settings = Settings(outliers=POLICIES[policy])
+        return scene.error_m(run_estimator(name, scene.with_error(sigmas), settings=settings))
 
     return pulled
 
@@ -88,6 +90,33 @@ def test_joint_filters_count_in_full_what_passes_their_gate_and_nothing_else(pul
     assert pull(name, 5.0) < NOTHING_M
 
 
+@pytest.mark.parametrize(
+    ("name", "held", "dropped"),
+    [("ekf", 5.0, 7.0), ("ekf-slam", 5.5, 6.7), ("riekf", 5.5, 6.7), ("iekf", 5.5, 6.7)],
+)
+def test_the_common_policy_holds_from_its_loss_on_and_drops_beyond_its_gate(pull, name, held, dropped):
+    """2.8 and 4.03 sigma of the innovation: the landmark's variance, and the pose's, make them 4.2 and 6.0."""
+    at_one = pull(name, 1.0, "robust")
+    assert at_one > 100.0 * NOTHING_M
+    assert pull(name, 3.8, "robust") / at_one == pytest.approx(3.8, rel=0.03)
+    assert pull(name, held, "robust") / at_one == pytest.approx(4.2, rel=0.12)
+    assert pull(name, dropped, "robust") < NOTHING_M
+
+
+@pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
+def test_the_common_policy_is_the_smoothers_too(pull, name):
+    """A landmark counts as known as one sighting tells: the gate's 4.03 sigma are 5.7 and a little for the motion."""
+    at_one = pull(name, 1.0, "robust")
+    assert pull(name, 2.5, "robust") / at_one == pytest.approx(2.5, rel=0.02)
+    assert pull(name, 5.3, "robust") / at_one == pytest.approx(3.0, rel=0.1)
+    assert pull(name, 6.5, "robust") < NOTHING_M
+
+
+@pytest.mark.parametrize("name", ["ekf-slam", "fixed-lag", "smart", "batch"])
+def test_without_a_policy_a_mismatch_counts_in_full(pull, name):
+    assert pull(name, 12.0, "none") / pull(name, 1.0, "none") == pytest.approx(12.0, rel=0.1)
+
+
 def test_the_reports_filter_has_no_gate_and_follows_whatever_it_sees(pull):
     assert pull("seed-ekf", 12.0) / pull("seed-ekf", 1.0) == pytest.approx(12.0, rel=0.1)
 
@@ -112,8 +141,10 @@ def test_what_the_measured_motion_leaves_open_is_no_slip(scene, run_estimator, n
         velocity_noise_density=2.0 * noise.velocity_noise_density,
         gyro_noise_density=2.0 * noise.gyro_noise_density,
     )
-    assert scene.error_m(run_estimator(name, sequence)) < NOTHING_M
-    assert scene.error_m(run_estimator(name, replace(sequence, noise=doubtful))) > 100.0 * NOTHING_M
+    settings = Settings(outliers=POLICIES["classic"])
+    assert scene.error_m(run_estimator(name, sequence, settings=settings)) < NOTHING_M
+    known_half_as_well = replace(sequence, noise=doubtful)
+    assert scene.error_m(run_estimator(name, known_half_as_well, settings=settings)) > 100.0 * NOTHING_M
 
 
 @pytest.mark.parametrize(("share", "believed"), [(0.4, False), (0.6, True)])
@@ -127,7 +158,8 @@ def test_where_most_tracks_disagree_none_has_slipped(scene, run_estimator, name,
     struck = rng.permutation(known)[: round(share * known.size)]
     uv_px = seen.uv_px.copy()
     uv_px[struck, :] += 15.0 * rng.choice([-1.0, 1.0], (struck.size, 1)) * np.array([1.0, 1.0, 1.0])
-    run = run_estimator(name, replace(scene.sequence, observations=replace(seen, uv_px=uv_px)))
+    struck_scene = replace(scene.sequence, observations=replace(seen, uv_px=uv_px))
+    run = run_estimator(name, struck_scene, settings=Settings(outliers=POLICIES["classic"]))
     assert (scene.error_m(run) > 100.0 * NOTHING_M) == believed
 
 
@@ -147,7 +179,8 @@ def test_a_track_that_fails_its_gate_by_little_is_lost_and_one_that_slipped_is_t
     """
 
     def counted(sigmas: float) -> tuple[int, int]:
-        info = run_estimator(name, scene.with_error(sigmas)).info
+        settings = Settings(outliers=POLICIES["classic"], window=Window(lag_s=0.45))
+        info = run_estimator(name, scene.with_error(sigmas), settings=settings).info
         return int(info["gate_tested"].sum()), int(info["gate_accepted"].sum())
 
     tested, accepted = counted(0.0)

@@ -10,18 +10,17 @@ from toolkit import runner
 from toolkit.estimate import Run
 from toolkit.estimator import find
 from toolkit.settings import Outliers, Settings, Window
-from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
+from toolkit.simulation import DRIVE, simulate
 
-SCENARIOS = {"drive": DRIVE, "drive-imu": DRIVE_IMU}
+WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
 
 
 @cache
-def answer(name: str, part: Window | Outliers = Window(), scenario: str = "drive") -> Run:  # noqa: B008 - frozen
+def answer(name: str, part: Window | Outliers = Window()) -> Run:  # noqa: B008 - frozen
     """Run an estimator over three seconds in which one sighting in a hundred is of another point."""
     settings = Settings(window=part) if isinstance(part, Window) else Settings(outliers=part)
-    of = SCENARIOS[scenario]
-    camera = replace(of.camera, outlier_rate=0.01, max_tracks=40)
-    sequence = simulate(replace(of, duration_s=3.0, camera=camera), 6)
+    camera = replace(DRIVE.camera, outlier_rate=0.01, max_tracks=40)
+    sequence = simulate(replace(DRIVE, duration_s=3.0, camera=camera), 6)
     assert sequence.prior is not None
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.final is not None, run.log
@@ -35,37 +34,44 @@ def same(one: Run, other: Run) -> bool:
 @pytest.mark.parametrize(
     ("part", "moved", "unmoved"),
     [
-        (Window(lag_s=0.5), {"fixed-lag", "smart"}, {"msckf", "isam2"}),
-        (Window(twist_clones=3), {"msckf", "msckf-fej", "msckf-slam"}, {"ekf-slam", "smart"}),
-        (Window(imu_clones=3), set(), {"msckf", "msckf-fej", "msckf-slam"}),
+        (Window(lag_s=0.5), WINDOWED, {"ekf-slam", "isam2"}),
+        (Window(most_states=8), WINDOWED, {"ekf-slam", "isam2"}),
         (Window(landmarks=5), {"msckf-slam"}, {"msckf-fej"}),
-        (Outliers(gate_probability=0.5), {"ekf", "ekf-slam", "msckf"}, {"seed-ekf", "mapping"}),
+        (Outliers(gate_probability=0.5), {"ekf", "ekf-slam", "msckf", "fixed-lag", "smart", "isam2"}, {"seed-ekf"}),
+        (Outliers(smoother_gate_factor=1.0), {"fixed-lag", "smart", "isam2"}, {"msckf", "batch"}),
+        (Outliers(joint_huber=0.5), {"ekf-slam", "riekf", "iekf", "msckf", "msckf-slam"}, {"ekf", "fixed-lag"}),
         (Outliers(filter_huber=0.5), {"ekf"}, {"msckf", "fixed-lag", "seed-ekf"}),
         (Outliers(smoother_huber=0.5), {"fixed-lag", "smart", "isam2"}, {"ekf"}),
         (Outliers(batch_huber=0.3), {"batch"}, {"isam2"}),
         (Outliers(batch_cauchy=0.1), {"batch"}, {"isam2"}),
         (Outliers(batch_cut_probability=0.3), {"batch"}, {"isam2"}),
+        (Outliers(batch_last_huber=0.5), {"batch"}, {"isam2"}),
     ],
     ids=[
         "lag",
-        "twist clones",
-        "imu clones",
+        "most states",
         "landmarks",
         "gate",
+        "smoothers' gate",
+        "joint huber",
         "filter huber",
         "smoother huber",
         "batch huber",
         "batch cauchy",
         "batch cut",
+        "batch last huber",
     ],
 )
 def test_a_setting_moves_the_estimators_it_is_for_alone(part, moved, unmoved):
     assert {name for name in moved | unmoved if not same(answer(name), answer(name, part))} == moved
 
 
-def test_the_clones_of_raw_imu_samples_are_a_setting_of_their_own():
-    shorter = Window(imu_clones=3)
-    assert not same(answer("msckf", scenario="drive-imu"), answer("msckf", shorter, "drive-imu"))
+def landmarks_of(part: Outliers) -> np.ndarray:
+    return answer("mapping", part).landmarks.points_world
+
+
+def test_the_gate_keeps_the_map_along_known_poses_from_what_is_outside_it():
+    assert not np.array_equal(landmarks_of(Outliers()), landmarks_of(Outliers(gate_probability=0.5)))
 
 
 def test_without_long_lived_landmarks_msckf_slam_is_msckf_fej():

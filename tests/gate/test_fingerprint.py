@@ -34,10 +34,11 @@ def test_the_same_seed_has_the_same_fingerprint_and_another_has_another(flight):
 
 def test_last_bits_do_not_change_it(flight):
     motion, rng = flight.motion, np.random.default_rng(0)
-    nearly = ImuSamples(
-        motion.t_ns,
-        motion.accel_mps2 * (1.0 + 1e-15 * rng.standard_normal(motion.accel_mps2.shape)),
-        motion.gyro_radps * (1.0 + 1e-15 * rng.standard_normal(motion.gyro_radps.shape)),
+    assert isinstance(motion, ImuSamples)
+    nearly = replace(
+        motion,
+        accel_mps2=motion.accel_mps2 * (1.0 + 1e-15 * rng.standard_normal(motion.accel_mps2.shape)),
+        gyro_radps=motion.gyro_radps * (1.0 + 1e-15 * rng.standard_normal(motion.gyro_radps.shape)),
     )
     other = replace(flight, motion=nearly)
     assert other.content_hash() != flight.content_hash()

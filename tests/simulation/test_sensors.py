@@ -78,8 +78,8 @@ def test_an_imu_at_rest_on_average_feels_the_reaction_to_gravity() -> None:
     sequence = simulate(noise_free(replace(FLIGHT, duration_s=60.0)), 0)
     assert isinstance(sequence.motion, ImuSamples)
     truth = truth_of(sequence)
-    at_frames = np.searchsorted(sequence.motion.t_ns, truth.t_ns)
-    f_world = np.einsum("nij,nj->ni", truth.T_world_imu[:, :3, :3], sequence.motion.accel_mps2[at_frames])
+    after_frames = np.searchsorted(sequence.motion.t_ns, truth.t_ns)
+    f_world = np.einsum("nij,nj->ni", truth.T_world_imu[:, :3, :3], sequence.motion.accel_mps2[after_frames])
     # The mean acceleration is (v_end - v_start) / 60 s, below 0.05 m/s^2.
     np.testing.assert_allclose(f_world.mean(axis=0), -sequence.gravity_world, atol=0.05)
 
@@ -178,9 +178,19 @@ def test_outliers_are_as_many_as_asked_and_stay_in_the_image() -> None:
     assert (dirty <= [width - 1, width - 1, height - 1]).all()
 
 
-@pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
-def test_motion_samples_span_exactly_the_frames(scenario: Scenario) -> None:
-    sequence = simulate(replace(scenario, duration_s=2.0), 0)
+def test_twists_span_exactly_the_frames() -> None:
+    sequence = simulate(replace(DRIVE, duration_s=2.0), 0)
     t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
     assert t_ns[0] == frames[0]
     assert t_ns[-1] == frames[-1] == frames[0] + 2 * NS_PER_S
+
+
+@pytest.mark.parametrize("scenario", [DRIVE_IMU, FLIGHT], ids=lambda s: s.name)
+def test_imu_samples_stand_in_the_middle_of_their_intervals_and_span_the_frames(scenario: Scenario) -> None:
+    sequence = simulate(replace(scenario, duration_s=2.0), 0)
+    t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
+    assert isinstance(scenario.motion, Imu)
+    half_ns = round(0.5 * NS_PER_S / scenario.motion.rate_hz)
+    assert t_ns[0] == frames[0] - half_ns
+    assert t_ns[-1] == frames[-1] + half_ns
+    assert frames[-1] == frames[0] + 2 * NS_PER_S

@@ -152,12 +152,29 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         "--config", metavar="FILE", type=Path, help="settings in TOML, or the manifest.json of a run to repeat"
     )
     parser.add_argument(
+        "--outliers",
+        metavar="POLICY",
+        help="what every estimator does about measurements that disagree with it (see docs/settings.md)",
+    )
+    parser.add_argument(
+        "--window",
+        metavar="SECONDS",
+        type=positive_seconds,
+        help="how far back windowed filters and smoothers reach alike",
+    )
+    parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
         action="append",
         default=[],
         help="one setting, as in window.lag_s=3 (see 'vislam list'); may be repeated",
     )
+
+
+def assignments_asked(options: argparse.Namespace) -> list[str]:
+    """Return what --outliers, --window and --set say, in that order, as assignments."""
+    named = {"outliers.policy": options.outliers, "window.lag_s": options.window}
+    return [*(f"{key}={value}" for key, value in named.items() if value is not None), *options.set]
 
 
 def settings_asked(options: argparse.Namespace) -> "Settings":
@@ -167,7 +184,7 @@ def settings_asked(options: argparse.Namespace) -> "Settings":
 
     values = {} if options.config is None else read_configuration(options.config)[1]
     place = "the command line" if options.config is None else str(options.config)
-    return settings_of(with_assignments(values, options.set), place)
+    return settings_of(with_assignments(values, assignments_asked(options)), place)
 
 
 def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:

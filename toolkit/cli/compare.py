@@ -13,6 +13,7 @@ from toolkit.cli.arguments import (
     add_settings_arguments,
     add_tracks_argument,
     add_workers_argument,
+    assignments_asked,
     at_least,
     epilog,
     kept_faults,
@@ -139,7 +140,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     }
     named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds}
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
-    settings = with_assignments(settings, options.set)
+    settings = with_assignments(settings, assignments_asked(options))
     settings |= {key: value for key, value in named.items() if value is not None}
     switches = () if options.columns == ("all",) else requests_of(options.columns)
     settings = with_assignments(settings, [f"metrics.{switch}=true" for switch in switches])

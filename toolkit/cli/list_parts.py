@@ -48,7 +48,8 @@ def command(_options: argparse.Namespace) -> int:
 
 
 def _estimator(entry: EstimatorEntry) -> str:
-    return f"{entry.summary()} (default)" if entry.is_default() else entry.summary()
+    ignored = "".join(f" (not {rule}: {why})" for rule, why in entry.ignores().items())
+    return f"{entry.summary()}{' (default)' if entry.is_default() else ''}{ignored}"
 
 
 def _setting(one: Described) -> str:

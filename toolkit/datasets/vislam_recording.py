@@ -17,7 +17,7 @@ from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
 from toolkit.inputs import open_input, read_text_input
-from toolkit.resampling import Pairing
+from toolkit.resampling import ImuPairing, Pairing
 from toolkit.sequence import (
     ImuNoise,
     ImuSamples,
@@ -109,8 +109,7 @@ def _to_text(sequence: Sequence) -> Text:
         "units": "SI and px; time int64 ns; poses take the IMU frame to the world; bias and prior in [accel, gyro]",
         "gravity_world": sequence.gravity_world.tolist(),
         "rig": _plain(sequence.rig),
-        "motion": {"kind": sequence.motion_kind}
-        | ({"pairing": motion.pairing} if isinstance(motion, TwistSamples) else {}),
+        "motion": {"kind": sequence.motion_kind, "pairing": motion.pairing},
         "noise": _plain(sequence.noise),
         "prior": None if prior is None else {"source": prior.source},
         "truth": None if truth is None else {"independent": truth.independent},
@@ -196,13 +195,20 @@ def _motion(text: Text, arrays: Arrays) -> tuple[MotionSamples, MotionNoise]:
     if kind == "none":
         return NoSamples(t_ns), TwistChangeNoise(**noise)
     if kind == "imu":
-        return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**noise)
+        imu_noise = ImuNoise(**noise)
+        # Recordings saved before an IMU had a choice do not say.
+        pairing = _one_of(text["motion"].get("pairing", "mean"), get_args(ImuPairing))
+        return ImuSamples(t_ns, values[:, :3], values[:, 3:], pairing), imu_noise
     if kind == "twist":
-        pairing = text["motion"]["pairing"]
-        if pairing not in get_args(Pairing):
-            raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(get_args(Pairing))}")
+        pairing = _one_of(text["motion"]["pairing"], get_args(Pairing))
         return TwistSamples(t_ns, values[:, :3], values[:, 3:], pairing), TwistNoise(**noise)
     raise DataError(f"motion.kind is {kind!r}, expected imu, twist or none")
+
+
+def _one_of(pairing: Any, known: tuple[Any, ...]) -> Any:
+    if pairing not in known:
+        raise DataError(f"motion.pairing is {pairing!r}, expected one of {', '.join(known)}")
+    return pairing
 
 
 def _provenance(fields: Text) -> Provenance:

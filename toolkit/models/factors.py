@@ -18,6 +18,11 @@ def kind_of(key: int) -> str:
     return chr(gtsam.Symbol(key).chr())
 
 
+def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:
+    """Return Huber's loss with a threshold in sigma, or no loss for None."""
+    return None if sigma is None else gtsam.noiseModel.mEstimator.Huber.Create(sigma)
+
+
 class StereoFactors:
     """Makes one projection factor per sighting: the measurement, noise and extrinsic the filters use."""
 

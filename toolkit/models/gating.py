@@ -6,7 +6,7 @@ the held-out metric, which judges all estimators alike.
 """
 
 import numpy as np
-from scipy.special import chdtr, chdtri
+from scipy.special import chdtr, chdtrc, chdtri
 
 from toolkit.geometry import Array, IntArray
 
@@ -19,19 +19,19 @@ FEWEST_SIGHTINGS = 2
 # A track whose NIS is this many times the gate's bound holds a mismatch: by chance twice the 95 % quantile is exceeded
 # once in 740 tracks of three degrees of freedom (two sightings), once in 30,000 of twelve (five sightings).
 MISMATCHED_TRACK_FACTOR = 2.0
-# A smoother relinearises and weighs doubtful sightings down, so it leaves out only what no chance explains: four times
-# the 95 % quantile of three degrees of freedom is exceeded less than once in a million.
-MISMATCHED_SIGHTING_FACTOR = 4.0
 # Mismatches come one by one. Where more of the tracks than this disagree with the state, it is the state that is wrong.
 MOST_MISMATCHED = 0.5
 
 
-def chi2_bound(dof: IntArray | int, probability: float) -> Array:
-    """Return the value that chi-square variables with ``dof`` (N,) degrees of freedom stay below so often."""
-    return np.asarray(chdtri(dof, 1.0 - probability), dtype=float)
+def chi2_bound(dof: IntArray | int, probability: float | None) -> Array:
+    """Return the value that chi-square variables with ``dof`` (N,) degrees of freedom stay below so often.
+
+    Without a probability it is infinite: there is no gate.
+    """
+    return np.asarray(chdtri(dof, 1.0 - (1.0 if probability is None else probability)), dtype=float)
 
 
-def mean_below_bound(dof: IntArray | int, probability: float) -> Array:
+def mean_below_bound(dof: IntArray | int, probability: float | None) -> Array:
     """Return the mean (N,) of chi-square variables with ``dof`` (N,) degrees of freedom that passed their gate.
 
     A test that passes below ``q``, the quantile of ``probability``, leaves a truncated variable, whose mean is not
@@ -39,6 +39,8 @@ def mean_below_bound(dof: IntArray | int, probability: float) -> Array:
     times that for d + 2. At 95 % that is 0.877 d for d = 3, 0.919 d for 6, 0.97 d for 33.
     """
     freedom = np.asarray(dof, dtype=float)
+    if probability is None:
+        return freedom
     return np.asarray(freedom * chdtr(freedom + 2.0, chi2_bound(dof, probability)) / probability, dtype=float)
 
 
@@ -49,11 +51,18 @@ def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
     return distance
 
 
-def huber_weights(distances_squared: Array, threshold: float) -> Array:
-    """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,).
+def huber_threshold(dof: IntArray | int, sigma: float) -> Array:
+    """Return the threshold (N,) for residuals of ``dof`` (N,) that is exceeded as often as ``sigma`` by three."""
+    return np.asarray(np.sqrt(chdtri(dof, chdtrc(3, sigma**2))), dtype=float)
+
+
+def huber_weights(distances_squared: Array, threshold: Array | float | None) -> Array:
+    """Return the weight (N,) in (0, 1] that Huber's loss gives squared whitened residual norms (N,); 1 without a loss.
 
     A whitened (uL, uR, v) has a norm of 1.54 in the median (chi distribution): a threshold of 1.5 weighs down the
     larger half of sound sightings a little and a mismatch in inverse proportion to its norm.
     """
+    if threshold is None:
+        return np.ones_like(distances_squared)
     weights: Array = np.minimum(1.0, threshold / np.sqrt(np.maximum(distances_squared, 1e-12)))
     return weights

@@ -17,7 +17,6 @@ from toolkit.geometry import Array, skew, so3_exp
 from toolkit.models.factors import B, V, X, joint_prior, kind_of
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction
 from toolkit.sequence import ImuMotion, ImuNoise, Motion, Prior
-from toolkit.settings import Window
 
 IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)
@@ -144,10 +143,6 @@ class ImuModel:
             gyro_noise_density=gyro * self._noise.gyro_noise_density,
         )
         return preintegration_params(scaled, self._gravity_world)
-
-    def clones(self, window: Window) -> int:
-        """Return many: an IMU ties poses over a second so well that tracks may wait as long."""
-        return window.imu_clones
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose, velocity in the world (3,) and biases."""

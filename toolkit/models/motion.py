@@ -19,7 +19,6 @@ from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
 from toolkit.sequence import Motion, MotionNoise, Prior, TwistChangeNoise, TwistNoise
-from toolkit.settings import Window
 
 
 class Increment(Protocol):
@@ -51,9 +50,6 @@ class MotionModel(Protocol):
 
     def integrate(self, motion: Motion, bias: Array) -> Increment:
         """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
-
-    def clones(self, window: Window) -> int:
-        """Return how many past poses a windowed filter keeps where the IMU moves like this."""
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""

@@ -19,7 +19,6 @@ from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log, 
 from toolkit.models.factors import B, V, X, joint_prior, kind_of
 from toolkit.models.state import POSE, ROTATION, Belief, Layout, Prediction
 from toolkit.sequence import Motion, Prior, TwistChangeNoise, UnmeasuredMotion
-from toolkit.settings import Window
 
 _VELOCITY, _TURN = slice(6, 9), slice(9, 12)
 SMOOTH_LAYOUT = Layout(12, _VELOCITY, None, _TURN)
@@ -153,10 +152,6 @@ class SmoothTwist:
         """Return the interval between two frames; nothing was measured in it."""
         assert isinstance(motion, UnmeasuredMotion)
         return SmoothIncrement(float(motion.dt_s.sum()), self._noise)
-
-    def clones(self, window: Window) -> int:
-        """Return few: poses drift while their tracks wait."""
-        return window.twist_clones
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose, velocity in the world (3,) and turn rate (3,)."""

@@ -16,7 +16,6 @@ from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_right
 from toolkit.models.factors import B, X, joint_prior, kind_of
 from toolkit.models.state import POSE, Belief, Layout, Prediction
 from toolkit.sequence import Motion, Prior, TwistMotion, TwistNoise
-from toolkit.settings import Window
 
 TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
 
@@ -141,10 +140,6 @@ class TwistModel:
         """Integrate the twists between two frames about a bias (6,), of which the gyro's counts."""
         assert isinstance(motion, TwistMotion)
         return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
-
-    def clones(self, window: Window) -> int:
-        """Return few: a twist is a hundred times looser than an IMU, and a pose drifts while its tracks wait."""
-        return window.twist_clones
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose and gyro bias (3,)."""

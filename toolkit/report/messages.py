@@ -5,10 +5,12 @@ from collections.abc import Callable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.geometry import IntArray
 from toolkit.metrics import metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
+from toolkit.settings import Window, outliers_in_words
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
@@ -18,6 +20,8 @@ _MARK = {
 }
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
+
+_RULES = {"outliers": "outliers", "window": "the window"}
 
 # Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
@@ -45,12 +49,35 @@ def sequence_line(sequence: Sequence) -> str:
 
 
 def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what stands above a table: the recording, then the matched pairs and the coverage the rows share."""
+    """Yield what stands above a table: the recording, matched pairs and coverage the rows share, the common rules."""
     seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
     yield sequence_line(comparison.sequence) + seeds
     shared = ", ".join(shared_values(comparison, columns))
     if shared:
         yield f"scored: {shared}"
+    yield rules_line(comparison)
+
+
+def rules_line(comparison: Comparison) -> str:
+    """Return the rules that estimators had in common: the window, whether its cap binds, the outlier policy."""
+    settings, sequence = comparison.settings, comparison.sequence
+    window = settings.window
+    left_out = _left_out(sequence.frames_t_ns, window)
+    thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
+    return (
+        f"window {window.lag_s:g} s, at most {window.most_states} states{thinned}; "
+        f"outliers: {outliers_in_words(settings.outliers)}"
+    )
+
+
+def _left_out(frames_t_ns: IntArray, window: Window) -> int:
+    """Return how many frames have no state in a window, for it would hold too many."""
+    last, left_out = -1, 0
+    for since_ns in (frames_t_ns - frames_t_ns[:1]).tolist():
+        interval = window.interval(since_ns)
+        left_out += interval == last
+        last = interval
+    return left_out
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
@@ -83,6 +110,9 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     if not len(comparison.sequence.observations):
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
+    for name, rules in comparison.ignored.items():
+        for rule, why in rules.items():
+            yield f"{name} does not obey the common rule for {_RULES.get(rule, rule)}: {why}"
     yield from _marks(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)

@@ -27,7 +27,7 @@ from toolkit.sequence import (
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, hall, road
-from toolkit.simulation.sensors import Imu, MotionMeasurements, Odometer
+from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 from toolkit.simulation.world import Camera
 
@@ -107,8 +107,8 @@ def _measure_motion(
 ) -> MotionMeasurements:
     sensor, scale = scenario.motion, scenario.noise_scale
     if isinstance(sensor, Imu):
-        t_ns = sensors.stamps_ns(START_NS, sensor.rate_hz, scenario.duration_s)
-        return sensors.measure_imu(sensor, scale, t_ns, trajectory, scenario.gravity_world, rng)
+        stamps = ImuStamps.over(START_NS, sensor.rate_hz, scenario.duration_s)
+        return sensors.measure_imu(sensor, scale, stamps, trajectory, scenario.gravity_world, rng)
     # One stamp beyond the last frame, so that the last sample is a mean twist like every other.
     t_ns = np.append(frames_t_ns, frames_t_ns[-1] + round(NS_PER_S / scenario.camera.rate_hz))
     T_world_imu = trajectory.at((t_ns - START_NS) / NS_PER_S).T_world_imu

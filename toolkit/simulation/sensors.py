@@ -47,6 +47,25 @@ def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
     return start_ns + np.round(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
+@dataclass(frozen=True, eq=False)
+class ImuStamps:
+    """Stamps (S,) of IMU samples and that of the trajectory's 0 s.
+
+    They are the middles of the IMU's intervals, from one before the start of a recording to one after its end. Frames
+    stand between two intervals then, and no sample informs both sides of a frame: what two intervals between frames
+    measure errs independently, as every estimator assumes.
+    """
+
+    t_ns: IntArray
+    start_ns: int
+
+    @classmethod
+    def over(cls, start_ns: int, rate_hz: float, duration_s: float) -> "ImuStamps":
+        """Return the stamps for a recording."""
+        count = int(np.floor(duration_s * rate_hz + 1e-9)) + 2
+        return cls(start_ns + np.round((np.arange(count) - 0.5) * (NS_PER_S / rate_hz)).astype(np.int64), start_ns)
+
+
 def sightings(tracks: Tracks, points: Array, T_world_imu: Array, rig: StereoRig) -> Observations:
     """Return the exact observations of tracks over landmarks (M, 3) from the poses (K, 4, 4) of the frames."""
     T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
@@ -102,14 +121,18 @@ def measure_twist(
 
 
 def measure_imu(
-    imu: Imu, scale: float, t_ns: IntArray, trajectory: SmoothTrajectory, gravity_world: Array, rng: np.random.Generator
+    imu: Imu, scale: float, stamps: ImuStamps, trajectory: SmoothTrajectory, gravity: Array, rng: np.random.Generator
 ) -> MotionMeasurements:
-    """Measure the instantaneous specific force and angular velocity at stamps (S,), plus noise and bias."""
-    t_s = (t_ns - t_ns[0]) / NS_PER_S
+    """Measure the instantaneous specific force and angular velocity at stamps, plus noise and bias.
+
+    ``gravity`` (3,) m/s^2 is that of the world.
+    """
+    t_ns = stamps.t_ns
+    t_s = (t_ns - stamps.start_ns) / NS_PER_S
     dt_s = 1.0 / imu.rate_hz
     motion = trajectory.at(t_s)
     R_imu_world = np.swapaxes(motion.T_world_imu[:, :3, :3], 1, 2)
-    exact = np.hstack([(R_imu_world @ (motion.a_world - gravity_world)[:, :, None])[:, :, 0], motion.w_imu])
+    exact = np.hstack([(R_imu_world @ (motion.a_world - gravity)[:, :, None])[:, :, 0], motion.w_imu])
     white_rng, walk_rng, start_rng = rng.spawn(3)
     white, walk = white_rng.standard_normal((t_ns.size, 6)), walk_rng.standard_normal((t_ns.size, 6))
     noise = imu.noise
@@ -117,7 +140,7 @@ def measure_imu(
     walk_density = np.repeat([noise.accel_random_walk, noise.gyro_random_walk], 3)
     bias = scale * _walk(imu.bias_sigma * start_rng.standard_normal(6), walk_density * np.sqrt(dt_s) * walk)
     measured = exact + bias + scale * white * density / np.sqrt(dt_s)
-    return MotionMeasurements(ImuSamples(t_ns, measured[:, :3], measured[:, 3:]), bias)
+    return MotionMeasurements(ImuSamples(t_ns, measured[:, :3], measured[:, 3:], "middle"), bias)
 
 
 def _walk(start: Array, steps: Array) -> Array:

@@ -1,0 +1,79 @@
+"""Where a window may not hold the states of all frames: those of frames evenly apart in time, the others predicted.
+
+Filters and smoothers are thinned alike: an estimator is given the frames of its states alone, with the whole motion
+between them, and what the other frames saw is not used. Where the window's cap does not bind it is given every frame.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.estimate import Estimate, Finished, Trajectory
+from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array
+from toolkit.models.motion import motion_model, predicted
+from toolkit.sequence import ImuMotion, Motion, Packet, TwistMotion
+
+
+class Thinned:
+    """Passes on to an estimator the first frame of each of the window's intervals, numbered anew."""
+
+    def __init__(self, setup: Setup, estimator: Estimator) -> None:
+        self._estimator = estimator
+        self._window = setup.settings.window
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._prior = self._motion.initial_belief(setup.prior)
+        self._kept_ns: list[int] = []
+        self._left_out: list[tuple[int, int, Motion]] = []
+        self._since: Motion | None = None
+        self._newest: Estimate | None = None
+
+    def step(self, packet: Packet) -> Estimate:
+        """Take in one packet and return the state at its frame."""
+        t_ns = packet.frame.t_ns
+        self._since = _in_one(self._since, packet.motion)
+        if self._newest is not None and self._interval(t_ns) == self._interval(self._kept_ns[-1]):
+            assert self._since is not None
+            self._left_out.append((len(self._kept_ns) - 1, t_ns, self._since))
+            return self._carried(self._newest, t_ns, self._since)
+        answer = self._estimator.step(Packet(len(self._kept_ns), self._since, packet.frame))
+        assert answer is not None
+        self._kept_ns.append(t_ns)
+        self._newest, self._since = answer, None
+        return answer
+
+    def finish(self) -> Finished:
+        """Return what the estimator does, with the frames left out carried on from the states before them."""
+        finished = self._estimator.finish()
+        if not self._left_out:
+            return finished
+        states = finished.trajectory.states()
+        carried = [self._carried(states[k], t_ns, motion) for k, t_ns, motion in self._left_out]
+        return replace(finished, trajectory=Trajectory.of(sorted([*states, *carried], key=lambda state: state.t_ns)))
+
+    def _interval(self, t_ns: int) -> int:
+        return self._window.interval(t_ns - self._kept_ns[0])
+
+    def _carried(self, state: Estimate, t_ns: int, motion: Motion) -> Estimate:
+        answer = predicted(self._prior.at(state), self._motion, motion).estimate(t_ns)
+        return answer if state.cov is not None else replace(answer, cov=None)
+
+
+def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
+    """Return two motions, one after the other, as one; where one is none, the other."""
+    if first is None or second is None:
+        return second if first is None else first
+    durations = np.concatenate([first.dt_s, second.dt_s])
+    scale = None
+    if first.noise_scale is not None or second.noise_scale is not None:
+        scale = np.concatenate([_noise_scale(first), _noise_scale(second)])
+    if isinstance(first, ImuMotion) and isinstance(second, ImuMotion):
+        accel = np.concatenate([first.accel_mps2, second.accel_mps2])
+        return ImuMotion(durations, accel, np.concatenate([first.gyro_radps, second.gyro_radps]), scale)
+    assert isinstance(first, TwistMotion) and isinstance(second, TwistMotion)
+    velocity = np.concatenate([first.v_mps, second.v_mps])
+    return TwistMotion(durations, velocity, np.concatenate([first.w_radps, second.w_radps]), scale)
+
+
+def _noise_scale(motion: Motion) -> Array:
+    return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale

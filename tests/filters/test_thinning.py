@@ -1,0 +1,106 @@
+"""A window that may not hold every frame's state: filters and smoothers thin alike, evenly, and leave no frame out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman.thinning import Thinned
+from toolkit import runner
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.estimator import Setup, find
+from toolkit.geometry import se3_inverse, se3_log
+from toolkit.models.motion import motion_model
+from toolkit.sequence import Packet
+from toolkit.settings import Settings, Window
+from toolkit.simulation import DRIVE, FLIGHT, noise_free, simulate
+
+WINDOWED = ("msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart")
+
+
+@pytest.fixture(scope="module")
+def flight():
+    camera = replace(FLIGHT.camera, max_tracks=40)
+    return simulate(noise_free(replace(FLIGHT, duration_s=2.0, camera=camera)), 0)
+
+
+class Listener:
+    """Integrates the motion it is given, from the truth, and remembers the packets."""
+
+    def __init__(self, setup: Setup) -> None:
+        self.packets: list[Packet] = []
+        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._belief = self._motion.initial_belief(setup.prior)
+        self._said: list[Estimate] = []
+
+    def step(self, packet: Packet) -> Estimate:
+        if packet.motion is not None:
+            increment = self._motion.integrate(packet.motion, self._belief.bias)
+            self._belief = self._belief.predicted(increment.predict(self._belief))
+        self.packets.append(packet)
+        self._said.append(self._belief.estimate(packet.frame.t_ns))
+        return self._said[-1]
+
+    def finish(self) -> Finished:
+        return Finished(Trajectory.of(self._said), Landmarks.none())
+
+
+def thinned(sequence, window):
+    setup = Setup(
+        sequence.rig,
+        sequence.noise,
+        sequence.prior,
+        sequence.gravity_world,
+        sequence.motion_kind,
+        Settings(window=window),
+    )
+    listener = Listener(setup)
+    wrapped = Thinned(setup, listener)
+    online = [wrapped.step(packet) for packet in sequence.packets()]
+    return listener, online, wrapped.finish().trajectory
+
+
+# 20 frames a second: a second's window has 21.
+@pytest.mark.parametrize("most_states", [2, 3, 5, 8, 11, 20])
+def test_no_window_holds_more_states_than_its_most_and_they_are_evenly_apart(flight, most_states):
+    listener, _, _ = thinned(flight, Window(lag_s=1.0, most_states=most_states))
+    t_s = np.array([packet.frame.t_ns - flight.frames_t_ns[0] for packet in listener.packets]) / 1e9
+    held = [int(((t_s >= now - 1.0 - 1e-9) & (t_s <= now)).sum()) for now in t_s]
+    assert max(held) <= most_states
+    assert max(held) >= most_states - 1
+    # To within a frame.
+    assert np.abs(np.diff(t_s) - 1.0 / (most_states - 1)).max() < 0.05 + 1e-9
+    assert [packet.index for packet in listener.packets] == list(range(len(t_s)))
+
+
+def test_where_the_cap_does_not_bind_an_estimator_is_given_every_packet_as_it_is(flight):
+    listener, _, _ = thinned(flight, Window(lag_s=1.0, most_states=21))
+    for given, packet in zip(listener.packets, flight.packets(), strict=True):
+        assert (given.index, given.frame.t_ns) == (packet.index, packet.frame.t_ns)
+        if packet.motion is not None:
+            np.testing.assert_array_equal(given.motion.dt_s, packet.motion.dt_s)
+
+
+def test_frames_without_a_state_are_carried_on_from_the_state_before_them(flight):
+    """With nothing left out of the motion, which is exact to 1 kHz's midpoint rule."""
+    listener, online, final = thinned(flight, Window(lag_s=1.0, most_states=5))
+    assert len(listener.packets) < len(online) == flight.frame_count
+    np.testing.assert_array_equal(final.t_ns, flight.frames_t_ns)
+    for trajectory in (Trajectory.of(online), final):
+        error = se3_log(se3_inverse(flight.truth.T_world_imu) @ trajectory.T_world_imu)
+        assert np.abs(error).max() < 1e-5
+        grown = np.linalg.det(trajectory.cov[1:, :6, :6]) > np.linalg.det(trajectory.cov[:-1, :6, :6])
+        assert grown.all()
+
+
+@pytest.mark.parametrize("name", WINDOWED)
+def test_windowed_filters_and_smoothers_answer_for_every_frame_under_a_cap(name):
+    sequence = simulate(replace(DRIVE, duration_s=2.0, camera=replace(DRIVE.camera, max_tracks=30)), 3)
+    settings = Settings(window=Window(lag_s=1.0, most_states=5))
+    run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
+    assert run.status == "ok", run.log
+    for trajectory in (run.causal, run.final):
+        np.testing.assert_array_equal(trajectory.t_ns, sequence.frames_t_ns)
+        assert trajectory.cov is not None
+        error_m = np.linalg.norm(trajectory.positions - sequence.truth.T_world_imu[:, :3, 3], axis=1)
+        assert error_m.max() < 0.3
