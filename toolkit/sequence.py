@@ -85,6 +85,11 @@ class TwistNoise:
     def __post_init__(self) -> None:
         freeze_arrays(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
 
+    def scaled(self, factor: float) -> Self:
+        """Return the noise with its white densities scaled; the random walk stays."""
+        velocity, gyro = factor * self.velocity_noise_density, factor * self.gyro_noise_density
+        return replace(self, velocity_noise_density=velocity, gyro_noise_density=gyro)
+
 
 @dataclass(frozen=True)
 class ImuNoise:
@@ -97,6 +102,11 @@ class ImuNoise:
     gyro_noise_density: float
     accel_random_walk: float
     gyro_random_walk: float
+
+    def scaled(self, factor: float) -> Self:
+        """Return the noise with its white densities scaled; the random walks stay."""
+        accel, gyro = factor * self.accel_noise_density, factor * self.gyro_noise_density
+        return replace(self, accel_noise_density=accel, gyro_noise_density=gyro)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +121,11 @@ class TwistChangeNoise:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, velocity_change_density=(3,), turn_change_density=(3,))
+
+    def scaled(self, factor: float) -> Self:
+        """Return the noise with its densities scaled."""
+        velocity, turn = factor * self.velocity_change_density, factor * self.turn_change_density
+        return replace(self, velocity_change_density=velocity, turn_change_density=turn)
 
 
 MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
@@ -137,6 +152,10 @@ class TwistSamples:
         """Return the samples side by side (S, 6): linear velocity, angular velocity."""
         return np.hstack([self.v_mps, self.w_radps])
 
+    def of(self, t_ns: IntArray, values: Array) -> Self:
+        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
+        return replace(self, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
+
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
@@ -159,6 +178,10 @@ class ImuSamples:
         """Return the samples side by side (S, 6): specific force, angular velocity."""
         return np.hstack([self.accel_mps2, self.gyro_radps])
 
+    def of(self, t_ns: IntArray, values: Array) -> Self:
+        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
+        return replace(self, t_ns=t_ns, accel_mps2=values[:, :3], gyro_radps=values[:, 3:])
+
 
 @dataclass(frozen=True, eq=False)
 class NoSamples:
@@ -173,6 +196,10 @@ class NoSamples:
     def values(self) -> Array:
         """Return rows (S, 0) without a value."""
         return np.empty((self.t_ns.size, 0))
+
+    def of(self, t_ns: IntArray, values: Array) -> Self:
+        """Return other stamps (S,), of which there are no values (S, 0) either."""
+        return replace(self, t_ns=t_ns)
 
 
 MotionSamples = TwistSamples | ImuSamples | NoSamples

@@ -12,7 +12,7 @@ from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import ImuMotion, Motion, Packet, TwistMotion
+from toolkit.sequence import ImuMotion, Motion, Packet, TwistMotion, UnmeasuredMotion
 
 
 class Thinned:
@@ -64,6 +64,8 @@ def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
     if first is None or second is None:
         return second if first is None else first
     durations = np.concatenate([first.dt_s, second.dt_s])
+    if isinstance(first, UnmeasuredMotion) or isinstance(second, UnmeasuredMotion):
+        return UnmeasuredMotion(durations.sum(keepdims=True))
     scale = None
     if first.noise_scale is not None or second.noise_scale is not None:
         scale = np.concatenate([_noise_scale(first), _noise_scale(second)])
@@ -75,5 +77,5 @@ def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
     return TwistMotion(durations, velocity, np.concatenate([first.w_radps, second.w_radps]), scale)
 
 
-def _noise_scale(motion: Motion) -> Array:
+def _noise_scale(motion: TwistMotion | ImuMotion) -> Array:
     return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale

@@ -14,7 +14,7 @@ from toolkit.audit.parts.intervals import is_comparable
 from toolkit.audit.time_gap import GAP_RATIO
 from toolkit.geometry import Array, IntArray
 from toolkit.resampling import NS_PER_S, Bridges
-from toolkit.sequence import MotionNoise, MotionSamples, Sequence, TwistNoise, TwistSamples
+from toolkit.sequence import ImuNoise, MotionNoise, MotionSamples, NoSamples, Sequence, TwistNoise, TwistSamples
 
 # Bridges laid over measured stretches: with fewer than this the recording is too short to tell, and the whole spread of
 # the samples counts as their error.
@@ -55,7 +55,7 @@ def _holes(sequence: Sequence) -> tuple[IntArray, float]:
     """
     t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
     step_ns = np.diff(t_ns)
-    if not step_ns.size:
+    if not step_ns.size or isinstance(sequence.motion, NoSamples):
         return np.empty(0, dtype=np.int64), 0.0
     usual_ns = float(np.median(step_ns))
     inside = (t_ns[1:] > frames_t_ns[0]) & (t_ns[:-1] < frames_t_ns[-1])
@@ -93,6 +93,7 @@ def _stated(noise: MotionNoise) -> Array:
     """Return the stated densities (2,) of linear and angular samples, the least of their axes."""
     if isinstance(noise, TwistNoise):
         return np.array([noise.velocity_noise_density.min(), noise.gyro_noise_density.min()])
+    assert isinstance(noise, ImuNoise)
     return np.array([noise.accel_noise_density, noise.gyro_noise_density])
 
 
@@ -103,9 +104,7 @@ def _filled(motion: MotionSamples, rows: IntArray, usual_ns: float) -> MotionSam
     t_ns = np.sort(np.concatenate([motion.t_ns, *(np.rint(stamps).astype(np.int64) for stamps in inner)]))
     at_s, sample_s = (t_ns - t_ns[0]) / NS_PER_S, (motion.t_ns - t_ns[0]) / NS_PER_S
     values = np.stack([np.interp(at_s, sample_s, column) for column in motion.values.T], axis=1)
-    if isinstance(motion, TwistSamples):
-        return replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
-    return replace(motion, t_ns=t_ns, accel_mps2=values[:, :3], gyro_radps=values[:, 3:])
+    return motion.of(t_ns, values)
 
 
 def _with(before: Bridges | None, new: Bridges) -> Bridges:

@@ -109,7 +109,10 @@ def _to_text(sequence: Sequence) -> Text:
         "units": "SI and px; time int64 ns; poses take the IMU frame to the world; bias and prior in [accel, gyro]",
         "gravity_world": sequence.gravity_world.tolist(),
         "rig": _plain(sequence.rig),
-        "motion": {"kind": sequence.motion_kind, "pairing": motion.pairing},
+        "motion": {
+            "kind": sequence.motion_kind,
+            "pairing": None if isinstance(motion, NoSamples) else motion.pairing,
+        },
         "noise": _plain(sequence.noise),
         "prior": None if prior is None else {"source": prior.source},
         "truth": None if truth is None else {"independent": truth.independent},

@@ -14,7 +14,7 @@ from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuNoise, MotionNoise, Prior, Sequence, TwistChangeNoise
+from toolkit.sequence import Prior, Sequence
 from toolkit.settings import DEFAULTS, Frontend, Noise
 from toolkit.simulation import SCENARIOS, simulate
 
@@ -107,17 +107,5 @@ def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
     rig = sequence.rig
     if asked.pixel_sigma_px is not None:
         rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (asked.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
-    noise = sequence.noise if asked.motion_scale == 1.0 else _scaled(sequence.noise, asked.motion_scale)
+    noise = sequence.noise if asked.motion_scale == 1.0 else sequence.noise.scaled(asked.motion_scale)
     return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
-
-
-def _scaled(noise: MotionNoise, factor: float) -> MotionNoise:
-    """Return the noise with its white densities scaled; random walks stay."""
-    if isinstance(noise, ImuNoise):
-        gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
-        return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
-    if isinstance(noise, TwistChangeNoise):
-        changes = (factor * noise.velocity_change_density, factor * noise.turn_change_density)
-        return TwistChangeNoise(*changes)
-    velocity = factor * noise.velocity_noise_density
-    return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)

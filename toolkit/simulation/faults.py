@@ -16,9 +16,6 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import (
-    ImuNoise,
-    MotionNoise,
-    MotionSamples,
     Observations,
     Sequence,
     Truth,
@@ -125,7 +122,7 @@ def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
     """Give one motion sample the value of the dose on one axis: a flipped bit, a failed parse."""
     rng, values = np.random.default_rng(seed), sequence.motion.values.copy()
     values[rng.integers(len(values) // 4, 3 * len(values) // 4), rng.integers(6)] = dose
-    return replace(sequence, motion=_with_values(sequence.motion, values))
+    return _with_values(sequence, values)
 
 
 def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
@@ -135,30 +132,30 @@ def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
     t_s, seen_s = _samples_s(sequence), _frames_s(sequence)[sequence.observations.frame]
     values[(t_s > begin_s) & (t_s < end_s)] = np.nan
     uv_px[(seen_s > begin_s) & (seen_s < end_s)] = np.nan
-    return replace(_with_pixels(sequence, uv_px), motion=_with_values(sequence.motion, values))
+    return _with_values(_with_pixels(sequence, uv_px), values)
 
 
 def linear_unit(sequence: Sequence, dose: float = 3.6, seed: int = 0) -> Sequence:
     """Multiply velocities, or accelerations, by the dose: 3.6 for km/h, 100 for cm/s, 0.102 for g."""
-    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values * np.repeat([dose, 1.0], 3)))
+    return _with_values(sequence, sequence.motion.values * np.repeat([dose, 1.0], 3))
 
 
 def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0) -> Sequence:
     """Multiply angular velocities by the dose: 57.3 for degrees."""
-    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values * np.repeat([1.0, dose], 3)))
+    return _with_values(sequence, sequence.motion.values * np.repeat([1.0, dose], 3))
 
 
 def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Add a constant of the dose (rad/s), in a direction drawn, to every angular velocity: a warm gyro."""
     axis = np.random.default_rng(seed).standard_normal(3)
     bias = np.concatenate([np.zeros(3), dose * axis / np.linalg.norm(axis)])
-    return replace(sequence, motion=_with_values(sequence.motion, sequence.motion.values + bias))
+    return _with_values(sequence, sequence.motion.values + bias)
 
 
 def wrong_noise(sequence: Sequence, dose: float = 2.0, seed: int = 0) -> Sequence:
     """State the dose times the noise of tracks and motion, which stay as they are: a data sheet of another sensor."""
     rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 * dose**2)
-    return replace(sequence, rig=rig, noise=_scaled_noise(sequence.noise, dose))
+    return replace(sequence, rig=rig, noise=sequence.noise.scaled(dose))
 
 
 # The clocks ---------------------------------------------------------------------------------------------------------
@@ -350,12 +347,9 @@ def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
     return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
 
 
-def _with_values(motion: MotionSamples, values: Array) -> MotionSamples:
-    """Return the motion with other values (S, 6)."""
-    linear, angular = values[:, :3], values[:, 3:]
-    if isinstance(motion, TwistSamples):
-        return replace(motion, v_mps=linear, w_radps=angular)
-    return replace(motion, accel_mps2=linear, gyro_radps=angular)
+def _with_values(sequence: Sequence, values: Array) -> Sequence:
+    """Return the sequence with other values (S, 6) of its motion samples."""
+    return replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
 
 
 def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
@@ -374,12 +368,3 @@ def _with_first_frames_cut(sequence: Sequence, inside: BoolArray) -> Sequence:
 
 def _with_rig(sequence: Sequence, **fields: Any) -> Sequence:
     return replace(sequence, rig=replace(sequence.rig, **fields))
-
-
-def _scaled_noise(noise: MotionNoise, factor: float) -> MotionNoise:
-    """Return the noise with its white densities scaled; random walks stay."""
-    if isinstance(noise, ImuNoise):
-        gyro, accel = factor * noise.gyro_noise_density, factor * noise.accel_noise_density
-        return replace(noise, gyro_noise_density=gyro, accel_noise_density=accel)
-    velocity = factor * noise.velocity_noise_density
-    return replace(noise, velocity_noise_density=velocity, gyro_noise_density=factor * noise.gyro_noise_density)

@@ -8,7 +8,7 @@ from toolkit.audit.parts.intervals import median_one_step_px, own_one_step_px
 from toolkit.audit.parts.vision import CameraMotion, usable_pairs
 from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, TwistNoise
+from toolkit.sequence import Sequence, TwistChangeNoise, TwistNoise
 
 # Median one-step residual (px) beyond which samples and tracks disagree. Sound recordings have 0.3 to 3.1 px, the
 # largest where the samples' own noise explains it.
@@ -36,8 +36,9 @@ def _explained_px(sequence: Sequence, own_px: float) -> float:
     """Return the residual that the tracks' own scatter and the stated noise over a usual interval explain together."""
     noise, focal_px = sequence.noise, sequence.rig.fx_px
     root_dt = np.sqrt(np.median(np.diff(sequence.frames_t_ns)) / NS_PER_S)
-    turned_px = focal_px * root_dt * float(np.max(noise.gyro_noise_density))
-    moved_px = 0.0
+    turned_px = moved_px = 0.0
+    if not isinstance(noise, TwistChangeNoise):
+        turned_px = focal_px * root_dt * float(np.max(noise.gyro_noise_density))
     if isinstance(noise, TwistNoise):
         uv_px = sequence.observations.uv_px[usable_pairs(sequence).before]
         depth_m = float(np.median(triangulate(uv_px, sequence.rig)[:, 2])) if len(uv_px) else np.inf

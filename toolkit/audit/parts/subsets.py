@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.geometry import BoolArray, IntArray
-from toolkit.sequence import MotionSamples, NoSamples, Observations, Sequence, TwistSamples
+from toolkit.sequence import Observations, Sequence
 
 
 def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
@@ -30,12 +30,4 @@ def keep_frames(sequence: Sequence, kept: IntArray) -> Sequence:
 def keep_samples(sequence: Sequence, kept: BoolArray | IntArray) -> Sequence:
     """Return the sequence with the motion samples of a mask (S,) or an index (M,), in that order."""
     motion = sequence.motion
-    t_ns = motion.t_ns[kept]
-    samples: MotionSamples
-    if isinstance(motion, TwistSamples):
-        samples = replace(motion, t_ns=t_ns, v_mps=motion.v_mps[kept], w_radps=motion.w_radps[kept])
-    elif isinstance(motion, NoSamples):
-        samples = NoSamples(t_ns)
-    else:
-        samples = replace(motion, t_ns=t_ns, accel_mps2=motion.accel_mps2[kept], gyro_radps=motion.gyro_radps[kept])
-    return replace(sequence, motion=samples)
+    return replace(sequence, motion=motion.of(motion.t_ns[kept], motion.values[kept]))

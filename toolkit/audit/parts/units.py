@@ -74,10 +74,9 @@ def linear_scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Se
     is scaled as well.
     """
     motion, noise = sequence.motion, sequence.noise
-    if not isinstance(motion, TwistSamples):
-        accel, gyro = linear * motion.accel_mps2, angular * motion.gyro_radps
-        return replace(sequence, motion=replace(motion, accel_mps2=accel, gyro_radps=gyro))
-    assert isinstance(noise, TwistNoise)
+    scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
+    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
+        return replace(sequence, motion=scaled)
     root_dt = np.sqrt(np.median(np.diff(motion.t_ns)) / NS_PER_S)
     velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
     if linear != 1.0 and (velocity > FROM_SCATTER * white_sigma(motion.v_mps) * root_dt).all():
@@ -86,6 +85,6 @@ def linear_scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Se
         gyro_noise = angular * gyro_noise
     return replace(
         sequence,
-        motion=replace(motion, v_mps=linear * motion.v_mps, w_radps=angular * motion.w_radps),
+        motion=scaled,
         noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
     )
