@@ -132,12 +132,18 @@ class FixedLagTree:
     def _emptied(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Begin a new tree; return all that was in the old one, to be taken in.
 
+        A landmark that was dropped with all its factors stays behind: in a tree it would be a variable without a place.
         GTSAM's marginal factors have no linearisation point: they stay right only while their variables stay linearised
         where they are. The tree that made them holds those fixed; the next one must be given them.
         """
         factors, values = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
+        known = factors.keys()
+        lost = [key for key in values.keys() if not known.count(key)]  # noqa: SIM118 - not a mapping
+        for key in lost:
+            values.erase(key)
+        self._forget(lost)
         return factors, values
 
     def _without(

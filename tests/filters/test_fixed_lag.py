@@ -129,6 +129,38 @@ def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_told
     np.testing.assert_allclose(position_of(window, 4), exact.atPoint3(X(4)), atol=1e-9)
 
 
+class BrokenOff:
+    """A tree whose update was refused after it had taken factors out: their variable is still among the values."""
+
+    def __init__(self, whole: gtsam.ISAM2, lost: int) -> None:
+        self._whole, self._lost = whole, lost
+
+    def getFactorsUnsafe(self) -> gtsam.NonlinearFactorGraph:  # noqa: N802 - GTSAM's name
+        kept, whole = gtsam.NonlinearFactorGraph(), self._whole.getFactorsUnsafe()
+        for factor in (whole.at(slot) for slot in range(whole.size()) if whole.exists(slot)):
+            if self._lost not in factor.keys():
+                kept.add(factor)
+        return kept
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._whole, name)
+
+
+def test_a_landmark_without_sightings_does_not_come_into_a_tree_built_anew():
+    """GTSAM, asked to marginalise a variable that is in no clique, ends the process."""
+    window, extension = FixedLagTree(2 * NS_PER_S), chain_link(0)
+    extension.landmark_ids = [5]
+    extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
+    unit = gtsam.noiseModel.Unit.Create(3)
+    extension.factors.add(gtsam.BetweenFactorPoint3(X(0), L(5), np.array([7.0, 0.0, 0.0]), unit))
+    assert window.add(extension, 0).log == []
+    window._isam = BrokenOff(window._isam, L(5))
+    assert window.rebuild().log == []
+    assert not window.values().exists(L(5))
+    for k in range(1, 4):
+        assert window.add(chain_link(k), k * NS_PER_S).log == []
+
+
 def with_a_first_sighting_too_far(sequence: Sequence, track_id: int, disparity_px: float) -> Sequence:
     seen, uv_px = sequence.observations, sequence.observations.uv_px.copy()
     first = np.flatnonzero(seen.track_id == track_id)[0]
