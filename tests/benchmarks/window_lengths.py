@@ -3,7 +3,7 @@
 The excess variance needs few seeds, for the draw of noise that all share is taken off. The default of window.lag_s was
 chosen from this, on seeds from 700 on.
 
-    python tests/benchmarks/window_lengths.py              flight, drive and drive-imu, about fifteen minutes on one core
+    python tests/benchmarks/window_lengths.py      flight, drive and drive-imu, fifteen minutes on one core
 """
 
 import argparse

@@ -138,7 +138,7 @@ class BrokenOff:
     def getFactorsUnsafe(self) -> gtsam.NonlinearFactorGraph:  # noqa: N802 - GTSAM's name
         kept, whole = gtsam.NonlinearFactorGraph(), self._whole.getFactorsUnsafe()
         for factor in (whole.at(slot) for slot in range(whole.size()) if whole.exists(slot)):
-            if self._lost not in factor.keys():
+            if self._lost not in list(factor.keys()):
                 kept.add(factor)
         return kept
 
