@@ -84,9 +84,11 @@ def time_gap(sequence: Sequence) -> Plant:
 
 
 def outside_motion(sequence: Sequence) -> Plant:
-    """Let the motion samples start with frame 5 and end with the last frame but three."""
+    """Let the motion samples reach from frame 5 to the last frame but three."""
     t_ns, frames = sequence.motion.t_ns, sequence.frames_t_ns
-    return Plant("outside-motion", with_samples(sequence, (t_ns >= frames[5]) & (t_ns <= frames[-4])), 5 + 3)
+    first, last = np.searchsorted(t_ns, frames[5], side="right") - 1, np.searchsorted(t_ns, frames[-4])
+    rows = np.arange(t_ns.size)
+    return Plant("outside-motion", with_samples(sequence, (rows >= first) & (rows <= last)), 5 + 3)
 
 
 def no_disparity(sequence: Sequence) -> Plant:

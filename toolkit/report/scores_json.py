@@ -57,8 +57,8 @@ def seeds_document(over: Comparison) -> Seeds:
 
 
 def path_length_m(sequence: Sequence) -> float | None:
-    """Return the length of the true path while the camera ran, or None without truth."""
-    if sequence.truth is None:
+    """Return the length of the true path while the camera ran, or None without truth or frames."""
+    if sequence.truth is None or not sequence.frame_count:
         return None
     t_ns = sequence.truth.t_ns
     during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
