@@ -12,30 +12,14 @@ the same vectors whatever the estimate, as in the invariant belief that this one
 import numpy as np
 
 from filters.kalman.invariant import InvariantBelief
-from filters.kalman.inverse_depth import inverse_depth, inverse_depth_jacobian
+from filters.kalman.inverse_depth import LandmarkAnchors, inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import JointBelief
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, skew, transform
-from toolkit.models.state import POSITION, ROTATION, Belief
+from toolkit.geometry import Array, se3_inverse, skew, transform
+from toolkit.models.state import POSITION, ROTATION
 
 
-class AnchoredBelief(InvariantBelief):
-    """An invariant belief with an anchor (4, 4) for each landmark, ``T_world_cam`` of the camera that saw it first."""
-
-    def __init__(self, core: Belief, T_imu_cam: Array) -> None:
-        super().__init__(core)
-        self._T_imu_cam = T_imu_cam
-        self.anchors: Array = np.empty((0, 4, 4))
-
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, cov: Array) -> None:
-        """Add landmarks as every joint belief does, anchored in the newest clone."""
-        super().add_landmarks(track_ids, points, jacobian, cov)
-        anchor = self.clones[-1] @ self._T_imu_cam
-        self.anchors = np.concatenate([self.anchors, np.tile(anchor, (len(track_ids), 1, 1))])
-
-    def forget_landmarks(self, which: BoolArray) -> None:
-        """Marginalise landmarks (L,)."""
-        super().forget_landmarks(which)
-        self.anchors = self.anchors[~which]
+class AnchoredBelief(LandmarkAnchors, InvariantBelief):
+    """An invariant belief whose anchors are moved along with the IMU."""
 
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.

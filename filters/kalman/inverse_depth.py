@@ -17,7 +17,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models.state import Belief
 
 
-class InverseDepthBelief(JointBelief):
+class LandmarkAnchors(JointBelief):
     """A joint belief with an anchor (4, 4) for each landmark, ``T_world_cam`` of the camera that saw it first."""
 
     def __init__(self, core: Belief, T_imu_cam: Array) -> None:
@@ -35,6 +35,10 @@ class InverseDepthBelief(JointBelief):
         """Marginalise landmarks (L,)."""
         super().forget_landmarks(which)
         self.anchors = self.anchors[~which]
+
+
+class InverseDepthBelief(LandmarkAnchors):
+    """A belief whose landmarks move along their inverse depth from anchors that stay where they are."""
 
     def _displace(self, delta: Array) -> None:
         to_anchor = se3_inverse(self.anchors)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_name, rig_of
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
@@ -22,7 +22,7 @@ from toolkit.inputs import is_regular, read_text_input
 from toolkit.models.noise import unmeasured_motion
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import NoSamples, Provenance, Sequence, Truth
-from toolkit.settings import DEFAULTS, Frontend, Tracks
+from toolkit.settings import DEFAULTS, Frontend
 
 NO_MOTION = "no motion input: all estimators assume a motion that is smooth, and say so"
 # Grey or colour, and the rows of calib.txt that are theirs.
@@ -42,6 +42,9 @@ class _Layout:
     row: int
 
 
+uses_images = images_only
+
+
 def recognises(path: Path) -> bool:
     """Say whether the path is a folder with the images of a rectified pair, named as KITTI odometry names them."""
     return _layout(path) is not None
@@ -50,13 +53,6 @@ def recognises(path: Path) -> bool:
 def load(path: Path) -> Sequence:
     """Read a sequence with the front end's default settings; see :func:`load_from_images`."""
     return load_from_images(path, DEFAULTS.frontend, SILENT)
-
-
-def uses_images(path: Path, tracks: Tracks) -> bool:
-    """Say that the tracks are made of the images; raise DataError where simulated ones are asked for."""
-    if tracks == "simulated":
-        raise DataError(f"{path}: tracks are simulated for EuRoC folders only; leave --tracks simulated out")
-    return True
 
 
 def images_of(path: Path) -> ImageRecording:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, observations
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_name, rig_of
 from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
 from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
@@ -32,7 +32,7 @@ from toolkit.sequence import (
     Truth,
     TwistSamples,
 )
-from toolkit.settings import DEFAULTS, Frontend, Tracks
+from toolkit.settings import DEFAULTS, Frontend
 
 _SIDES = (("00", "01"), ("02", "03"))
 # Between slower packets a car's specific force is not what its samples say.
@@ -54,6 +54,9 @@ class _Layout:
         return self.root / f"image_{self.sides[side]}" / "data"
 
 
+uses_images = images_only
+
+
 def recognises(path: Path) -> bool:
     """Say whether the path is a folder with the images of a raw drive."""
     return _layout(path) is not None
@@ -62,13 +65,6 @@ def recognises(path: Path) -> bool:
 def load(path: Path) -> Sequence:
     """Read a drive with the front end's default settings; see :func:`load_from_images`."""
     return load_from_images(path, DEFAULTS.frontend, SILENT)
-
-
-def uses_images(path: Path, tracks: Tracks) -> bool:
-    """Say that the tracks are made of the images; raise DataError where simulated ones are asked for."""
-    if tracks == "simulated":
-        raise DataError(f"{path}: tracks are simulated for EuRoC folders only; leave --tracks simulated out")
-    return True
 
 
 def images_of(path: Path) -> ImageRecording:

@@ -13,6 +13,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.inputs import is_regular, read_text_input
 from toolkit.models.noise import pixel_covariance
 from toolkit.sequence import StereoRig
+from toolkit.settings import Tracks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
 # Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
@@ -28,6 +29,13 @@ class Listed:
     pairs: tuple[StampedPair, ...]
     stamps: int
     remarks: tuple[str, ...] = ()
+
+
+def images_only(path: Path, tracks: Tracks) -> bool:
+    """Say that the tracks are made of the images; raise DataError where simulated ones are asked for."""
+    if tracks == "simulated":
+        raise DataError(f"{path}: tracks are simulated for EuRoC folders only; leave --tracks simulated out")
+    return True
 
 
 def images_in(folder: Path) -> list[Path]:
