@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from toolkit.geometry import Array, se3
-from toolkit.sequence import Observations, Sequence, TwistSamples
+from toolkit.measured_motion import TwistSamples
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
 STALE_SHARE = 0.15

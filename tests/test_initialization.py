@@ -12,7 +12,8 @@ from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import Array, about_z, interpolate_poses, so3_log, yaw_of
 from toolkit.initialization import start_from_measurements, start_from_truth
-from toolkit.sequence import ImuSamples, Observations, Prior, Sequence
+from toolkit.measured_motion import ImuSamples
+from toolkit.sequence import Observations, Prior, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 SEEDS = range(5)

@@ -14,9 +14,10 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.measured_motion import Motion
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief
-from toolkit.sequence import Motion, Sequence
+from toolkit.sequence import Sequence
 
 # A windowed filter corrects by several frames' tracks at once: five times the motion noise of one frame.
 _LUMP_FRAMES = 5

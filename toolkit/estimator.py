@@ -18,8 +18,9 @@ from toolkit.discovery import FoundModule, MissingDependency, announced
 from toolkit.errors import EstimatorError, no_such
 from toolkit.estimate import Estimate, Finished
 from toolkit.geometry import Array
+from toolkit.measured_motion import MotionKind, MotionNoise
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import MotionKind, MotionNoise, Packet, Prior, StereoRig
+from toolkit.sequence import Packet, Prior, StereoRig
 from toolkit.settings import DEFAULTS, Scalar, Settings
 
 ENTRY_POINT_GROUP = "toolkit.estimators"

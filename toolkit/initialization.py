@@ -15,22 +15,12 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, IntArray, se3, so3_exp, transform
+from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, TwistChangeNoise, TwistNoise
 from toolkit.models import stereo
 from toolkit.models.factors import B, L, StereoFactors, X, joint_cov
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import (
-    ImuMotion,
-    ImuNoise,
-    Motion,
-    Packet,
-    Prior,
-    Sequence,
-    StereoFrame,
-    StereoRig,
-    TwistChangeNoise,
-    TwistNoise,
-)
+from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig
 
 WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
 # What the gauge is held to (rad, m), and the biases' before any measurement (m/s^2, rad/s).

@@ -8,7 +8,7 @@ from all of them and serves the held-out reprojection error.
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
@@ -20,11 +20,19 @@ from toolkit.geometry import (
     BoolArray,
     IntArray,
     quaternion_from_rotation,
-    read_only,
     rotation_from_quaternion,
     se3,
 )
-from toolkit.resampling import NS_PER_S, Bridges, ImuPairing, Pairing, cut_at
+from toolkit.measured_motion import (
+    Motion,
+    MotionKind,
+    MotionNoise,
+    MotionSamples,
+    are_of_one_kind,
+    kind_of,
+    motions_between,
+)
+from toolkit.resampling import NS_PER_S, Bridges
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
@@ -69,146 +77,6 @@ class StereoRig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))
         freeze_arrays(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
-
-
-@dataclass(frozen=True, eq=False)
-class TwistNoise:
-    """Continuous white-noise densities of a measured body twist, per axis (3,), and of the gyro bias' walk.
-
-    Units: m/s/sqrt(Hz), rad/s/sqrt(Hz), rad/s^2/sqrt(Hz).
-    """
-
-    velocity_noise_density: Array
-    gyro_noise_density: Array
-    gyro_random_walk: Array
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, velocity_noise_density=(3,), gyro_noise_density=(3,), gyro_random_walk=(3,))
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walk stays."""
-        velocity, gyro = factor * self.velocity_noise_density, factor * self.gyro_noise_density
-        return replace(self, velocity_noise_density=velocity, gyro_noise_density=gyro)
-
-
-@dataclass(frozen=True)
-class ImuNoise:
-    """Continuous noise densities of an IMU, with Kalibr's names.
-
-    Units: m/s^2/sqrt(Hz), rad/s/sqrt(Hz), m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz).
-    """
-
-    accel_noise_density: float
-    gyro_noise_density: float
-    accel_random_walk: float
-    gyro_random_walk: float
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its white densities scaled; the random walks stay."""
-        accel, gyro = factor * self.accel_noise_density, factor * self.gyro_noise_density
-        return replace(self, accel_noise_density=accel, gyro_noise_density=gyro)
-
-
-@dataclass(frozen=True, eq=False)
-class TwistChangeNoise:
-    """Densities of the white noise on the change of a twist that nobody measured, per axis (3,), in the IMU frame.
-
-    Units: m/s^2/sqrt(Hz) of the velocity, rad/s^2/sqrt(Hz) of the turn rate.
-    """
-
-    velocity_change_density: Array
-    turn_change_density: Array
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, velocity_change_density=(3,), turn_change_density=(3,))
-
-    def scaled(self, factor: float) -> Self:
-        """Return the noise with its densities scaled."""
-        velocity, turn = factor * self.velocity_change_density, factor * self.turn_change_density
-        return replace(self, velocity_change_density=velocity, turn_change_density=turn)
-
-
-MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
-
-
-@dataclass(frozen=True, eq=False)
-class TwistSamples:
-    """Measured body twists: stamps (S,), linear velocity (S, 3) m/s, angular velocity (S, 3) rad/s, IMU frame.
-
-    ``pairing`` says which sample describes the motion between two stamps: the one at its start, the one at
-    its end, or the mean of both.
-    """
-
-    t_ns: IntArray
-    v_mps: Array
-    w_radps: Array
-    pairing: Pairing = "start"
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3))
-
-    @property
-    def values(self) -> Array:
-        """Return the samples side by side (S, 6): linear velocity, angular velocity."""
-        return np.hstack([self.v_mps, self.w_radps])
-
-    def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
-        return replace(self, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
-
-
-@dataclass(frozen=True, eq=False)
-class ImuSamples:
-    """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame.
-
-    ``pairing`` says what stands for the motion: the mean of two neighbours from one stamp to the next, or each sample
-    for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
-    """
-
-    t_ns: IntArray
-    accel_mps2: Array
-    gyro_radps: Array
-    pairing: ImuPairing = "mean"
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
-
-    @property
-    def values(self) -> Array:
-        """Return the samples side by side (S, 6): specific force, angular velocity."""
-        return np.hstack([self.accel_mps2, self.gyro_radps])
-
-    def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
-        return replace(self, t_ns=t_ns, accel_mps2=values[:, :3], gyro_radps=values[:, 3:])
-
-
-@dataclass(frozen=True, eq=False)
-class NoSamples:
-    """No motion was measured: only the stamps (S,) of the frames, which it spans."""
-
-    t_ns: IntArray
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, t_ns=(None,))
-
-    @property
-    def values(self) -> Array:
-        """Return rows (S, 0) without a value."""
-        return np.empty((self.t_ns.size, 0))
-
-    def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return other stamps (S,), of which there are no values (S, 0) either."""
-        return replace(self, t_ns=t_ns)
-
-
-MotionSamples = TwistSamples | ImuSamples | NoSamples
-MotionKind = Literal["twist", "imu", "none"]
-_KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
-    (TwistSamples, TwistNoise, "twist"),
-    (ImuSamples, ImuNoise, "imu"),
-    (NoSamples, TwistChangeNoise, "none"),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,36 +143,6 @@ class Prior:
 
 # In both, ``noise_scale`` (n, 2) multiplies the noise of linear and angular samples; None where all was measured.
 @dataclass(frozen=True, eq=False)
-class TwistMotion:
-    """The twists of one interval: durations (n,) s, linear (n, 3) m/s and angular velocity (n, 3) rad/s."""
-
-    dt_s: Array
-    v_mps: Array
-    w_radps: Array
-    noise_scale: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ImuMotion:
-    """The IMU of one interval: durations (n,) s, mid-interval accel (n, 3) m/s^2 and gyro (n, 3) rad/s."""
-
-    dt_s: Array
-    accel_mps2: Array
-    gyro_radps: Array
-    noise_scale: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class UnmeasuredMotion:
-    """An interval in which no motion was measured: its duration (1,) s."""
-
-    dt_s: Array
-
-
-Motion = TwistMotion | ImuMotion | UnmeasuredMotion
-
-
-@dataclass(frozen=True, eq=False)
 class StereoFrame:
     """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px."""
 
@@ -357,13 +195,13 @@ class Sequence:
 
     def __post_init__(self) -> None:
         freeze_arrays(self, frames_t_ns=(None,), gravity_world=(3,))
-        if not any(isinstance(self.motion, one) and isinstance(self.noise, other) for one, other, _ in _KINDS):
+        if not are_of_one_kind(self.motion, self.noise):
             raise DataError(f"{self.name}: the motion noise is not of the kind of the motion samples")
 
     @property
     def motion_kind(self) -> MotionKind:
         """Return the kind of motion samples the sequence has."""
-        return next(kind for samples, _, kind in _KINDS if isinstance(self.motion, samples))
+        return kind_of(self.motion)
 
     @property
     def frame_count(self) -> int:
@@ -393,7 +231,7 @@ class Sequence:
         """
         check_runnable(self)
         first_row = np.searchsorted(self.visible.frame, np.arange(self.frame_count + 1))
-        motions = _cut(self.motion, self.frames_t_ns, self.bridges)
+        motions = motions_between(self.motion, self.frames_t_ns, self.bridges)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
             frame = StereoFrame(int(self.frames_t_ns[k]), self.visible.track_id[rows], self.visible.uv_px[rows])
@@ -461,17 +299,3 @@ def check_stated(sequence: Sequence) -> None:
             raise DataError(f"{sequence.name}: {key} is not finite; a calibration needs every value")
     if not (np.isfinite(rig.cov_uv_px2).all() and (np.linalg.eigvalsh(rig.cov_uv_px2) > 0.0).all()):
         raise DataError(f"{sequence.name}: rig.cov_uv_px2 is no covariance: its noise must be positive in every axis")
-
-
-def _cut(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None) -> Iterator[Motion]:
-    """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
-    if isinstance(samples, NoSamples):
-        for dt_s in np.diff(frames_t_ns) / NS_PER_S:
-            yield UnmeasuredMotion(read_only([dt_s]))
-        return
-    twist = isinstance(samples, TwistSamples)
-    pieces = cut_at(frames_t_ns, samples.t_ns, samples.values, samples.pairing)
-    for begin_ns, (dt_s, rows) in zip(frames_t_ns[:-1].tolist(), pieces, strict=True):
-        scale = None if bridges is None else bridges.scale_over(begin_ns, dt_s)
-        part = (read_only(dt_s), read_only(rows[:, :3]), read_only(rows[:, 3:]), scale)
-        yield TwistMotion(*part) if twist else ImuMotion(*part)

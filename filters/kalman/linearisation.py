@@ -10,9 +10,9 @@ from typing import Protocol
 
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array
+from toolkit.measured_motion import Motion
 from toolkit.models.motion import Increment, MotionModel
 from toolkit.models.state import Prediction
-from toolkit.sequence import Motion
 
 
 class Linearisation(Protocol):

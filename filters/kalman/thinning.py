@@ -11,8 +11,9 @@ import numpy as np
 from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.measured_motion import ImuMotion, Motion, TwistMotion, UnmeasuredMotion
 from toolkit.models.motion import motion_model, predicted
-from toolkit.sequence import ImuMotion, Motion, Packet, TwistMotion, UnmeasuredMotion
+from toolkit.sequence import Packet
 
 
 class Thinned:

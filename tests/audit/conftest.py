@@ -9,8 +9,9 @@ import pytest
 
 from toolkit.audit import Audit, audit
 from toolkit.geometry import Array, IntArray, se3
+from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence, TwistSamples
+from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
 # Most faults show in half of it.

@@ -11,7 +11,7 @@ import pytest
 from toolkit.audit import Audit, audit
 from toolkit.audit.parts.vision import camera_motion
 from toolkit.datasets import load_sequence
-from toolkit.sequence import TwistSamples
+from toolkit.measured_motion import TwistSamples
 
 DATA = Path(os.environ.get("VISLAM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 

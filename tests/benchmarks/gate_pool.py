@@ -30,10 +30,11 @@ from toolkit.estimator import find
 from toolkit.gate.reference import reference_s
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
+from toolkit.measured_motion import ImuSamples, MotionNoise, TwistNoise, TwistSamples
 from toolkit.metrics import Evaluation, ate, held_out, nees, nis
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.progress import SILENT
-from toolkit.sequence import ImuSamples, MotionNoise, Observations, Prior, Sequence, TwistNoise, TwistSamples
+from toolkit.sequence import Observations, Prior, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
 DITHER = 0.05

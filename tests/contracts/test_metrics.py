@@ -9,7 +9,8 @@ from toolkit import metrics
 from toolkit.estimate import Landmarks, Run, Timings, Trajectory
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS
 from toolkit.geometry import se3
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
+from toolkit.measured_motion import TwistNoise, TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
 CONTRACT = [
     "ate_none_m",

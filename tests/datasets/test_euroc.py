@@ -14,8 +14,9 @@ from toolkit.datasets import euroc, formats, load_sequence
 from toolkit.datasets.io.euroc_calibration import ACCEL_FACTOR, GYRO_FACTOR
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, so3_log, transform
+from toolkit.measured_motion import ImuMotion, ImuNoise, ImuSamples
 from toolkit.models.stereo import project, triangulate
-from toolkit.sequence import ImuMotion, ImuNoise, ImuSamples, Sequence
+from toolkit.sequence import Sequence
 
 Refused = Callable[..., None]
 # As large as today's stamps, and no multiple of what a double can tell apart.

@@ -11,7 +11,7 @@ import pytest
 from toolkit.datasets import kitti_odometry, load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.sequence import NoSamples, TwistChangeNoise
+from toolkit.measured_motion import NoSamples, TwistChangeNoise
 from toolkit.settings import Frontend
 
 pytestmark = pytest.mark.usefixtures("shared_cache")

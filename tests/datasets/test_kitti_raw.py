@@ -12,7 +12,7 @@ from toolkit.datasets import kitti_raw, load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3
-from toolkit.sequence import ImuSamples, TwistSamples
+from toolkit.measured_motion import ImuSamples, TwistSamples
 
 pytestmark = pytest.mark.usefixtures("shared_cache")
 

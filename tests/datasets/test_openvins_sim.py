@@ -10,9 +10,9 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.geometry import se3_inverse, transform
+from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuNoise, ImuSamples
 
 Refused = Callable[..., None]
 

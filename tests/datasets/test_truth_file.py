@@ -23,8 +23,9 @@ from toolkit.geometry import (
     se3_inverse,
     so3_exp,
 )
+from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
 Refused = Callable[..., None]
 COUNT, STEP_S, START_S = 200, 0.1, 1.4e9

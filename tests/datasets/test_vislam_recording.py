@@ -12,7 +12,8 @@ import pytest
 
 from toolkit.datasets import vislam_recording
 from toolkit.errors import DataError, OutputError
-from toolkit.sequence import Sequence, TwistSamples
+from toolkit.measured_motion import TwistSamples
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
 
 DATA = Path(__file__).parents[2] / "data"

@@ -8,7 +8,7 @@ import pytest
 from toolkit.datasets import load_sequence
 from toolkit.experiment import Plan
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.sequence import ImuNoise, MotionNoise, TwistNoise
+from toolkit.measured_motion import ImuNoise, MotionNoise, TwistNoise
 from toolkit.settings import DEFAULTS, Noise, settings_of
 
 

@@ -21,11 +21,12 @@ from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log
+from toolkit.measured_motion import TwistMotion
 from toolkit.models import twist
 from toolkit.models.factors import B, L, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
-from toolkit.sequence import Sequence, TwistMotion
+from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)

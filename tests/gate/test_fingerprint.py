@@ -10,7 +10,8 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.gate.measuring import fingerprint
-from toolkit.sequence import ImuSamples, Observations
+from toolkit.measured_motion import ImuSamples
+from toolkit.sequence import Observations
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 SHORT = replace(FLIGHT, duration_s=1.0)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
+from toolkit.measured_motion import TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.smooth_twist import SmoothTwist, smooth_factor, twist_change_cov
 from toolkit.models.state import Belief
-from toolkit.sequence import TwistChangeNoise, UnmeasuredMotion
 
 NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
 DT_S = 0.1

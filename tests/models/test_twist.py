@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log
+from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models import twist
 from toolkit.models.factors import B, X
-from toolkit.sequence import TwistMotion, TwistNoise
 from toolkit.simulation import DRIVE, simulate
 
 NOISE = TwistNoise(np.array([0.05, 0.03, 0.02]), np.array([0.004, 0.002, 0.006]), np.full(3, 1e-4))

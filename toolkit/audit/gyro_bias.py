@@ -11,7 +11,8 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.robust import median_error
 from toolkit.geometry import Array
-from toolkit.sequence import Sequence, TwistSamples
+from toolkit.measured_motion import TwistSamples
+from toolkit.sequence import Sequence
 
 # Measured speed below which the vehicle stands, and the fewest samples of a standstill that is used.
 STANDING_MPS = 0.05

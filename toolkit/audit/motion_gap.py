@@ -13,8 +13,9 @@ from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import is_comparable
 from toolkit.audit.time_gap import GAP_RATIO
 from toolkit.geometry import Array, IntArray
+from toolkit.measured_motion import ImuNoise, MotionNoise, MotionSamples, NoSamples, TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S, Bridges
-from toolkit.sequence import ImuNoise, MotionNoise, MotionSamples, NoSamples, Sequence, TwistNoise, TwistSamples
+from toolkit.sequence import Sequence
 
 # Bridges laid over measured stretches: with fewer than this the recording is too short to tell, and the whole spread of
 # the samples counts as their error.

@@ -19,8 +19,9 @@ from toolkit.audit.parts.robust import Scalar, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
 from toolkit.geometry import Array, BoolArray
+from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, TwistSamples
+from toolkit.sequence import Sequence
 
 # How far it is searched for, and the step of the search in intervals.
 MOST_S, COARSE_STEP = 0.6, 0.25

@@ -15,8 +15,9 @@ from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals
 from toolkit.audit.parts.robust import Scalar, slope
 from toolkit.geometry import BoolArray, IntArray
+from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import Pairing
-from toolkit.sequence import Sequence, TwistSamples
+from toolkit.sequence import Sequence
 
 LAG: dict[Pairing, float] = {"start": 0.0, "mean": 0.5, "end": 1.0}
 # The lag must be known to this and differ from the present pairing's by so many standard errors.

@@ -11,8 +11,9 @@ import numpy as np
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, check_rows, observations, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, SparseArray, glance, opened
 from toolkit.geometry import Array, se3_inverse
+from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
-from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig, TwistSamples
+from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig
 
 _NOT_SEEN = -1.0
 _REQUIRED = (

@@ -33,9 +33,10 @@ from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, rectified, track_images
 from toolkit.geometry import Array, IntArray, interpolate_poses
 from toolkit.inputs import is_regular
+from toolkit.measured_motion import ImuSamples
 from toolkit.progress import Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuSamples, Provenance, Sequence, Truth
+from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation.world import Camera
 

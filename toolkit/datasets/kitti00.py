@@ -12,8 +12,9 @@ import numpy as np
 from toolkit.datasets.io.fields import stamps_ns
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_inverse
+from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
 
 # The first IMU sample is followed by a gap of 1.92 s, which covers frames 0 to 13.
 FIRST_FRAME = 14

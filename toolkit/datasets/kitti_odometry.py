@@ -19,9 +19,10 @@ from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.inputs import is_regular, read_text_input
+from toolkit.measured_motion import NoSamples
 from toolkit.models.noise import unmeasured_motion
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import NoSamples, Provenance, Sequence, Truth
+from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend
 
 NO_MOTION = "no motion input: all estimators assume a motion that is smooth, and say so"

@@ -18,20 +18,11 @@ from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
 from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, size_of, track_images
+from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, NoSamples, TwistSamples
 from toolkit.models.noise import twist_noise, unmeasured_motion
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import (
-    ImuNoise,
-    ImuSamples,
-    MotionNoise,
-    MotionSamples,
-    NoSamples,
-    Provenance,
-    Sequence,
-    Truth,
-    TwistSamples,
-)
+from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend
 
 _SIDES = (("00", "01"), ("02", "03"))

@@ -23,7 +23,8 @@ from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import IntArray, se3, se3_inverse
 from toolkit.inputs import read_input, read_text_input
-from toolkit.sequence import ImuNoise, ImuSamples, Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
 _IMU_COLUMNS = ("timestamp", "ax", "ay", "az", "gx", "gy", "gz")

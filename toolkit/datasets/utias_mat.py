@@ -18,9 +18,10 @@ from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, ob
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3, so3_exp
 from toolkit.inputs import is_regular, open_input, read_input
+from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth, TwistNoise, TwistSamples
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
 _NOT_SEEN = -1.0
 _REQUIRED = (

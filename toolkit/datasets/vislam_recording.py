@@ -17,23 +17,18 @@ from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
 from toolkit.inputs import open_input, read_text_input
-from toolkit.resampling import ImuPairing, Pairing
-from toolkit.sequence import (
+from toolkit.measured_motion import (
     ImuNoise,
     ImuSamples,
     MotionNoise,
     MotionSamples,
     NoSamples,
-    Observations,
-    Prior,
-    Provenance,
-    Sequence,
-    StereoRig,
-    Truth,
     TwistChangeNoise,
     TwistNoise,
     TwistSamples,
 )
+from toolkit.resampling import ImuPairing, Pairing
+from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth
 
 SCHEMA = "vislam.recording/1"
 _TEXT, _ARRAYS = "recording.json", "recording.npz"

@@ -13,12 +13,13 @@ import gtsam
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array
+from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import EliminatedGraph, joint_cov
 from toolkit.models.imu import ImuModel
 from toolkit.models.smooth_twist import SmoothTwist
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.models.twist import TwistModel
-from toolkit.sequence import Motion, MotionNoise, Prior, TwistChangeNoise, TwistNoise
+from toolkit.sequence import Prior
 
 
 class Increment(Protocol):

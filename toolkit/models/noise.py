@@ -3,8 +3,8 @@
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
+from toolkit.measured_motion import TwistChangeNoise, TwistNoise
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import TwistChangeNoise, TwistNoise
 
 # Standard deviation of one tracked image coordinate (px) where a file states none: sparse KLT on rectified video.
 TRACKED_PIXEL_SIGMA_PX = 0.5

@@ -13,9 +13,10 @@ import numpy as np
 
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_right_jacobian
+from toolkit.measured_motion import Motion, TwistMotion, TwistNoise
 from toolkit.models.factors import B, X, joint_prior, kind_of
 from toolkit.models.state import POSE, Belief, Layout, Prediction
-from toolkit.sequence import Motion, Prior, TwistMotion, TwistNoise
+from toolkit.sequence import Prior
 
 TWIST_LAYOUT = Layout(9, None, None, slice(6, 9))
 

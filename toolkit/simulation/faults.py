@@ -14,14 +14,9 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
+from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import (
-    Observations,
-    Sequence,
-    Truth,
-    TwistNoise,
-    TwistSamples,
-)
+from toolkit.sequence import Observations, Sequence, Truth
 
 Fault = Callable[[Sequence, float, int], Sequence]
 

@@ -12,18 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3, so3_exp
+from toolkit.measured_motion import ImuNoise, TwistNoise
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import (
-    GRAVITY_WORLD,
-    ImuNoise,
-    Observations,
-    Prior,
-    Provenance,
-    Sequence,
-    StereoRig,
-    Truth,
-    TwistNoise,
-)
+from toolkit.sequence import GRAVITY_WORLD, Observations, Prior, Provenance, Sequence, StereoRig, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, hall, road

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log, transform
+from toolkit.measured_motion import ImuNoise, ImuSamples, MotionSamples, TwistNoise, TwistSamples
 from toolkit.models.stereo import project
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuNoise, ImuSamples, MotionSamples, Observations, StereoRig, TwistNoise, TwistSamples
+from toolkit.sequence import Observations, StereoRig
 from toolkit.simulation.trajectory import SmoothTrajectory
 from toolkit.simulation.world import Camera, Tracks
 

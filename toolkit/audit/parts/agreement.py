@@ -6,9 +6,10 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import median_one_step_px, own_one_step_px
 from toolkit.audit.parts.vision import CameraMotion, usable_pairs
+from toolkit.measured_motion import TwistChangeNoise, TwistNoise
 from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, TwistChangeNoise, TwistNoise
+from toolkit.sequence import Sequence
 
 # Median one-step residual (px) beyond which samples and tracks disagree. Sound recordings have 0.3 to 3.1 px, the
 # largest where the samples' own noise explains it.

@@ -7,9 +7,10 @@ import numpy as np
 from toolkit.audit.parts.vision import CameraMotion, usable_pairs
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
+from toolkit.measured_motion import NoSamples, TwistSamples
 from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import NoSamples, Sequence, TwistSamples, check_runnable
+from toolkit.sequence import Sequence, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30

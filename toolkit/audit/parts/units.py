@@ -8,9 +8,10 @@ import numpy as np
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar, median_error
 from toolkit.geometry import Array
+from toolkit.measured_motion import ImuSamples, TwistNoise, TwistSamples
 from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuSamples, Sequence, TwistNoise, TwistSamples
+from toolkit.sequence import Sequence
 
 # Noise that is this share of the samples' own scatter, or more, was estimated from them and is in their unit.
 FROM_SCATTER = 0.5

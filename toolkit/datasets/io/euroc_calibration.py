@@ -22,7 +22,8 @@ from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.errors import DataError
 from toolkit.frontend import Camera, Pinhole
 from toolkit.geometry import Array, se3_inverse
-from toolkit.sequence import ImuNoise, StereoRig
+from toolkit.measured_motion import ImuNoise
+from toolkit.sequence import StereoRig
 from toolkit.simulation.scenarios import stereo_cov_px2
 
 PIXEL_SIGMA_PX = 0.5

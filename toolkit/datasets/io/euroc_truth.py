@@ -17,8 +17,9 @@ from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import ImuSamples, Truth
+from toolkit.sequence import Truth
 
 # Long enough that the noise of single truth poses hardly counts, short enough that the gyro's mean is the rotation.
 _STEP_NS = NS_PER_S // 10
