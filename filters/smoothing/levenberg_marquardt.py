@@ -18,6 +18,8 @@ from toolkit.errors import EstimatorError
 from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
+# Half a sum of squares of standard deviations: exact measurements have next to none, of which no share is little.
+_LEAST_DECREASE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ def solve(
     for iteration in range(1, stopping.max_iterations + 1):
         progress.advance(iteration - 1, stopping.max_iterations, stage)
         before, here = here.error, solver.advanced(here)
-        if before - here.error <= stopping.relative_decrease * here.error:
+        if before - here.error <= max(stopping.relative_decrease * here.error, _LEAST_DECREASE):
             return Solution(here.values(), here.error, iteration, converged=True)
     return Solution(here.values(), here.error, stopping.max_iterations, converged=False)
 
@@ -104,16 +106,16 @@ class _Solver:
         if not self._python:
             here.optimizer.iterate()
             return _Reached(here.optimizer, here.optimizer.error())
-        values, damping = here.values(), here.optimizer.lambda_()
-        while damping < _MOST_DAMPING:
+        values, tried = here.values(), here.optimizer.lambda_()
+        while tried < _MOST_DAMPING:
             here.optimizer.iterate()
-            moved, damping = here.values(), here.optimizer.lambda_()
+            moved = here.values()
             error = self._error(moved)
             if error <= here.error:
-                return self.at(moved, error, damping)
-            # The linearisations promised more than their factors keep.
-            damping = _DAMPING_FACTOR * max(damping, _FIRST_DAMPING)
-            here = self.at(values, here.error, damping)
+                return self.at(moved, error, here.optimizer.lambda_())
+            # The linearisations promised more than their factors keep: from here again, in shorter steps.
+            tried = _DAMPING_FACTOR * max(tried, _FIRST_DAMPING)
+            here = self.at(values, here.error, tried)
         return here
 
     def _error(self, values: gtsam.Values) -> float:
