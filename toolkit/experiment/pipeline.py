@@ -1,9 +1,9 @@
 """The one experiment: load, audit, start, run, score. The command line, the gate, notebooks and users all call this."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 
 from toolkit.datasets import is_drawn_from_a_seed, load_references
@@ -13,6 +13,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
@@ -29,7 +30,8 @@ class Plan:
     ``sources`` are paths, built-in names or sequences; ``estimators`` are names, or the word for the whole ladder;
     ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is a TUM file and ``trajectories``
     are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
-    leaves as they are. ``workers`` is the number of processes, one a processor where it is None.
+    leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
+    writes those of every seed; of a single one they always are.
     """
 
     sources: tuple[str | Recorded, ...]
@@ -41,6 +43,7 @@ class Plan:
     keep: frozenset[str] = frozenset()
     max_frames: int | None = None
     workers: int | None = None
+    keep_trajectories: bool = False
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -134,29 +137,74 @@ def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping
     return Case(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
 
 
+def stores_of(plan: Plan, cases: Sequence[Case], directories: Sequence[Path]) -> list[OutcomeStore]:
+    """Return where the outcomes of each case are kept, of a comparison over seeds; of one seed the runs are needed.
+
+    Raises DataError where what is kept in a directory is damaged, OutputError where another process writes there.
+    """
+    if len(plan.seeds) == 1:
+        return []
+    conditions = [Conditions(_hash_under_seed_0(plan, case), plan.keep) for case in cases]
+    return [OutcomeStore(directory, one) for directory, one in zip(directories, conditions, strict=True)]
+
+
+def _hash_under_seed_0(plan: Plan, case: Case) -> str:
+    prepared = case.prepared if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
+    return prepared.sequence.content_hash()
+
+
 def comparisons(
-    plan: Plan, cases: Sequence[Case], workers: Workers, progress_for: ProgressFor = silent
+    plan: Plan,
+    cases: Sequence[Case],
+    workers: Workers,
+    progress_for: ProgressFor = silent,
+    stores: Sequence[Store] = (),
 ) -> Iterator[Comparison]:
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
-    An estimator that fails is a row that says so. Raises DataError where a recording cannot be had under a seed.
+    What the ``stores``, one a case, have already is not run again. An estimator that fails is a row that says so.
+    Raises DataError where a recording cannot be had under a seed.
     """
     entries = find_all(plan.estimators)
-    by_case = [list(_units(plan, case, entries)) for case in cases]
-    units = list(chain.from_iterable(by_case))
-    owner = [i for i, of_case in enumerate(by_case) for _ in of_case]
-    outcomes: list[list[Outcome]] = [[] for _ in cases]
-    missing, shown = [len(of_case) for of_case in by_case], 0
-    label = f"{', '.join(dict.fromkeys(case.name for case in cases))}: {len(units)} runs"
-    with progress_for(label) as progress, closing(workers.results(units, run_unit, progress)) as coming:
+    kept_in = stores or [NOWHERE] * len(cases)
+    outcomes, units, owner = _found_and_missing(plan, cases, entries, kept_in)
+    missing, shown = Counter(owner), 0
+    with (
+        progress_for(_label(cases, len(units), sum(map(len, outcomes)))) as progress,
+        closing(workers.results(units, run_unit, progress)) as coming,
+    ):
         for place, result in coming:
-            outcomes[owner[place]].append(_outcome(result, units[place]))
-            missing[owner[place]] -= 1
+            case = owner[place]
+            outcomes[case].append(_outcome(result, units[place], kept_in[case]))
+            missing[case] -= 1
             while shown < len(cases) and not missing[shown]:
                 yield _comparison(plan, cases[shown], outcomes[shown], entries, workers.count)
                 shown += 1
-    for case, found in zip(cases[shown:], outcomes[shown:], strict=True):
-        yield _comparison(plan, case, found, entries, workers.count)
+    for one, found in zip(cases[shown:], outcomes[shown:], strict=True):
+        yield _comparison(plan, one, found, entries, workers.count)
+
+
+def _found_and_missing(
+    plan: Plan, cases: Sequence[Case], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
+) -> tuple[list[list[Outcome]], list[Unit], list[int]]:
+    """Return the outcomes that are there, by case, the units that have to be run, and the case of each of these."""
+    outcomes: list[list[Outcome]] = [[] for _ in cases]
+    units: list[Unit] = []
+    owner: list[int] = []
+    for i, (case, store) in enumerate(zip(cases, stores, strict=True)):
+        for unit in _units(plan, case, entries):
+            found = store.find(unit)
+            if found is not None:
+                outcomes[i].append(found)
+            else:
+                units.append(unit)
+                owner.append(i)
+    return outcomes, units, owner
+
+
+def _label(cases: Sequence[Case], missing: int, there: int) -> str:
+    names = ", ".join(dict.fromkeys(case.name for case in cases))
+    return f"{names}: {missing} runs" + (f" ({there} are there)" if there else "")
 
 
 def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
@@ -165,12 +213,14 @@ def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Ite
     for seed in plan.seeds:
         recording = case.prepared if len(plan.seeds) == 1 else plan.recording(case.source, seed)
         for name in names:
-            yield Unit(recording, seed, name, plan.settings, plan.own.get(name), keep_run=len(plan.seeds) == 1)
+            build, single = plan.own.get(name), len(plan.seeds) == 1
+            keep_trajectories = plan.keep_trajectories and not single
+            yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories)
 
 
-def _outcome(result: Outcome | Lost, unit: Unit) -> Outcome:
+def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:
     if isinstance(result, Outcome):
-        return result
+        return store.keep(unit, result)
     return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
 
 
