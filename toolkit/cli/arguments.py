@@ -29,7 +29,8 @@ exit status:
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
   70   a defect of vislam itself; VISLAM_TRACEBACK=1 shows where
-  71   the system's means do not suffice: memory, processes, an encoding
+  71   the system's means do not suffice: memory, processes, a cluster, an
+       encoding
   130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,
        and what has ended of a comparison over seeds is kept
   141  the reader of the output went away"""

@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -99,6 +100,11 @@ def add_to(subcommands: Subcommands) -> None:
     )
     add_settings_arguments(parser)
     add_workers_argument(parser)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+    )
     parser.set_defaults(command=command)
 
 
@@ -112,7 +118,7 @@ def command(options: argparse.Namespace) -> int:
 
     columns = _columns(options.columns)
     asked = _configuration(options)
-    plan, progress_for = _plan(asked, options.workers), of_this_process()
+    plan, progress_for = _placed(_plan(asked), options), of_this_process()
     made_by, all_ok = MadeBy(shlex.join(options.command_line), asked), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
@@ -207,7 +213,16 @@ def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
     return tuple(sorted(kept_faults(options, faults())))
 
 
-def _plan(asked: Configuration, workers: int | None) -> Plan:
+def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
+    """Return the plan with where it is run."""
+    from toolkit.cli.arguments import UsageError
+
+    if options.scheduler is not None and options.workers is not None:
+        raise UsageError("--scheduler and --workers exclude each other: a cluster has its own workers")
+    return replace(plan, workers=options.workers, scheduler=options.scheduler)
+
+
+def _plan(asked: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
     from toolkit.cli.arguments import UsageError
     from toolkit.estimator import defaults
@@ -231,7 +246,6 @@ def _plan(asked: Configuration, workers: int | None) -> Plan:
         trajectories={name: Path(file) for name, file in request.trajectories.items()},
         keep=frozenset(request.keep),
         max_frames=request.max_frames,
-        workers=workers,
         keep_trajectories=request.keep_trajectories,
     )
 

@@ -1,7 +1,8 @@
-"""The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or in processes.
+"""The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or on a cluster.
 
-Reading order: recording (what is read) -> units (what is run) -> workers (where) -> outcome_store (what is kept of it)
--> pipeline -> comparison (what comes of it) -> statistics -> consistency (whose stated uncertainty cannot be right).
+Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
+kept of it) -> pipeline -> comparison (what comes of it) -> statistics -> consistency (whose stated uncertainty cannot
+be right).
 """
 
 from toolkit.experiment.comparison import Comparison, Record, Row

@@ -6,18 +6,19 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from toolkit.datasets import is_drawn_from_a_seed, load_references
+from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
+from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
-from toolkit.experiment.workers import Lost, Workers, usable_cpus
+from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings
@@ -31,7 +32,8 @@ class Plan:
     ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is a TUM file and ``trajectories``
     are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
     leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
-    writes those of every seed; of a single one they always are.
+    writes those of every seed; of a single one they always are. ``scheduler`` is the address of a Dask cluster that
+    does the work instead.
     """
 
     sources: tuple[str | Recorded, ...]
@@ -44,6 +46,7 @@ class Plan:
     max_frames: int | None = None
     workers: int | None = None
     keep_trajectories: bool = False
+    scheduler: str | None = None
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -85,14 +88,19 @@ def run(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Comparison, ...
         return tuple(comparisons(plan, prepared_cases(plan, workers, progress_for), workers, progress_for))
 
 
-def workers_of(plan: Plan) -> Workers:
-    """Return the processes that a plan asks for, which begin to import what they will need."""
+def workers_of(plan: Plan) -> Pool:
+    """Return the processes that a plan asks for, which begin to import what they will need, or its cluster.
+
+    Raises ClusterError where that cannot be used.
+    """
+    if plan.scheduler is not None:
+        return Cluster(plan.scheduler)
     workers = Workers(plan.workers or usable_cpus())
     workers.warm_up(__name__)
     return workers
 
 
-def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
+def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
@@ -106,11 +114,11 @@ def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = sil
     recordings = [plan.recording(source, plan.seeds[0]) for source in plan.sources]
     names = ", ".join(_name(source) for source in plan.sources)
     with progress_for(f"{names}: loading and checking") as progress:
-        prepared = _prepared(recordings, workers, progress)
+        prepared = _prepared(recordings, workers if plan.scheduler is None else Workers(1), progress)
         return tuple(_case(plan, source, one, files) for source, one in zip(plan.sources, prepared, strict=True))
 
 
-def _prepared(recordings: Sequence[Recording], workers: Workers, progress: Progress) -> list[Prepared]:
+def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress) -> list[Prepared]:
     """Prepare recordings: several side by side, a single one here, where it is there at once."""
     if len(recordings) == 1:
         return [prepare(recordings[0], progress)]
@@ -156,7 +164,7 @@ def _hash_under_seed_0(plan: Plan, case: Case) -> str:
 def comparisons(
     plan: Plan,
     cases: Sequence[Case],
-    workers: Workers,
+    workers: Pool,
     progress_for: ProgressFor = silent,
     stores: Sequence[Store] = (),
 ) -> Iterator[Comparison]:
@@ -210,12 +218,21 @@ def _label(cases: Sequence[Case], missing: int, there: int) -> str:
 def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
     """Yield the work of a case: seed by seed, the estimators that take longest first."""
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
+    # A worker of a cluster stands in another folder.
+    source = case.source if plan.scheduler is None else _located(case.source)
     for seed in plan.seeds:
-        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(case.source, seed)
+        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(source, seed)
         for name in names:
             build, single = plan.own.get(name), len(plan.seeds) == 1
             keep_trajectories = plan.keep_trajectories and not single
             yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories)
+
+
+def _located(source: str | Recorded) -> str | Recorded:
+    """Return a path where it leads from here, anything else as it is."""
+    if isinstance(source, Recorded) or source in built_ins():
+        return source
+    return str(Path(source).expanduser().absolute())
 
 
 def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:

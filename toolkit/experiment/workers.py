@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from loky import ProcessPoolExecutor
@@ -57,6 +57,23 @@ def results_of(
     """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress)
+
+
+class Pool(Protocol):
+    """Does units of work somewhere, ``count`` at a time; a context that ends what it started."""
+
+    count: int
+
+    def __enter__(self) -> Self:
+        """Begin."""
+
+    def __exit__(self, *_: object) -> None:
+        """End what was started."""
+
+    def results(
+        self, units: Sequence[T], work: Work[T, R], progress: Progress
+    ) -> Generator[tuple[int, R | Lost], None, None]:
+        """Yield the place and the result of every unit as each is there; an error of the work is raised."""
 
 
 class Workers:
