@@ -70,6 +70,8 @@ def test_an_interrupt_says_where_to_go_on(vislam: Vislam, one_line: OneLine, mon
     assert vislam(*SWEEP, "--workers", "1", "--out", "run") == 130
     assert "interrupted; what has ended is kept in run, and the same command with this --out" in one_line()
     assert len(lines("run")) == 2
+    assert vislam("report", "run") == 3
+    assert "run is of a comparison that has not ended; repeat its command" in one_line()
 
 
 def test_outcomes_stay_whatever_replaces_the_run_and_files_of_others_are_refused(

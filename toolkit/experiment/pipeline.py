@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -82,10 +82,17 @@ class Case:
         return self.prepared.sequence.name
 
 
-def run(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Comparison, ...]:
-    """Run and score every estimator on every source; raises as :func:`prepared_cases` and :func:`comparisons` do."""
-    with workers_of(plan) as workers:
-        return tuple(comparisons(plan, prepared_cases(plan, workers, progress_for), workers, progress_for))
+def run(plan: Plan, progress_for: ProgressFor = silent, directories: Sequence[Path] = ()) -> tuple[Comparison, ...]:
+    """Run and score every estimator on every source; over seeds outcomes are kept in ``directories``, one a source.
+
+    Raises as :func:`prepared_cases`, :func:`stores_of` and :func:`comparisons` do.
+    """
+    with workers_of(plan) as workers, ExitStack() as open_files:
+        cases = prepared_cases(plan, workers, progress_for)
+        stores = stores_of(plan, cases, directories) if directories else []
+        for store in stores:
+            open_files.callback(store.close)
+        return tuple(comparisons(plan, cases, workers, progress_for, stores))
 
 
 def workers_of(plan: Plan) -> Pool:
