@@ -233,6 +233,24 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
     _assert_gone(vislam.pid)
 
 
+def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: StartsGroup) -> None:
+    program = textwrap.dedent("""
+        import time
+        from toolkit.experiment.workers import Workers
+        workers = Workers(2)
+        for answer in [workers.submit(abs, number) for number in (1, 2)]:
+            answer.result()
+        print("started", flush=True)
+        time.sleep(60)
+    """)
+    parent = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == "started\n"
+    parent.kill()
+    parent.wait()
+    _assert_gone(parent.pid)
+
+
 def _assert_gone(group: int) -> None:
     for _ in range(100):
         try:
