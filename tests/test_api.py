@@ -17,7 +17,7 @@ from toolkit.api import Result
 from toolkit.audit import faults
 from toolkit.datasets import load_sequence
 from toolkit.errors import VislamError
-from toolkit.estimator import LADDER, defaults, find
+from toolkit.estimator import LADDER, Estimator, Setup, defaults, find
 from toolkit.metrics import describe
 from toolkit.report.table import comparison_table
 
@@ -178,6 +178,26 @@ def test_seeds_are_repeated_from_the_first(over: Result) -> None:
     assert over.comparison.seeds == (4, 5)
     assert len(set(over.comparison.hashes)) == 2
     assert over.runs == {}
+
+
+def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> None:
+    built: list[int] = []
+
+    def mine(setup: Setup) -> Estimator:
+        built.append(1)
+        return find("dead-reckoning").load()(setup)
+
+    def compared(seeds: int) -> Result:
+        asked = {"own": {"mine": mine}, "max_frames": FRAMES, "seeds": seeds, "workers": 1, "resume": tmp_path / "run"}
+        return toolkit.compare("drive", "dead-reckoning", **asked)
+
+    compared(2)
+    kept = (tmp_path / "run" / "outcomes.jsonl").read_text().splitlines()
+    assert len(kept) == 2
+    first = compared(3)
+    assert (tmp_path / "run" / "outcomes.jsonl").read_text().splitlines()[:2] == kept
+    assert len(built) == 2 + 3
+    assert first.metrics["mine", "final"]["ate_se3_m"] == first.metrics["dead-reckoning", "final"]["ate_se3_m"]
 
 
 def test_settings_are_a_record_or_nested_values(result: Result) -> None:

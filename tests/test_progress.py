@@ -1,6 +1,7 @@
 """Progress: a bar with the time left on a terminal, a line now and then in a log, nothing where nobody watches."""
 
 import io
+import itertools
 
 import pytest
 
@@ -29,8 +30,23 @@ def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch: pytest.
     monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
     lines = work(io.StringIO()).splitlines()
     assert len(lines) == 6
-    assert lines[1].startswith("drive: batch 2/3 [") and "left" in lines[1]
-    assert lines[-1].startswith("drive: batch, iteration 3/60 [")
+    assert lines[1].startswith("drive: batch 67 % [") and "left" in lines[1]
+    assert lines[-1].startswith("drive: batch, iteration 5 % [")
+
+
+def test_lines_of_long_work_are_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock_s = itertools.count()
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock_s)))
+    stream = io.StringIO()
+    with progress.on_stream(stream)("sweep") as watched:
+        counts = []
+        for second in range(1, 4 * 3600):
+            watched.advance(second, 4 * 3600)
+            counts.append(stream.getvalue().count("\n"))
+    assert counts[99] == 10  # one every ten seconds in the first
+    assert counts[2 * 3600] < 100
+    last_hour = counts[-1] - counts[3 * 3600]
+    assert 11 <= last_hour <= 12  # one every five minutes in the end
 
 
 def test_a_terminal_sees_a_bar_that_is_gone_at_the_end() -> None:

@@ -47,6 +47,8 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     seeds: int | None = None,
     settings: Settings | Mapping[str, Any] = DEFAULTS,
     workers: int | None = None,
+    scheduler: str | None = None,
+    resume: str | Path | None = None,
 ) -> "Result":
     """Audit a recording, run estimators on it from the same start, and score them.
 
@@ -55,10 +57,12 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     TUM file, ``trajectories`` are files of other systems by name, ``keep`` names faults that the audit reports and
     leaves alone. ``seeds`` repeats a simulated source over so many, from ``seed`` on. ``settings`` is a record or
     nested values as in TOML, as in ``{"window": {"lag_s": 3.0}}``. ``workers`` is the number of processes, one a
-    processor by default.
+    processor by default; ``scheduler`` the address of a Dask cluster in their place. ``resume`` is a run directory in
+    which every run over seeds is kept as it ends, and found by the next comparison that asks for it.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, truth or
-    trajectory that cannot, SettingsError for a setting that does not exist.
+    trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
+    used, OutputError where what is to be kept cannot be written.
     """
     unnamed = () if own else defaults()
     plan = Plan(
@@ -71,8 +75,9 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         keep=frozenset(_names(keep)),
         max_frames=max_frames,
         workers=workers,
+        scheduler=scheduler,
     )
-    return Result(run_plan(plan, silent)[0])
+    return Result(run_plan(plan, silent, () if resume is None else (Path(resume),))[0])
 
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:

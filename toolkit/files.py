@@ -1,8 +1,10 @@
-"""Writing at once or not at all, and hashes of what is in memory.
+"""Writing at once or not at all, a file that grows by whole lines, and hashes of what is in memory.
 
 A directory or a file appears complete or not at all: it is written beside its place and then renamed into it.
 """
 
+import errno
+import fcntl
 import hashlib
 import os
 import shutil
@@ -166,6 +168,67 @@ def check_file(target: Path) -> None:
         raise OutputError(f"{target} is a directory; name a file in it")
     if target.exists() and not target.is_file():
         raise OutputError(f"{target} is a device or a pipe, and files are written whole; name a regular file")
+
+
+class LineFile:
+    """A text file that grows by whole lines; one process at a time adds to it.
+
+    A process that is killed while it writes leaves at most one line without its end, which is cut off when the file is
+    opened again. Raises OutputError where it cannot be written, or another process has it open.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o666)
+        except OSError as error:
+            raise _unwritable(path, error, "place") from error
+        try:
+            self._lock()
+            self._cut_off(whole_length(path.read_bytes()))
+        except BaseException:
+            self.close()
+            raise
+
+    def append(self, line: bytes) -> None:
+        """Write a line, which holds no end of line itself, and hand it to the system; a line in part is cut off."""
+        length = os.fstat(self._fd).st_size
+        rest = memoryview(line + b"\n")
+        try:
+            while rest:
+                rest = rest[os.write(self._fd, rest) :]
+        except OSError as error:
+            self._cut_off(length)
+            raise _unwritable(self._path, error, "place") from error
+
+    def close(self) -> None:
+        """Let other processes write."""
+        os.close(self._fd)
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                return  # a file system without locks
+            raise OutputError(
+                f"{self._path} is being written by another run; wait for its end, or choose another place with --out"
+            ) from error
+
+    def _cut_off(self, length: int) -> None:
+        if os.fstat(self._fd).st_size > length:
+            os.ftruncate(self._fd, length)
+
+
+def whole_length(content: bytes) -> int:
+    """Return how long the part of a text is whose lines have their ends."""
+    return content.rfind(b"\n") + 1
+
+
+def whole_lines(content: bytes) -> list[bytes]:
+    """Return the lines of a text that have their ends, without them."""
+    return content[: whole_length(content)].split(b"\n")[:-1]
 
 
 def _swap(new: Path, target: Path, owner: Owner) -> None:

@@ -11,10 +11,12 @@ from typing import Protocol, TextIO
 
 from toolkit.errors import printable
 
-# Seconds between two lines where the stream is a file or a pipe, and before the first.
+# Seconds between two lines where the stream is a file or a pipe, and before the first; of work that takes hours there
+# are fewer: a twentieth of the time so far lies between two, and at most five minutes.
 LOG_EVERY_S = 10.0
+_SELDOM_AFTER_S, _MOST_SELDOM = 200.0, 30.0
 _FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
-_LOG_FORMAT = "{desc} {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
+_LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
 
 
 class Progress(Protocol):
@@ -90,14 +92,15 @@ class _Log:
     def __init__(self, label: str, stream: TextIO) -> None:
         self._label, self._stream = label, stream
         self._stage, self._began_s = "", time.monotonic()
-        self._told_s = self._began_s
+        self._first_s = self._told_s = self._began_s
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Write a line where the last one is long past."""
         now_s = time.monotonic()
         if stage != self._stage:
             self._stage, self._began_s = stage, now_s
-        if now_s - self._told_s < LOG_EVERY_S:
+        times_longer = min(max((now_s - self._first_s) / _SELDOM_AFTER_S, 1.0), _MOST_SELDOM)
+        if now_s - self._told_s < LOG_EVERY_S * times_longer:
             return
         from tqdm import tqdm
 

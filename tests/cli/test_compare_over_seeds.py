@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,6 +53,7 @@ RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
         (("drive", "--seeds", "0"), 2, "at least 1"),
         (("drive", "--seeds", "2", "--truth", "gt.tum"), 2, "exclude each other"),
         (("drive", "--workers", "0"), 2, "at least 1"),
+        (("drive", "--workers", "2", "--scheduler", "tcp://host:8786"), 2, "exclude each other"),
     ],
 )
 def test_what_cannot_be_repeated_is_told_before_anything_runs(
@@ -62,6 +64,14 @@ def test_what_cannot_be_repeated_is_told_before_anything_runs(
     assert vislam("compare", *words, *QUICK) == status
     assert why in one_line()
     assert not Path("runs").exists()
+
+
+def test_a_cluster_needs_a_package_that_is_named(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert vislam("compare", "drive", *QUICK, "--scheduler", "tcp://host:8786") == 71
+    assert "a cluster needs the package distributed: pip install 'vislam-toolkit[cluster]'" in one_line()
 
 
 @pytest.mark.usefixtures("unrendered")

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ from toolkit.datasets import is_drawn_from_a_seed
 from toolkit.documents import parse, to_text
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.statistics import mean_nees, quantiles_of_all, spread_of
-from toolkit.metrics import describe
+from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, spread_of
+from toolkit.experiment.units import Outcome
+from toolkit.metrics import Scores, describe
 from toolkit.metrics._shared.consistency import nees_band
 from toolkit.report.figures import over_seeds as figures
-from toolkit.report.messages import note_lines
+from toolkit.report.messages import note_lines, paired_lines
 from toolkit.report.records import Seeds
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import seeds_document
@@ -102,6 +104,43 @@ def test_runs_that_ended_badly_are_told_beside_the_means(over: Comparison, docum
     assert broken["metrics"]["ate_none_m"]["quantiles_all"]["median"] is None
     words = "\n".join(note_lines(over))
     assert "honest final 4.50 m (100 % ok); astray causal 5.50 m (75 % ok); broken final none, 4 of 4 runs" in words
+
+
+def test_the_paired_difference_is_that_of_the_seeds_both_have():
+    found = paired([1.0, 2.0, None, 5.0, 9.0], [0.5, 1.0, 7.0, None, 6.0])
+    assert (found.n, found.mean) == (3, 1.5)
+    assert found.error == pytest.approx(np.std([0.5, 1.0, 3.0], ddof=1) / np.sqrt(3))
+    assert paired([1.0, None], [None, 2.0]) is paired([1.0], [2.0]) is None
+    assert paired([1.0, 2.0], [1.0, 2.0]).seeds_needed == np.inf
+
+
+def test_equal_estimators_are_told_apart_at_5_percent_and_others_by_the_seeds_said_to_be_needed():
+    rng, half = np.random.default_rng(5), 0.5  # of the standard deviation of a difference
+    needed = round(Paired(100, half, 1.0 / np.sqrt(100)).seeds_needed)
+    assert needed == 42
+    for effect, share in ((0.0, 0.05), (half, 0.9)):
+        draws = effect + rng.standard_normal((2000, needed))
+        told = np.mean([paired(draw, np.zeros(needed)).told_apart for draw in draws])
+        # Four standard errors of the share, and one percent by which Student's test needs more than the normal one.
+        assert told == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
+
+
+def test_under_the_table_stands_who_differs_from_the_best(over: Comparison) -> None:
+    honest, astray = over.rows[0].outcomes, over.rows[2].outcomes
+    worse = [_with_ate(one, 0.3 + 0.01 * one.seed) for one in astray]
+    lines = list(paired_lines(replace(over, outcomes=(*honest, *worse))))
+    # Under the seeds 3, 5 and 6, in which both are ok, it has 2.67, 4.65 and 5.64 m less than the other's 3, 5 and 6 m.
+    assert lines == ["honest causal: ATE none +4.32 ± 0.87 m against astray, paired over 3 seeds"]
+    near = [_with_ate(one, one.seed + (0.1 if one.seed % 2 else -0.11)) for one in astray]
+    (line,) = paired_lines(replace(over, outcomes=(*honest, *near)))
+    assert re.search(r"paired over 3 seeds: may be chance; \d+ more seeds? would tell a difference as large", line)
+    assert "Who differs from the best?" in report_text(over, {})
+
+
+def _with_ate(outcome: Outcome, ate_m: float) -> Outcome:
+    scored = outcome.outputs["causal"]
+    scores = Scores(scored.scores.values | {"ate_none_m": ate_m}, scored.scores.notes)
+    return replace(outcome, outputs={"causal": replace(scored, scores=scores)})
 
 
 def test_an_estimator_without_any_answer_keeps_a_line(over: Comparison) -> None:

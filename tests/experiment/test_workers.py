@@ -205,7 +205,7 @@ def test_progress_is_that_of_all_units_and_never_goes_back(units: Units, work: M
 
 # While the processes start, and while the units run.
 @pytest.mark.parametrize("delay_s", [0.2, 3.0])
-def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(
+def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(
     tmp_path: Path, starts_group: StartsGroup, delay_s: float
 ) -> None:
     program = textwrap.dedent("""
@@ -227,9 +227,28 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_neither_file_nor_process(
     os.killpg(vislam.pid, signal.SIGINT)  # as a terminal does: to every process of the group
     _, told = vislam.communicate(timeout=60)
     assert vislam.returncode == 130
-    assert told == "vislam: error: interrupted; what was not finished is not written\n"
-    assert list(tmp_path.iterdir()) == []
+    assert (told.startswith("vislam: error: interrupted; what "), told.count("\n")) == (True, 1)
+    assert (tmp_path / "run").exists() == ("what has ended is kept in run" in told)
+    assert {path.name for path in tmp_path.rglob("*")} <= {"run", "outcomes.jsonl"}
     _assert_gone(vislam.pid)
+
+
+def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: StartsGroup) -> None:
+    program = textwrap.dedent("""
+        import time
+        from toolkit.experiment.workers import Workers
+        workers = Workers(2)
+        for answer in [workers.submit(abs, number) for number in (1, 2)]:
+            answer.result()
+        print("started", flush=True)
+        time.sleep(60)
+    """)
+    parent = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == "started\n"
+    parent.kill()
+    parent.wait()
+    _assert_gone(parent.pid)
 
 
 def _assert_gone(group: int) -> None:

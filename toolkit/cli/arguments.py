@@ -29,8 +29,10 @@ exit status:
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
   70   a defect of vislam itself; VISLAM_TRACEBACK=1 shows where
-  71   the system's means do not suffice: memory, processes, an encoding
-  130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written
+  71   the system's means do not suffice: memory, processes, a cluster, an
+       encoding
+  130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,
+       and what has ended of a comparison over seeds is kept
   141  the reader of the output went away"""
 
 
@@ -38,6 +40,12 @@ class UsageError(VislamError):
     """A command line that asks for something that does not exist."""
 
     exit_status: ClassVar[int] = 2
+
+
+class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
+    """An interrupt after which something is kept that the same command continues from."""
+
+    exit_status: ClassVar[int] = 130
 
 
 class Parser(argparse.ArgumentParser):

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
+    Interrupted,
     add_estimators_argument,
     add_repair_arguments,
     add_settings_arguments,
@@ -24,11 +28,12 @@ from toolkit.cli.arguments import (
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from toolkit.cli.arguments import Subcommands
-    from toolkit.experiment import Plan
+    from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
+    from toolkit.experiment.outcome_store import OutcomeStore
     from toolkit.report.table import Columns
 
 # The one with truth first: its table is the first impression.
@@ -61,7 +66,13 @@ def add_to(subcommands: Subcommands) -> None:
         help="another system's poses of the IMU (TUM, KITTI, EuRoC or OpenVINS file), to be scored beside the "
         "estimators; may be repeated; with exactly one SEQUENCE",
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="run directory (default: runs/<date and time>)")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the "
+        "same command continues where it stopped",
+    )
     parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
     add_repair_arguments(parser)
     parser.add_argument(
@@ -75,6 +86,12 @@ def add_to(subcommands: Subcommands) -> None:
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
     )
     parser.add_argument(
+        "--keep-trajectories",
+        action="store_true",
+        default=None,
+        help="with --seeds, write the trajectories of every seed (of a single one they always are)",
+    )
+    parser.add_argument(
         "--columns",
         metavar="NAME,...",
         type=names,
@@ -83,12 +100,17 @@ def add_to(subcommands: Subcommands) -> None:
     )
     add_settings_arguments(parser)
     add_workers_argument(parser)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+    )
     parser.set_defaults(command=command)
 
 
 def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
-    from toolkit.experiment import comparisons, prepared_cases, workers_of
+    from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
@@ -96,18 +118,51 @@ def command(options: argparse.Namespace) -> int:
 
     columns = _columns(options.columns)
     asked = _configuration(options)
-    plan, progress_for = _plan(asked, options.workers), of_this_process()
+    plan, progress_for = _placed(_plan(asked), options), of_this_process()
     made_by, all_ok = MadeBy(shlex.join(options.command_line), asked), True
-    with workers_of(plan) as workers:
+    with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
-        for comparison, directory in zip(comparisons(plan, cases, workers, progress_for), directories, strict=True):
+        stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
+        open_files.enter_context(_told_where_to_go_on(stores))
+        coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
+        for comparison, directory in zip(coming, directories, strict=True):
             print_above(comparison_text(comparison, columns, width_of_output()))
             with progress_for(f"{comparison.name}: figures and report"):
                 write_run(comparison, directory, made_by)
-            print_above(f"\nresults: {printable(str(directory))}\n")
+            print_above(f"\nresults: {printable(str(directory))}{_found(comparison, stores.get(directory))}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
+
+
+@contextmanager
+def _told_where_to_go_on(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
+    """Say what of the kept outcomes is of no use and, after an interrupt, where others are; close them in the end.
+
+    Raises Interrupted in the place of KeyboardInterrupt where any outcome is kept.
+    """
+    for directory, store in stores.items():
+        if store.unusable:
+            what = f"{store.unusable} outcomes of other data or another version are there and not used"
+            print(f"vislam: {printable(str(directory))}: {what}", file=sys.stderr)
+    try:
+        yield
+    except KeyboardInterrupt:
+        begun = [printable(str(directory)) for directory, store in stores.items() if store.is_there]
+        if not begun:
+            raise
+        kept = f"what has ended is kept in {', '.join(begun)}"
+        raise Interrupted(f"interrupted; {kept}, and the same command with this --out goes on") from None
+    finally:
+        for store in stores.values():
+            store.close()
+
+
+def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
+    """Return how many runs did not have to be made, nothing where all had."""
+    if store is None or not store.found:
+        return ""
+    return f" ({store.found} of {len(comparison.outcomes)} runs were there)"
 
 
 def _columns(names: tuple[str, ...]) -> Columns:
@@ -137,6 +192,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
         "trajectories": {name: str(file) for name, file in options.trajectory} or None,
         "max_frames": options.max_frames,
         "keep": _kept(options),
+        "keep_trajectories": options.keep_trajectories,
     }
     named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds}
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
@@ -157,7 +213,16 @@ def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
     return tuple(sorted(kept_faults(options, faults())))
 
 
-def _plan(asked: Configuration, workers: int | None) -> Plan:
+def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
+    """Return the plan with where it is run."""
+    from toolkit.cli.arguments import UsageError
+
+    if options.scheduler is not None and options.workers is not None:
+        raise UsageError("--scheduler and --workers exclude each other: a cluster has its own workers")
+    return replace(plan, workers=options.workers, scheduler=options.scheduler)
+
+
+def _plan(asked: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
     from toolkit.cli.arguments import UsageError
     from toolkit.estimator import defaults
@@ -181,7 +246,7 @@ def _plan(asked: Configuration, workers: int | None) -> Plan:
         trajectories={name: Path(file) for name, file in request.trajectories.items()},
         keep=frozenset(request.keep),
         max_frames=request.max_frames,
-        workers=workers,
+        keep_trajectories=request.keep_trajectories,
     )
 
 

@@ -106,6 +106,10 @@ class Row:
         given = (outcome.outputs.get(self.output) for outcome in self.outcomes)
         return [None if scored is None else scored.scores.values.get(key) for scored in given]
 
+    def good_values(self, key: str) -> list[float | None]:
+        """Return a metric's value under each seed whose run is ok, None under the others."""
+        return [v if o.status == "ok" else None for v, o in zip(self.values(key), self.outcomes, strict=True)]
+
     def spread(self, key: str) -> Spread | None:
         """Return what a metric's values over the runs that are ok say, or None where there is no value."""
         return spread_of(value for scored in self.good if (value := scored.scores.values.get(key)) is not None)

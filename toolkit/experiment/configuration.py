@@ -25,6 +25,7 @@ class Request(Struct, frozen=True):
     trajectories: dict[str, str] = {}
     max_frames: Annotated[int, Meta(ge=2)] | None = None
     keep: tuple[str, ...] = ()
+    keep_trajectories: bool = False
 
 
 class Configuration(Struct, frozen=True):

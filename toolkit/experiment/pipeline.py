@@ -1,22 +1,24 @@
 """The one experiment: load, audit, start, run, score. The command line, the gate, notebooks and users all call this."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 
-from toolkit.datasets import is_drawn_from_a_seed, load_references
+from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
 from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
+from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
-from toolkit.experiment.workers import Lost, Workers, usable_cpus
+from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Settings
@@ -29,7 +31,9 @@ class Plan:
     ``sources`` are paths, built-in names or sequences; ``estimators`` are names, or the word for the whole ladder;
     ``own`` are further estimators as functions ``build(setup)`` by name. ``truth`` is a TUM file and ``trajectories``
     are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
-    leaves as they are. ``workers`` is the number of processes, one a processor where it is None.
+    leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
+    writes those of every seed; of a single one they always are. ``scheduler`` is the address of a Dask cluster that
+    does the work instead.
     """
 
     sources: tuple[str | Recorded, ...]
@@ -41,6 +45,8 @@ class Plan:
     keep: frozenset[str] = frozenset()
     max_frames: int | None = None
     workers: int | None = None
+    keep_trajectories: bool = False
+    scheduler: str | None = None
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -76,20 +82,32 @@ class Case:
         return self.prepared.sequence.name
 
 
-def run(plan: Plan, progress_for: ProgressFor = silent) -> tuple[Comparison, ...]:
-    """Run and score every estimator on every source; raises as :func:`prepared_cases` and :func:`comparisons` do."""
-    with workers_of(plan) as workers:
-        return tuple(comparisons(plan, prepared_cases(plan, workers, progress_for), workers, progress_for))
+def run(plan: Plan, progress_for: ProgressFor = silent, directories: Sequence[Path] = ()) -> tuple[Comparison, ...]:
+    """Run and score every estimator on every source; over seeds outcomes are kept in ``directories``, one a source.
+
+    Raises as :func:`prepared_cases`, :func:`stores_of` and :func:`comparisons` do.
+    """
+    with workers_of(plan) as workers, ExitStack() as open_files:
+        cases = prepared_cases(plan, workers, progress_for)
+        stores = stores_of(plan, cases, directories) if directories else []
+        for store in stores:
+            open_files.callback(store.close)
+        return tuple(comparisons(plan, cases, workers, progress_for, stores))
 
 
-def workers_of(plan: Plan) -> Workers:
-    """Return the processes that a plan asks for, which begin to import what they will need."""
+def workers_of(plan: Plan) -> Pool:
+    """Return the processes that a plan asks for, which begin to import what they will need, or its cluster.
+
+    Raises ClusterError where that cannot be used.
+    """
+    if plan.scheduler is not None:
+        return Cluster(plan.scheduler)
     workers = Workers(plan.workers or usable_cpus())
     workers.warm_up(__name__)
     return workers
 
 
-def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
+def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
@@ -103,11 +121,11 @@ def prepared_cases(plan: Plan, workers: Workers, progress_for: ProgressFor = sil
     recordings = [plan.recording(source, plan.seeds[0]) for source in plan.sources]
     names = ", ".join(_name(source) for source in plan.sources)
     with progress_for(f"{names}: loading and checking") as progress:
-        prepared = _prepared(recordings, workers, progress)
+        prepared = _prepared(recordings, workers if plan.scheduler is None else Workers(1), progress)
         return tuple(_case(plan, source, one, files) for source, one in zip(plan.sources, prepared, strict=True))
 
 
-def _prepared(recordings: Sequence[Recording], workers: Workers, progress: Progress) -> list[Prepared]:
+def _prepared(recordings: Sequence[Recording], workers: Pool, progress: Progress) -> list[Prepared]:
     """Prepare recordings: several side by side, a single one here, where it is there at once."""
     if len(recordings) == 1:
         return [prepare(recordings[0], progress)]
@@ -134,43 +152,99 @@ def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping
     return Case(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
 
 
+def stores_of(plan: Plan, cases: Sequence[Case], directories: Sequence[Path]) -> list[OutcomeStore]:
+    """Return where the outcomes of each case are kept, of a comparison over seeds; of one seed the runs are needed.
+
+    Raises DataError where what is kept in a directory is damaged, OutputError where another process writes there.
+    """
+    if len(plan.seeds) == 1:
+        return []
+    conditions = [Conditions(_hash_under_seed_0(plan, case), plan.keep) for case in cases]
+    return [OutcomeStore(directory, one) for directory, one in zip(directories, conditions, strict=True)]
+
+
+def _hash_under_seed_0(plan: Plan, case: Case) -> str:
+    prepared = case.prepared if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
+    return prepared.sequence.content_hash()
+
+
 def comparisons(
-    plan: Plan, cases: Sequence[Case], workers: Workers, progress_for: ProgressFor = silent
+    plan: Plan,
+    cases: Sequence[Case],
+    workers: Pool,
+    progress_for: ProgressFor = silent,
+    stores: Sequence[Store] = (),
 ) -> Iterator[Comparison]:
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
-    An estimator that fails is a row that says so. Raises DataError where a recording cannot be had under a seed.
+    What the ``stores``, one a case, have already is not run again. An estimator that fails is a row that says so.
+    Raises DataError where a recording cannot be had under a seed.
     """
     entries = find_all(plan.estimators)
-    by_case = [list(_units(plan, case, entries)) for case in cases]
-    units = list(chain.from_iterable(by_case))
-    owner = [i for i, of_case in enumerate(by_case) for _ in of_case]
-    outcomes: list[list[Outcome]] = [[] for _ in cases]
-    missing, shown = [len(of_case) for of_case in by_case], 0
-    label = f"{', '.join(dict.fromkeys(case.name for case in cases))}: {len(units)} runs"
-    with progress_for(label) as progress, closing(workers.results(units, run_unit, progress)) as coming:
+    kept_in = stores or [NOWHERE] * len(cases)
+    outcomes, units, owner = _found_and_missing(plan, cases, entries, kept_in)
+    missing, shown = Counter(owner), 0
+    with (
+        progress_for(_label(cases, len(units), sum(map(len, outcomes)))) as progress,
+        closing(workers.results(units, run_unit, progress)) as coming,
+    ):
         for place, result in coming:
-            outcomes[owner[place]].append(_outcome(result, units[place]))
-            missing[owner[place]] -= 1
+            case = owner[place]
+            outcomes[case].append(_outcome(result, units[place], kept_in[case]))
+            missing[case] -= 1
             while shown < len(cases) and not missing[shown]:
                 yield _comparison(plan, cases[shown], outcomes[shown], entries, workers.count)
                 shown += 1
-    for case, found in zip(cases[shown:], outcomes[shown:], strict=True):
-        yield _comparison(plan, case, found, entries, workers.count)
+    for one, found in zip(cases[shown:], outcomes[shown:], strict=True):
+        yield _comparison(plan, one, found, entries, workers.count)
+
+
+def _found_and_missing(
+    plan: Plan, cases: Sequence[Case], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
+) -> tuple[list[list[Outcome]], list[Unit], list[int]]:
+    """Return the outcomes that are there, by case, the units that have to be run, and the case of each of these."""
+    outcomes: list[list[Outcome]] = [[] for _ in cases]
+    units: list[Unit] = []
+    owner: list[int] = []
+    for i, (case, store) in enumerate(zip(cases, stores, strict=True)):
+        for unit in _units(plan, case, entries):
+            found = store.find(unit)
+            if found is not None:
+                outcomes[i].append(found)
+            else:
+                units.append(unit)
+                owner.append(i)
+    return outcomes, units, owner
+
+
+def _label(cases: Sequence[Case], missing: int, there: int) -> str:
+    names = ", ".join(dict.fromkeys(case.name for case in cases))
+    return f"{names}: {missing} runs" + (f" ({there} are there)" if there else "")
 
 
 def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
     """Yield the work of a case: seed by seed, the estimators that take longest first."""
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
+    # A worker of a cluster stands in another folder.
+    source = case.source if plan.scheduler is None else _located(case.source)
     for seed in plan.seeds:
-        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(case.source, seed)
+        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(source, seed)
         for name in names:
-            yield Unit(recording, seed, name, plan.settings, plan.own.get(name), keep_run=len(plan.seeds) == 1)
+            build, single = plan.own.get(name), len(plan.seeds) == 1
+            keep_trajectories = plan.keep_trajectories and not single
+            yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories)
 
 
-def _outcome(result: Outcome | Lost, unit: Unit) -> Outcome:
+def _located(source: str | Recorded) -> str | Recorded:
+    """Return a path where it leads from here, anything else as it is."""
+    if isinstance(source, Recorded) or source in built_ins():
+        return source
+    return str(Path(source).expanduser().absolute())
+
+
+def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:
     if isinstance(result, Outcome):
-        return result
+        return store.keep(unit, result)
     return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))
 
 

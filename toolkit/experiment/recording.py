@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from toolkit.audit import Audit, Finding, audit
 from toolkit.datasets import load_sequence
@@ -60,14 +61,15 @@ class Prepared:
 
 
 def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
-    """Load, audit, cut and find the start.
+    """Load, audit, cut and find the start, with linear algebra on one thread: the same bits wherever that is done.
 
     Raises DataError where the source or the truth cannot be used, VislamError where ``keep`` names no fault.
     """
-    audited = audited_recording(recording, progress)
-    whole = _with_noise(audited.sequence, recording.noise)
-    sequence = _cut(whole, recording)
-    return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
+    with threadpool_limits(limits=1, user_api="blas"):
+        audited = audited_recording(recording, progress)
+        whole = _with_noise(audited.sequence, recording.noise)
+        sequence = _cut(whole, recording)
+        return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
 
 
 def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:

@@ -2,6 +2,9 @@
 
 A mean is over the runs that ended well; quartiles over all runs have the others in them, as infinitely bad ones.
 
+Two estimators are compared in pairs, for under each seed they read the same recording (Montgomery, "Design and analysis
+of experiments", 2013, sections 2.4 and 2.5).
+
 Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation" (2001), section 5.4:
 over N independent runs the mean NEES of a consistent estimator stays within the chi-square band for N runs.
 """
@@ -11,6 +14,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
@@ -49,6 +53,41 @@ class QuantilesOfAll:
         """Return why a quartile is None, nothing where none is."""
         lacking = None in (self.lower_quartile, self.median, self.upper_quartile)
         return f"{self.bad} of {self.n} runs did not end well, and each counts as infinitely bad" if lacking else ""
+
+
+# How often chance alone tells two equal estimators apart, and how often enough seeds tell different ones apart.
+_LEVEL, _POWER = 0.05, 0.9
+
+
+@dataclass(frozen=True)
+class Paired:
+    """The mean difference of a metric over n seeds that both estimators have, with its standard error."""
+
+    n: int
+    mean: float
+    error: float
+
+    @property
+    def told_apart(self) -> bool:
+        """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
+        return abs(self.mean) > float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
+
+    @property
+    def seeds_needed(self) -> float:
+        """Return how many seeds tell a difference as large as this apart with 90 % chance; infinite for none."""
+        if self.mean == 0.0:
+            return math.inf
+        quantiles = float(ndtri(1.0 - _LEVEL / 2.0) + ndtri(_POWER))
+        return self.n * (quantiles * self.error / self.mean) ** 2
+
+
+def paired(one: Iterable[float | None], other: Iterable[float | None]) -> Paired | None:
+    """Return how much more the first has than the second, both seed by seed; None with fewer than two common seeds."""
+    differences = [a - b for a, b in zip(one, other, strict=True) if a is not None and b is not None]
+    if len(differences) < 2:
+        return None
+    given = np.array(differences)
+    return Paired(given.size, float(given.mean()), float(given.std(ddof=1) / np.sqrt(given.size)))
 
 
 @dataclass(frozen=True, eq=False)

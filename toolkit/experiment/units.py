@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from toolkit import runner
+from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Output, Run, Status
 from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
@@ -24,7 +25,8 @@ OUTPUTS: tuple[Output, ...] = ("causal", "final")
 class Unit:
     """What to run. ``recording`` may be prepared already; ``build`` is an estimator that cannot be found by its name.
 
-    ``keep_run`` asks for the run itself with its trajectories and landmarks, not for its scores alone.
+    ``keep_run`` asks for the run itself with its trajectories and landmarks, not for its scores alone;
+    ``keep_trajectories`` for the trajectories as the texts of files.
     """
 
     recording: Recording | Prepared
@@ -33,6 +35,7 @@ class Unit:
     settings: Settings = DEFAULTS
     build: Build | None = None
     keep_run: bool = False
+    keep_trajectories: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +56,8 @@ class Outcome:
     """How one estimator fared under one seed; ``outputs`` lacks the kinds of output it did not give.
 
     ``sequence_hash`` is that of the recording it read; ``run`` is there where it was asked for. ``final_is_causal``
-    tells that the final output only repeats the causal one, as a filter's does.
+    tells that the final output only repeats the causal one, as a filter's does. ``tum`` has, where they are to be kept,
+    the trajectories as texts; once they are written ``files`` has the SHA-256 of each by its path in the run directory.
     """
 
     seed: int
@@ -64,6 +68,8 @@ class Outcome:
     sequence_hash: str = ""
     final_is_causal: bool = False
     run: Run | None = None
+    tum: Mapping[Output, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
@@ -73,8 +79,16 @@ def run_unit(unit: Unit, progress: Progress) -> Outcome:
     """
     prepared = prepared_of(unit)
     requested = unit.settings.metrics.requested()
-    outcome = outcome_of(run_estimator(unit, prepared, progress), prepared.sequence, unit.seed, requested)
-    return outcome if unit.keep_run else replace(outcome, run=None)
+    run = run_estimator(unit, prepared, progress)
+    outcome = outcome_of(run, prepared.sequence, unit.seed, requested)
+    texts = _trajectory_texts(run) if unit.keep_trajectories else {}
+    return replace(outcome, run=run if unit.keep_run else None, tum=texts)
+
+
+def _trajectory_texts(run: Run) -> dict[Output, str]:
+    """Return the trajectories of a run as the texts of TUM files."""
+    given = {output: run.trajectory(output) for output in OUTPUTS}
+    return {output: tum.text(trajectory) for output, trajectory in given.items() if trajectory is not None}
 
 
 def prepared_of(unit: Unit) -> Prepared:

@@ -2,13 +2,16 @@
 
 A process that dies takes the unit it was busy with along and nothing else: the units that were under way are tried once
 more, each alone, and one that dies again is lost. An interrupt is the parent's alone to handle: it ends the processes
-it started. Loky's processes do not run the caller's main module again, so a script needs no guard.
+it started, and where it is itself killed they end by themselves. Loky's processes do not run the caller's main module
+again, so a script needs no guard.
 """
 
 import os
 import re
 import signal
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
@@ -16,7 +19,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from loky import ProcessPoolExecutor
@@ -32,7 +35,7 @@ Work = Callable[[T, Progress], R]
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
     "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
 }
-_POLL_S = 0.1
+_POLL_S, _PARENT_POLL_S = 0.1, 1.0
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64)])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
@@ -57,6 +60,23 @@ def results_of(
     """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress)
+
+
+class Pool(Protocol):
+    """Does units of work somewhere, ``count`` at a time; a context that ends what it started."""
+
+    count: int
+
+    def __enter__(self) -> Self:
+        """Begin."""
+
+    def __exit__(self, *_: object) -> None:
+        """End what was started."""
+
+    def results(
+        self, units: Sequence[T], work: Work[T, R], progress: Progress
+    ) -> Generator[tuple[int, R | Lost], None, None]:
+        """Yield the place and the result of every unit as each is there; an error of the work is raised."""
 
 
 class Workers:
@@ -93,7 +113,7 @@ class Workers:
         resource_tracker.ensure_running()
         with _interrupts_held_back():
             if self._executor is None:
-                self._executor = ProcessPoolExecutor(self.count, initializer=_begin, env=_ENVIRONMENT)
+                self._executor = _executor(self.count)
             future: Future[R] = self._executor.submit(work, *arguments)
         return future
 
@@ -187,9 +207,21 @@ class _Watch(Generic[T, R]):
         return _STEPS * len(self._finished) + sum(under_way)
 
 
-def _begin() -> None:
-    """Leave interrupts to the parent; the whole of a process' preparation."""
+def _executor(count: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(),), env=_ENVIRONMENT)
+
+
+def _begin(parent: int) -> None:
+    """Leave interrupts to the parent, and end where it ends; the whole of a process' preparation."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone: one that was killed could not tell it to."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL_S)
+    os._exit(1)
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:

@@ -38,6 +38,7 @@ __all__ = [
     "requests_of",
     "score_run",
     "unavailable",
+    "without_requests",
 ]
 
 ENTRY_POINT_GROUP = "toolkit.metrics"
@@ -164,11 +165,22 @@ def repeated(causal: Scores) -> Scores:
     return Scores(values, notes)
 
 
+def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
+    """Return the scores as they are where no metrics on request but the ``requested`` were computed."""
+    values, notes = dict(scores.values), dict(scores.notes)
+    for file in _found().files:
+        if (switch := _on_request(file)) and switch not in requested:
+            keys = [metric.key for metric in file.METRICS]
+            values |= dict.fromkeys(keys)
+            notes |= dict.fromkeys(keys, _how_to_request(switch))
+    return Scores(values, notes)
+
+
 def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[str]) -> Scores:
     """Score one file; where it cannot be computed at all, each of its keys gets the reason."""
     try:
         if (switch := _on_request(file)) and switch not in requested:
-            raise Unavailable(f"computed on request: --set metrics.{switch}=true")
+            raise Unavailable(_how_to_request(switch))
         if evaluation.output != "causal" and (reason := _causal_only(file)):
             raise Unavailable(reason)
         return file.score(evaluation)
@@ -180,6 +192,10 @@ def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[
 def _causal_only(file: MetricFile) -> str:
     """Return why a file's metrics belong to the causal output alone; nothing where they do not."""
     return str(getattr(file, "CAUSAL_ONLY", ""))
+
+
+def _how_to_request(switch: str) -> str:
+    return f"computed on request: --set metrics.{switch}=true"
 
 
 def _on_request(file: MetricFile) -> str:

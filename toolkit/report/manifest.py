@@ -4,33 +4,26 @@ import os
 import platform
 import subprocess
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import msgspec
 from msgspec import UNSET
 
+from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.workers import usable_cpus
 from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
 
-_PACKAGES = {
-    "toolkit": "vislam-toolkit",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "gtsam": "gtsam",
-    "opencv": "opencv-python-headless",
-    "matplotlib": "matplotlib",
-}
+_PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
 
 
 def manifest_document(comparison: Comparison, command: str, asked: Configuration) -> Manifest:
     """Return the manifest of a comparison: made by a command, that came to be asked for this."""
     here = _run_here(comparison)
-    versions = {name: _version(package) for name, package in _PACKAGES.items()}
+    versions = {name: installed_version(package) for name, package in _PACKAGES.items()}
     request = msgspec.structs.replace(asked.request, sequences=(comparison.source,), estimators=here)
     return Manifest(
         schema="vislam.manifest/1",
@@ -100,10 +93,3 @@ def cpu_model() -> str:
         lines = []
     named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(named, "") or platform.processor() or platform.machine()
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None

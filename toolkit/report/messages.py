@@ -1,12 +1,15 @@
 """What the numbers mean, in plain words: statuses, findings, metrics that are missing and why."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.statistics import Paired, paired
+from toolkit.experiment.units import OUTPUTS
 from toolkit.geometry import IntArray
-from toolkit.metrics import metrics_called, unavailable
+from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
@@ -22,6 +25,9 @@ _MARK = {
 _LOG_ENTRIES = 4
 
 _RULES = {"outliers": "outliers", "window": "the window"}
+
+# A difference that takes more seeds than these to find is none that matters.
+_MOST_SEEDS = 10_000
 
 # Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
@@ -198,6 +204,37 @@ def consistency_lines(comparison: Comparison) -> Iterator[str]:
             given.add(verdict)
             same = sum(r.estimator == row.estimator and _equal(r, row) for r in comparison.rows) > 1
             yield verdict.format("" if same else f" {row.output}")
+
+
+def paired_lines(comparison: Comparison) -> Iterator[str]:
+    """Yield, over seeds, how each estimator differs from the best of its kind of output in the table's first metric."""
+    metric = next((metric for metric in shown_metrics(comparison) if metric.best in ("least", "most")), None)
+    if metric is None or not comparison.over_seeds:
+        return
+    for output in OUTPUTS:
+        rows = [row for row in comparison.lines if row.output == output and row.value(metric.key) is not None]
+        sign = -1.0 if metric.best == "most" else 1.0
+        rows.sort(key=lambda row: sign * (row.value(metric.key) or 0.0))
+        for row in rows[1:]:
+            found = paired(row.good_values(metric.key), rows[0].good_values(metric.key))
+            if found is not None:
+                who = f"{row.estimator}{'' if row.label == 'both' else f' {output}'}"
+                yield f"{who}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
+
+
+def _difference(found: Paired, metric: Metric, best: str) -> str:
+    """Say by how much two estimators differ, and whether that is more than chance."""
+    if found.mean == found.error == 0.0:
+        return f"equal to that of {best} under all {found.n} seeds"
+    decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else metric.decimals
+    figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
+    told = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
+    if found.told_apart:
+        return told
+    if found.seeds_needed > _MOST_SEEDS:
+        return f"{told}: as good as equal, {_MOST_SEEDS} seeds would not tell them apart"
+    more = max(1, math.ceil(found.seeds_needed) - found.n)
+    return f"{told}: may be chance; {more} more seed{'s' if more > 1 else ''} would tell a difference as large as this"
 
 
 def _equal(one: Row, other: Row) -> bool:

@@ -3,7 +3,14 @@
 from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.messages import consistency_lines, finding_lines, header_lines, note_lines, remark_lines
+from toolkit.report.messages import (
+    consistency_lines,
+    finding_lines,
+    header_lines,
+    note_lines,
+    paired_lines,
+    remark_lines,
+)
 from toolkit.report.prose import in_markdown
 from toolkit.report.table import as_markdown, comparison_table, explained_metrics
 
@@ -65,6 +72,7 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
         *(f"{in_markdown(line)}." for line in header_lines(comparison)),
         as_markdown(comparison_table(comparison)),
+        *_section("Who differs from the best?", paired_lines(comparison)),
         *_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
         *_section("Notes", note_lines(comparison)),
         *_section("Remarks on single numbers", remark_lines(comparison)),

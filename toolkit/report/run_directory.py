@@ -1,8 +1,9 @@
 """The run directory: everything one comparison leaves behind, written at once or not at all."""
 
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import msgspec
 from msgspec import UNSET
@@ -13,6 +14,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.pipeline import Case
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
@@ -42,17 +44,24 @@ def check_run_directory(target: Path) -> None:
 def written_by_us(directory: Path) -> frozenset[str]:
     """Return what in a directory an earlier run wrote: files by their relative path, folders with a slash behind.
 
-    They are those its manifest lists, or where an earlier version listed none, those that version wrote by its
-    estimators' names; and the page that ``vislam report`` puts beside them. None where there is no manifest of ours:
-    many programs write a file of that name.
+    They are the outcomes of a run that is not complete or is continued; those its manifest lists, or where an earlier
+    version listed none, those that version wrote by its estimators' names; and the page that ``vislam report`` puts
+    beside them. None of these where there is no manifest of ours: many programs write a file of that name.
     """
+    outcomes = files_of_ours(directory)
     try:
         manifest = read_manifest(directory / MANIFEST)
     except DataError:
-        return frozenset()
+        return _with_folders(outcomes)
     files = _files_of_an_earlier_version(manifest) if manifest.files is UNSET else frozenset(manifest.files)
     page = {PAGE} if _is_page(directory / PAGE) else set()
-    return files | page | {f"{folder}/" for folder in FOLDERS}
+    return _with_folders(outcomes | files | page) | {f"{folder}/" for folder in FOLDERS}
+
+
+def _with_folders(files: frozenset[str]) -> frozenset[str]:
+    """Return files and the folders they are in."""
+    folders = {folder.as_posix() for file in files for folder in PurePosixPath(file).parents}
+    return files | {f"{folder}/" for folder in folders - {"."}}
 
 
 def _is_page(path: Path) -> bool:
@@ -117,12 +126,16 @@ class MadeBy:
 def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
     """Write the run directory of a comparison, in the place of an earlier one if there is one.
 
-    Raises OutputError where ``target`` cannot be written or holds something else; nothing is left behind then.
+    The outcomes that are kept there stay, with the trajectories of those that are in the comparison. Raises OutputError
+    where ``target`` cannot be written or holds something else; nothing is left behind then.
     """
     with replaced_directory(target, written_by_us) as directory:
+        _take_over(comparison, target, directory)
         if comparison.over_seeds:
             _write_text(directory / SEEDS, to_text(seeds_document(comparison)))
             _write_text(directory / REPORT, to_line(report_json.seeds_report_document(comparison)))
+            if any(outcome.files for outcome in comparison.outcomes):
+                _write_truth(comparison, directory)
         else:
             _write_text(directory / METRICS, to_text(metrics_document(comparison)))
             _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
@@ -134,6 +147,18 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
         _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))
 
 
+def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:
+    """Have what is kept of the runs in a new run directory, too, before it takes the place of the old one."""
+    trajectories = (name for outcome in comparison.outcomes for name in outcome.files)
+    for name in (OUTCOMES, *trajectories) if OUTCOMES in files_of_ours(target) else ():
+        place = directory / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            place.hardlink_to(target / name)
+        except OSError:  # a file system without links
+            shutil.copyfile(target / name, place)
+
+
 def _files_in(directory: Path) -> tuple[str, ...]:
     """Return the files of a run, and its manifest, by their relative paths."""
     written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
@@ -143,15 +168,19 @@ def _files_in(directory: Path) -> tuple[str, ...]:
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:
     for folder in ("trajectories", "landmarks"):
         (directory / folder).mkdir()
-    truth = truth_during(comparison.sequence)
-    if truth is not None:
-        _write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
+    _write_truth(comparison, directory)
     for row in comparison.rows:
         trajectory = row.run.trajectory(row.output)
         if trajectory is not None:
             _write_tum(trajectory, directory / report_json.trajectory_file(row.estimator, row.output))
     for run in comparison.runs:
         _write_landmarks(run.landmarks, directory / report_json.landmarks_file(run.estimator))
+
+
+def _write_truth(comparison: Comparison, directory: Path) -> None:
+    truth = truth_during(comparison.sequence)
+    if truth is not None:
+        _write_tum(Trajectory(truth.t_ns, truth.T_world_imu), directory / report_json.TRUTH_FILE)
 
 
 def _write_tum(trajectory: Trajectory, path: Path) -> None:

@@ -11,6 +11,7 @@ from toolkit.report.messages import (
     header_lines,
     note_lines,
     outcome,
+    paired_lines,
     sequence_line,
     undecided_lines,
 )
@@ -30,6 +31,7 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
     lines += section("start", [comparison.prior.source], width)
     lines += section("audit", finding_lines(comparison), width)
     lines += section("facts", comparison.sequence.provenance.facts, width)
+    lines += section("pairs", paired_lines(comparison), width)
     lines += section("nees", consistency_lines(comparison), width)
     lines += section("notes", note_lines(comparison, columns), width)
     return "\n".join(lines)

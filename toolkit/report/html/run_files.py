@@ -9,6 +9,7 @@ import numpy as np
 
 from toolkit.errors import DataError
 from toolkit.estimate import Output
+from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.geometry import Array
 from toolkit.inputs import read_input
 from toolkit.report.records import (
@@ -67,6 +68,8 @@ def read_run(directory: Path) -> RunFiles | SeedsFiles:
     """
     if not directory.is_dir():
         raise DataError(f"{directory} is not a directory; give a run directory, as vislam compare writes it")
+    if OUTCOMES in files_of_ours(directory) and not (directory / MANIFEST).exists():
+        raise DataError(f"{directory} is of a comparison that has not ended; repeat its command, which continues it")
     if not any((directory / name).is_file() for name in (METRICS, SEEDS)):
         raise DataError(f"{directory} is not a run directory: it holds neither {METRICS} nor {SEEDS}")
     manifest = read_manifest(directory / MANIFEST)

@@ -1,0 +1,97 @@
+"""A cluster gives what one process gives, a worker that is killed included; what it cannot do is told in one line."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from toolkit.experiment import cluster as clusters
+from toolkit.experiment.cluster import Cluster, ClusterError
+from toolkit.experiment.units import Outcome, Unit, run_unit
+from toolkit.experiment.workers import Lost, results_of
+from toolkit.progress import SILENT
+
+cloudpickle = pytest.importorskip("cloudpickle", reason="needs the extra cluster")
+dask = pytest.importorskip("dask", reason="needs the extra cluster")
+distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+Units = Callable[..., list[Unit]]
+
+
+@pytest.fixture(scope="module")
+def local() -> Iterator[Any]:
+    """Two worker processes and their scheduler."""
+    # How long a worker that is gone is waited for; 30 s otherwise.
+    impatient = {"distributed.comm.timeouts.connect": "1s", "distributed.scheduler.allowed-failures": 1}
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers need not find this file
+    with (
+        dask.config.set(impatient),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as started,
+    ):
+        yield started
+    cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
+
+
+def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local: Any, units: Units) -> None:
+    asked = [
+        replace(unit, recording=replace(unit.recording, duration_s=3.0))  # a short recording is quickly simulated
+        for unit in units((0, 1, 2), ("dead-reckoning", "ekf"))
+    ]
+    found: dict[int, Outcome] = {}
+    with Cluster(local.scheduler_address) as cluster:
+        assert cluster.count == 2
+        for place, outcome in cluster.results(asked, run_unit, SILENT):
+            assert place not in found
+            assert isinstance(outcome, Outcome)
+            if not found:
+                os.kill(local.workers[0].pid, signal.SIGKILL)
+            found[place] = outcome
+    assert len(found) == len(asked)
+    for place, outcome in results_of(asked, 1, run_unit, SILENT):
+        assert isinstance(outcome, Outcome)
+        one, other = (each.outputs["causal"] for each in (outcome, found[place]))
+        assert found[place].sequence_hash == outcome.sequence_hash
+        np.testing.assert_array_equal(one.nees_pose, other.nees_pose)
+        np.testing.assert_array_equal(one.position_m, other.position_m)
+
+
+def test_a_worker_of_another_version_is_told(local: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = clusters.numeric_versions() | {"gtsam": "4.9"}
+    monkeypatch.setattr(clusters, "numeric_versions", lambda: ours)
+    with pytest.raises(ClusterError, match=r"has gtsam 4\.3.*, not 4\.9; install"):
+        Cluster(local.scheduler_address)
+    monkeypatch.undo()
+    monkeypatch.setattr(clusters, "code_digest", lambda: "other")
+    with pytest.raises(ClusterError, match="another version of the toolkit"):
+        Cluster(local.scheduler_address)
+
+
+def test_an_error_of_the_work_is_raised_here(local: Any, units: Units) -> None:
+    with Cluster(local.scheduler_address) as cluster, pytest.raises(ZeroDivisionError):
+        list(cluster.results([(1, 0)], divmod_of, SILENT))
+
+
+def divmod_of(pair: tuple[int, int], _progress: object) -> tuple[int, int]:
+    return divmod(*pair)
+
+
+def test_a_unit_that_ends_its_worker_is_lost_alone(local: Any) -> None:
+    with Cluster(local.scheduler_address) as cluster:
+        found = dict(cluster.results([0, 1], kills_at_one, SILENT))
+    assert found == {0: 0, 1: Lost("the workers that tried it ended before they answered (2 of them)")}
+
+
+def kills_at_one(unit: int, _progress: object) -> int:
+    if unit == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return unit
+
+
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clusters, "_CONNECT_S", 0.3)
+    with pytest.raises(ClusterError, match=r"no scheduler can be reached at tcp://127\.0\.0\.1:9 "):
+        Cluster("tcp://127.0.0.1:9")

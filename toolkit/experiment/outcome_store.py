@@ -1,0 +1,219 @@
+"""Outcomes that survive: each is added to a file of the run directory as it ends, and is looked up there afterwards.
+
+What is found again is what was kept, to the bit; an outcome of other data, settings or code has another key and is
+never taken for one asked for. A run whose process died is not kept: it is tried again.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from toolkit.errors import DataError, OutputError
+from toolkit.estimate import Output
+from toolkit.experiment.code_version import code_digest, numeric_versions
+from toolkit.experiment.comparison import plain_name
+from toolkit.experiment.outcome_record import FilesRecord, OutcomeRecord, UnitKey, outcome_of_record, record_of
+from toolkit.experiment.units import Outcome, Unit
+from toolkit.files import LineFile, whole_lines
+from toolkit.inputs import read_input
+from toolkit.settings import Settings, as_values
+
+OUTCOMES = "outcomes.jsonl"
+# Every line of such a file begins so.
+_OUR_START = b'{"schema":"vislam.outcome'
+_FILES_START = b'{"schema":"vislam.outcome-files/1"'
+_DECODER = msgspec.json.Decoder(OutcomeRecord | FilesRecord)
+
+
+class Store(Protocol):
+    """Where outcomes are looked for before a unit is run, and kept when it has ended."""
+
+    def find(self, unit: Unit) -> Outcome | None:
+        """Return the outcome of a unit, or None where it has to be run."""
+
+    def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
+        """Keep an outcome; return it as it will be found again."""
+
+
+class Nowhere:
+    """Keeps nothing: every unit is run, and its outcome is in memory alone."""
+
+    def find(self, _unit: Unit) -> None:
+        """Find nothing."""
+
+    def keep(self, _unit: Unit, outcome: Outcome) -> Outcome:
+        """Return the outcome."""
+        return outcome
+
+
+NOWHERE = Nowhere()
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What the units of a case share: the ``data``, as the hash of the recording under seed 0, and what is kept."""
+
+    data: str
+    keep: frozenset[str] = frozenset()
+
+    def key(self, unit: Unit) -> UnitKey:
+        """Return all that the outcome of a unit depends on."""
+        return UnitKey(
+            data=self.data,
+            seed=unit.seed,
+            estimator=unit.estimator,
+            settings=_settings_of_a_run(unit.settings, unit.estimator),
+            keep=tuple(sorted(self.keep)),
+            code=code_digest(),
+            versions=numeric_versions(),
+        )
+
+    def fit(self, key: UnitKey) -> bool:
+        """Say whether a unit of the case, of some seed, estimator and settings, may have a key."""
+        ours = (self.data, tuple(sorted(self.keep)), code_digest(), numeric_versions())
+        return (key.data, key.keep, key.code, key.versions) == ours
+
+
+def _settings_of_a_run(settings: Settings, estimator: str) -> dict[str, object]:
+    """Return the settings that reach a run; which seeds there are and which metrics are asked for does not."""
+    values = as_values(settings)
+    for name in ("first_seed", "seeds", "metrics"):
+        del values[name]
+    values["estimators"] = {name: options for name, options in values["estimators"].items() if name == estimator}
+    return values
+
+
+class OutcomeStore:
+    """The outcomes in a run directory; until it is closed no other process adds to them.
+
+    ``found`` counts the units that were there. Raises DataError where the file is damaged, OutputError where it cannot
+    be written or another process does so.
+    """
+
+    def __init__(self, directory: Path, conditions: Conditions) -> None:
+        self.found = 0
+        self._directory, self._conditions = directory, conditions
+        self._path = directory / OUTCOMES
+        self._lines = LineFile(self._path) if self._path.exists() else None
+        self._records: dict[bytes, list[OutcomeRecord]] = {}
+        try:
+            for record in _records_in(self._path):
+                if isinstance(record, OutcomeRecord):
+                    self._records.setdefault(record.unit.text(), []).append(record)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def unusable(self) -> int:
+        """Return how many outcomes are there of other data, code or repairs, which no unit of the case can have."""
+        return sum(not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
+
+    @property
+    def is_there(self) -> bool:
+        """Say whether anything is kept."""
+        return self._lines is not None
+
+    def find(self, unit: Unit) -> Outcome | None:
+        """Return the outcome of a unit with all that is asked of it, or None."""
+        if unit.build is not None:  # a function, which nobody can tell from another of its name
+            return None
+        asked = unit.settings.metrics.requested()
+        for record in self._records.get(self._conditions.key(unit).text(), []):
+            if set(asked) <= set(record.requested):
+                files = self._unchanged(record.files)
+                if not unit.keep_trajectories or files.keys() == _names(unit, record.final_is_causal, record.outputs):
+                    self.found += 1
+                    return replace(outcome_of_record(record, asked), files=files)
+        return None
+
+    def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
+        """Write the trajectories of an outcome where it has any, then its line."""
+        if unit.build is not None:
+            return outcome
+        if self._lines is None:
+            self._lines = LineFile(self._path)
+        texts = {trajectory_file(unit, output): text.encode() for output, text in outcome.tum.items()}
+        if texts:
+            self._lines.append(msgspec.json.encode(FilesRecord(files=tuple(texts))))
+            self._write(texts)
+        digests = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
+        asked = unit.settings.metrics.requested()
+        line = msgspec.json.encode(record_of(outcome, self._conditions.key(unit), asked, digests))
+        self._lines.append(line)
+        kept = _DECODER.decode(line)
+        assert isinstance(kept, OutcomeRecord)
+        return outcome_of_record(kept, asked)
+
+    def close(self) -> None:
+        """Let other processes add to the file."""
+        if self._lines is not None:
+            self._lines.close()
+            self._lines = None
+
+    def _write(self, texts: Mapping[str, bytes]) -> None:
+        try:
+            for name, text in texts.items():
+                path = self._directory / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(text)
+        except OSError as error:
+            why = error.strerror or error
+            raise OutputError(f"{self._directory / name} cannot be written ({why}); make room, and repeat") from error
+
+    def _unchanged(self, files: Mapping[str, str]) -> dict[str, str]:
+        """Return those of some files that are there as they were written."""
+        return {name: digest for name, digest in files.items() if _digest(self._directory / name) == digest}
+
+
+def trajectory_file(unit: Unit, output: Output) -> str:
+    """Return where in a run directory the trajectory of a unit's output is kept."""
+    return f"trajectories/seed-{unit.seed}/{plain_name(unit.estimator)}_{output}.tum"
+
+
+def _names(unit: Unit, final_is_causal: bool, outputs: Iterable[Output]) -> set[str]:
+    both: tuple[Output, ...] = ("causal", "final")
+    return {trajectory_file(unit, output) for output in (both if final_is_causal else outputs)}
+
+
+def files_of_ours(directory: Path) -> frozenset[str]:
+    """Return the file of outcomes in a directory, if it is one, and the files that its lines say were written."""
+    try:
+        content = read_input(directory / OUTCOMES)
+    except DataError:
+        return frozenset()
+    if not (content.startswith(_OUR_START) or _OUR_START.startswith(content)):
+        return frozenset()
+    named = (line for line in whole_lines(content) if line.startswith(_FILES_START))
+    return frozenset({OUTCOMES, *(name for line in named for name in _files_named(line))})
+
+
+def _files_named(line: bytes) -> tuple[str, ...]:
+    try:
+        record = _DECODER.decode(line)
+    except msgspec.DecodeError:
+        return ()
+    return record.files if isinstance(record, FilesRecord) else ()
+
+
+def _records_in(path: Path) -> Iterable[OutcomeRecord | FilesRecord]:
+    """Yield what the lines of a file hold; a last line without its end was cut off by a kill and is not read."""
+    if not path.exists():
+        return
+    for number, line in enumerate(whole_lines(read_input(path)), start=1):
+        try:
+            yield _DECODER.decode(line)
+        except msgspec.DecodeError as error:
+            what = " ".join(str(error).split())
+            raise DataError(f"{path}, line {number}: is no outcome ({what}); delete the line, and repeat") from error
+
+
+def _digest(path: Path) -> str | None:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
