@@ -93,7 +93,7 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
 
     lag_s: Annotated[
         float, Meta(gt=0.0, le=3600.0, description="window of the windowed filters and smoothers", extra={"unit": "s"})
-    ] = 1.0
+    ] = 0.6
     most_states: Annotated[
         int, Meta(ge=2, le=10_000, description="states in the window at most; of more frames they are thinned evenly")
     ] = 30
