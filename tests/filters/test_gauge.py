@@ -27,7 +27,7 @@ from toolkit.simulation import DRIVE, FLIGHT
 LOOSENESS = np.array([0.5, 0.5, 0.5, 0.1])
 YAW = 3
 
-SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=2.5)}
+SCENARIOS = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=3.0)}
 SCENARIOS = {name: replace(s, camera=replace(s.camera, max_tracks=25)) for name, s in SCENARIOS.items()}
 FILTERS = {
     "ekf-slam": JointEkf,

@@ -35,7 +35,7 @@ def same(one: Run, other: Run) -> bool:
     ("part", "moved", "unmoved"),
     [
         (Window(lag_s=0.5), WINDOWED, {"ekf-slam", "isam2"}),
-        (Window(most_states=8), WINDOWED, {"ekf-slam", "isam2"}),
+        (Window(most_states=4), WINDOWED, {"ekf-slam", "isam2"}),
         (Window(landmarks=5), {"msckf-slam"}, {"msckf-fej"}),
         (Outliers(gate_probability=0.5), {"ekf", "ekf-slam", "msckf", "fixed-lag", "smart", "isam2"}, {"seed-ekf"}),
         (Outliers(smoother_gate_factor=1.0), {"fixed-lag", "smart", "isam2"}, {"msckf", "batch"}),
