@@ -41,6 +41,11 @@ def test_no_motion_is_measured_and_that_is_said(drive: Path) -> None:
     np.testing.assert_array_equal(sequence.frames_t_ns, 100_000_000 * np.arange(FRAMES))
 
 
+def test_the_audit_says_that_there_is_no_motion_to_compare_with(drive: Path) -> None:
+    why = set(prepare(Recording(str(drive))).undecided.values())
+    assert why == {"no motion was measured to compare the camera's with"}
+
+
 def test_forward_is_the_bodys_x(drive: Path) -> None:
     sequence = load_sequence(str(drive))
     truth = sequence.truth

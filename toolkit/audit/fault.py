@@ -73,6 +73,8 @@ class Evidence:
         known, intervals = int(self.camera_motion.known.sum()), max(self.sequence.frame_count - 1, 0)
         if not len(self.sequence.observations):
             return Undecided("there are no sightings to compare with")
+        if self.sequence.motion_kind == "none":
+            return Undecided("no motion was measured to compare the camera's with")
         per_frame = len(self.sequence.observations) / self.sequence.frame_count
         return Undecided(
             f"the tracks ({per_frame:.1f} sightings a frame) determine the camera's own motion in {known} of "
