@@ -2,7 +2,6 @@
 
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -16,7 +15,6 @@ from toolkit.experiment.units import Outcome, Unit, run_unit
 from toolkit.experiment.workers import Lost, results_of
 from toolkit.progress import SILENT
 
-cloudpickle = pytest.importorskip("cloudpickle", reason="needs the extra cluster")
 dask = pytest.importorskip("dask", reason="needs the extra cluster")
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 Units = Callable[..., list[Unit]]
@@ -27,13 +25,11 @@ def local() -> Iterator[Any]:
     """Two worker processes and their scheduler."""
     # How long a worker that is gone is waited for; 30 s otherwise.
     impatient = {"distributed.comm.timeouts.connect": "1s", "distributed.scheduler.allowed-failures": 1}
-    cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the workers need not find this file
     with (
         dask.config.set(impatient),
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as started,
     ):
         yield started
-    cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
 
 
 def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local: Any, units: Units) -> None:
@@ -70,25 +66,26 @@ def test_a_worker_of_another_version_is_told(local: Any, monkeypatch: pytest.Mon
         Cluster(local.scheduler_address)
 
 
+# Workers need not find this file: a function within a function goes to them as it is.
+
+
 def test_an_error_of_the_work_is_raised_here(local: Any, units: Units) -> None:
+    def divided_by_zero(unit: int, _progress: object) -> int:
+        return unit // 0
+
     with Cluster(local.scheduler_address) as cluster, pytest.raises(ZeroDivisionError):
-        list(cluster.results([(1, 0)], divmod_of, SILENT))
-
-
-def divmod_of(pair: tuple[int, int], _progress: object) -> tuple[int, int]:
-    return divmod(*pair)
+        list(cluster.results([1], divided_by_zero, SILENT))
 
 
 def test_a_unit_that_ends_its_worker_is_lost_alone(local: Any) -> None:
+    def kills_at_one(unit: int, _progress: object) -> int:
+        if unit == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return unit
+
     with Cluster(local.scheduler_address) as cluster:
         found = dict(cluster.results([0, 1], kills_at_one, SILENT))
     assert found == {0: 0, 1: Lost("the workers that tried it ended before they answered (2 of them)")}
-
-
-def kills_at_one(unit: int, _progress: object) -> int:
-    if unit == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return unit
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,13 +62,14 @@ def pull(scene, run_estimator) -> Callable[[str, float], float]:
     """Return a function: the error (m) of the final position at FRAME that a sighting off by some sigmas makes."""
 
     def pulled(name: str, sigmas: float, policy: PolicyName = "classic") -> float:
-        settings = Settings(outliers=POLICIES[policy])
+        settings = Settings(outliers=POLICIES[policy], window=WHOLE)
         return scene.error_m(run_estimator(name, scene.with_error(sigmas), settings=settings))
 
     return pulled
 
 
 # Of what is exact a run leaves rounding, or where its iteration stops.
+WHOLE = Window(lag_s=2.0)  # no sighting of the scene leaves it
 NOTHING_M = 1e-6
 
 
