@@ -62,9 +62,8 @@ def test_filters_and_smoothers_find_the_motion(drive: Path, name: str, run_estim
     run = run_estimator(name, prepared.sequence, prepared.prior)
     assert run.status == "ok"
     moved = run.final.T_world_imu[:, :3, 3]
-    # 12 px of disparity at 8 m: a tenth of a pixel is 7 cm of depth, and tens of tracks share it. The newest poses of a
-    # windowed filter wait for their tracks to end.
-    np.testing.assert_allclose(moved[-1], [STEP_M * (FRAMES - 1), 0.0, 0.0], atol=0.05 if name == "msckf" else 0.03)
+    # 12 px of disparity at 8 m: a tenth of a pixel is 7 cm of depth, and tens of tracks share it
+    np.testing.assert_allclose(moved[-1], [STEP_M * (FRAMES - 1), 0.0, 0.0], atol=0.03)
 
 
 def test_poses_of_the_download_are_found_beside_the_sequences(drive: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from filters.smoothing.robust import worth_smoothing
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import StereoFrame
+from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 
@@ -20,20 +21,28 @@ def error_since_the_start(poses: Array, truth: Array) -> float:
 
 @pytest.mark.parametrize(
     ("scenario", "duration_s", "most"),
-    # Measured 0.80 and 0.40 of a filter whose window is as long as the smoothers.
-    [(DRIVE, 4.0, 0.85), (FLIGHT, 2.0, 0.5)],
+    # Measured 0.68 and 0.40; with ten seconds, which take five times as long, 0.51 and 0.36.
+    [(DRIVE, 4.0, 0.75), (FLIGHT, 2.0, 0.5)],
     ids=["drive", "flight"],
 )
 def test_it_beats_the_filter_it_starts_from(scenario, duration_s, most, run_estimator):
-    """It sees the future and relinearises: less error than msckf-fej on average over five seeds, and under four."""
+    """It sees the future and relinearises: less error than msckf-fej under each of five seeds, by far on average.
+
+    The filter has the window of each scenario for which the bounds were measured: five poses of a car, twelve of a
+    flight. One of seven poses is better on the road, and four seconds of it do not always tell the two apart.
+    """
+    settings = Settings(window=Window(lag_s=0.4 if scenario is DRIVE else 0.6))
     sequences = [simulate(replace(scenario, duration_s=duration_s), seed) for seed in range(5)]
     filtered_m, smoothed_m = (
         np.array(
-            [error_since_the_start(run_estimator(name, s).final.T_world_imu, s.truth.T_world_imu) for s in sequences]
+            [
+                error_since_the_start(run_estimator(name, s, settings=settings).final.T_world_imu, s.truth.T_world_imu)
+                for s in sequences
+            ]
         )
         for name in ("msckf-fej", "batch")
     )
-    assert (smoothed_m < filtered_m).sum() >= 4
+    assert (smoothed_m < filtered_m).all()
     assert smoothed_m.mean() < most * filtered_m.mean()
 
 

@@ -137,8 +137,8 @@ def score_run(run: Run, output: Output, sequence: Sequence, requested: Collectio
     """Score one output of a run against its sequence, with every key of :func:`describe`.
 
     ``requested`` names the switches of metrics that are computed on request alone. A metric that cannot be computed, or
-    is not finite, is None and has its reason in the notes. Raises
-    ValueError where the run has no output of that kind; an error inside a metric is a defect and passes through.
+    is not finite, is None and has its reason in the notes. Raises ValueError where the run has no output of that kind;
+    an error inside a metric is a defect and passes through.
     """
     evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
