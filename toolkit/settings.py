@@ -19,6 +19,7 @@ from toolkit.inputs import read_text_input
 _NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
+Varied = Literal["noise", "world"]
 Scalar = bool | int | float | str
 
 
@@ -199,6 +200,9 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     seeds: Annotated[
         int, Meta(ge=1, le=100_000, description="how many seeds a simulated sequence is repeated over")
     ] = 1
+    vary: Annotated[
+        Varied, Meta(description="what a seed draws of a simulation: the noise, or trajectory and landmarks as well")
+    ] = "noise"
     estimators: dict[str, dict[str, Scalar]] = {}
 
     def options_of(self, estimator: str) -> Mapping[str, Scalar]:

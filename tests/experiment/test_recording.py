@@ -9,7 +9,7 @@ from toolkit.datasets import load_sequence
 from toolkit.experiment import Plan
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistNoise
-from toolkit.settings import DEFAULTS, Noise, settings_of
+from toolkit.settings import DEFAULTS, Noise, SettingsError, settings_of
 
 
 def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
@@ -74,3 +74,12 @@ def test_a_plan_reads_its_recordings_by_the_settings() -> None:
         "drive", 6, keep=frozenset({"time-gap"}), start="truth", max_frames=9, noise=Noise(pixel_sigma_px=0.7)
     )
     assert Plan(("drive",), ("ekf",)).seeds == (DEFAULTS.first_seed,)
+
+
+def test_a_world_is_drawn_of_simulations_alone() -> None:
+    fixed, drawn = (prepare(Recording("drive", duration_s=1.0, vary=vary)).sequence for vary in ("noise", "world"))
+    assert fixed.truth is not None
+    assert drawn.truth is not None
+    assert np.abs(fixed.truth.T_world_imu - drawn.truth.T_world_imu).max() > 0.01
+    with pytest.raises(SettingsError, match="vary=world draws a simulated world"):
+        prepare(Recording(fixed, vary="world"))

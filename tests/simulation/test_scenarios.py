@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import simulated
+from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import check_runnable
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
@@ -53,7 +54,48 @@ def test_twist_and_imu_drive_the_same_road() -> None:
     assert twist.truth is not None
     assert imu.truth is not None
     np.testing.assert_array_equal(twist.truth.T_world_imu, imu.truth.T_world_imu)
-    np.testing.assert_array_equal(twist.observations.uv_px, imu.observations.uv_px)
+
+
+def test_scenarios_under_one_seed_are_independent_draws() -> None:
+    drive, imu, flight = (_prior_errors(scenario) for scenario in (DRIVE, DRIVE_IMU, FLIGHT))
+    # 240 products of independent standard normal numbers: their mean has a standard deviation of 0.065.
+    for one, other in ((drive, imu), (drive, flight), (imu, flight)):
+        assert abs(np.mean(one * other)) < 4.0 / np.sqrt(one.size)
+
+
+def _prior_errors(scenario: Scenario) -> Array:
+    """Return the errors (40, 6) of the prior's pose under 40 seeds, in standard deviations."""
+    errors = []
+    for seed in range(40):
+        sequence = simulate(replace(scenario, duration_s=0.2), seed)
+        assert sequence.prior is not None
+        assert sequence.truth is not None
+        error = se3_log(se3_inverse(sequence.truth.T_world_imu[0]) @ sequence.prior.T_world_imu)
+        errors.append(error / np.sqrt(np.diag(sequence.prior.cov)[:6]))
+    return np.array(errors)
+
+
+@every_scenario
+def test_a_varied_world_has_trajectory_and_landmarks_of_its_own_under_every_seed(scenario: Scenario) -> None:
+    fixed, one, again, other = (
+        simulate(replace(short(scenario), varied=varied), seed)
+        for varied, seed in ((False, 1), (True, 1), (True, 1), (True, 2))
+    )
+    assert one.content_hash() == again.content_hash()
+    for different in (fixed, other):
+        assert one.truth is not None
+        assert different.truth is not None
+        assert np.abs(one.truth.T_world_imu - different.truth.T_world_imu).max() > 0.1
+    np.testing.assert_array_equal(one.motion.t_ns, fixed.motion.t_ns)
+
+
+@every_scenario
+def test_a_varied_world_is_clean_and_the_camera_sees_enough_of_it(scenario: Scenario) -> None:
+    for seed in range(4):
+        sequence = simulate(replace(scenario, duration_s=10.0, varied=True), seed)
+        check_runnable(sequence)
+        assert disparity_px(sequence.observations.uv_px).min() > 0.0
+        assert np.bincount(sequence.observations.frame, minlength=sequence.frame_count).min() >= 20
 
 
 @every_scenario

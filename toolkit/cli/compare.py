@@ -86,6 +86,11 @@ def add_to(subcommands: Subcommands) -> None:
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
     )
     parser.add_argument(
+        "--vary",
+        choices=("noise", "world"),
+        help="what a seed draws of a simulation: the noise, or trajectory and landmarks as well (default: noise)",
+    )
+    parser.add_argument(
         "--keep-trajectories",
         action="store_true",
         default=None,
@@ -194,7 +199,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
         "keep": _kept(options),
         "keep_trajectories": options.keep_trajectories,
     }
-    named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds}
+    named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds, "vary": options.vary}
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
     settings = with_assignments(settings, assignments_asked(options))
     settings |= {key: value for key, value in named.items() if value is not None}

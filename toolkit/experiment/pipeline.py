@@ -65,6 +65,7 @@ class Plan:
             max_frames=self.max_frames,
             noise=settings.noise,
             frontend=settings.frontend,
+            vary=settings.vary,
         )
 
 

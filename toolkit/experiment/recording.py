@@ -16,7 +16,7 @@ from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
-from toolkit.settings import DEFAULTS, Frontend, Noise
+from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, Varied
 from toolkit.simulation import SCENARIOS, simulate
 
 Start = Literal["measurements", "truth"]
@@ -32,7 +32,7 @@ class Recording:
 
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
     reports and leaves as they are. ``max_frames`` and ``duration_s`` cut it; a simulation of ``duration_s`` is made
-    that long.
+    that long. ``vary`` says what the seed draws of a simulation.
     """
 
     source: str | Sequence
@@ -44,6 +44,7 @@ class Recording:
     duration_s: float | None = None
     noise: Noise = DEFAULTS.noise
     frontend: Frontend = DEFAULTS.frontend
+    vary: Varied = DEFAULTS.vary
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +89,16 @@ def prepare_once(recording: Recording) -> Prepared:
 
 def _loaded(recording: Recording, progress: Progress) -> Sequence:
     source = recording.source
+    if recording.vary == "world" and source not in SCENARIOS:
+        name = source.name if isinstance(source, Sequence) else source
+        raise SettingsError(f"{name}: vary=world draws a simulated world ({', '.join(SCENARIOS)}); this is none")
     if isinstance(source, Sequence):
         sequence = source
-    elif source in SCENARIOS and recording.duration_s is not None:
-        sequence = simulate(replace(SCENARIOS[source], duration_s=recording.duration_s), recording.seed)
+    elif source in SCENARIOS:
+        scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
+        if recording.duration_s is not None:
+            scenario = replace(scenario, duration_s=recording.duration_s)
+        sequence = simulate(scenario, recording.seed)
     else:
         sequence = load_sequence(source, recording.seed, recording.frontend, progress)
     return sequence if recording.truth is None else with_truth(sequence, load_truth(recording.truth))

@@ -1,13 +1,14 @@
 """The simulated recordings: `drive` (a car, twist or IMU) and `flight` (hand-held or aerial, IMU).
 
 Trajectory and landmarks belong to the scenario; the seed draws the prior's error, the biases, all noise,
-the chance ends of tracks and the outliers, each from a stream of its own. Repeating a scenario over seeds is
-therefore a Monte-Carlo experiment about noise, as a consistency test needs (Bar-Shalom, Li & Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, section 5.4).
+the chance ends of tracks and the outliers, each from a stream of its own, and other ones for every scenario: two
+scenarios under one seed are independent draws. Repeating a scenario over seeds is therefore a Monte-Carlo experiment
+about noise, as a consistency test needs (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, section 5.4). Where the world varies, the seed draws trajectory and landmarks too.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from zlib import crc32
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import GRAVITY_WORLD, Observations, Prior, Provenance, Sequence, StereoRig, Truth
 from toolkit.settings import SettingsError
 from toolkit.simulation import sensors, world
-from toolkit.simulation.scenes import Scene, hall, road
+from toolkit.simulation.scenes import SceneOf, hall, road
 from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 from toolkit.simulation.world import Camera
@@ -33,18 +34,19 @@ _UNUSED_ACCEL_BIAS_SIGMA = 0.01
 class Scenario:
     """Everything about a simulated recording but its seed.
 
-    ``scene`` builds the trajectory and the world for a duration. ``noise_scale`` multiplies every drawn
-    error (pixels, motion, biases, prior) and leaves the stated noise as it is, so that 0 gives exact
-    measurements an estimator can still weigh.
+    ``scene`` builds the trajectory and the world for a duration; ``varied`` lets every seed draw its own.
+    ``noise_scale`` multiplies every drawn error (pixels, motion, biases, prior) and leaves the stated noise as it is,
+    so that 0 gives exact measurements an estimator can still weigh.
     """
 
     name: str
-    scene: Callable[[float], Scene]
+    scene: SceneOf
     rig: StereoRig
     camera: Camera
     motion: Odometer | Imu
     duration_s: float = 60.0
     noise_scale: float = 1.0
+    varied: bool = False
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
 
 
@@ -72,10 +74,11 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
             f"a simulation of {scenario.duration_s:g} s cannot be had; its duration is from "
             f"{1.0 / scenario.camera.rate_hz:g} to {LONGEST_S:g} s"
         )
-    prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng = (
-        np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(5)
+    prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng, world_rng = (
+        np.random.default_rng(stream)
+        for stream in np.random.SeedSequence((seed, crc32(scenario.name.encode()))).spawn(6)
     )
-    scene = scenario.scene(scenario.duration_s)
+    scene = scenario.scene(scenario.duration_s, world_rng) if scenario.varied else scenario.scene(scenario.duration_s)
     frames_t_ns = sensors.stamps_ns(START_NS, scenario.camera.rate_hz, scenario.duration_s)
     motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
     measured = _measure_motion(scenario, scene.trajectory, frames_t_ns, motion_rng)
@@ -145,7 +148,9 @@ def _prior(scenario: Scenario, motion: Kinematics, rng: np.random.Generator) -> 
 def _provenance(scenario: Scenario, seed: int) -> Provenance:
     camera = scenario.camera
     facts = (
-        "the trajectory and the landmarks belong to the scenario; the seed draws the errors",
+        "the seed draws trajectory, landmarks and errors"
+        if scenario.varied
+        else "the trajectory and the landmarks belong to the scenario; the seed draws the errors",
         f"noise scale {scenario.noise_scale:g}, outlier rate {camera.outlier_rate:g}",
         f"image coordinates rounded to {camera.step_px:g} px" if camera.step_px else "image coordinates not rounded",
     )

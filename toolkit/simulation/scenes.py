@@ -1,6 +1,11 @@
-"""The scenes of the scenarios: the road of `drive` and the hall of `flight`; functions of time without any seed."""
+"""The scenes of the scenarios: the road of `drive` and the hall of `flight`.
+
+A scene is a function of its duration alone, or one of a family of its kind: other corners, hills and turns, other
+landmarks, drawn from a stream of random numbers.
+"""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -23,7 +28,6 @@ _ROAD_LEAD_OUT_S = 6.0
 _ROAD_LANDMARKS_PER_POSE = 14
 _ROAD_POSE_SPACING_M = 2.0
 _CORNER_EVERY_S = 20.0
-_CORNER_TURNS = (1.0, 1.0, -1.0, 1.0, -1.0, -1.0)  # left is positive
 
 _HALL_LOWER_M, _HALL_UPPER_M = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 4.5])
 _HALL_LANDMARKS = 1500
@@ -39,56 +43,86 @@ class Scene:
     points: Array
 
 
-def road(duration_s: float) -> Scene:
+class SceneOf(Protocol):
+    """Makes a scene that lasts so long: always the same one, or one drawn from random numbers."""
+
+    def __call__(self, duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
+        """Return the scene."""
+
+
+@dataclass(frozen=True)
+class _Streets:
+    """What tells one town's streets from another's: which way the corners turn, phases (rad) of bends and hills."""
+
+    corner_turns: tuple[float, ...] = (1.0, 1.0, -1.0, 1.0, -1.0, -1.0)  # left is positive; repeated from the first
+    bend_phase: float = 0.0
+    hill_phases: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, corners: int) -> "_Streets":
+        bend, *hills = rng.uniform(0.0, 2.0 * np.pi, 3)
+        turns = rng.choice([1.0, -1.0], size=max(corners, 1))
+        return cls(tuple(turns.tolist()), bend, (hills[0], hills[1]))
+
+
+def road(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     """Return a drive through hilly streets: 3 to 12 m/s, a right-angled corner every 20 s, slow in the corners."""
     reach_s = duration_s + _ROAD_LEAD_OUT_S
     knots, control_t_s = _knots(0.8, reach_s)
-    trajectory = RoadTrajectory(VectorSpline(knots, _road_positions(control_t_s)))
+    streets = _Streets() if drawn is None else _Streets.drawn(drawn, int(control_t_s[-1] / _CORNER_EVERY_S) + 1)
+    trajectory = RoadTrajectory(VectorSpline(knots, _road_positions(control_t_s, streets)))
     fine_t_s = np.arange(0.0, reach_s, 0.02)
     travelled_m = np.cumsum(0.02 * np.linalg.norm(trajectory.position.at(fine_t_s, 1), axis=1))
     even_m = np.arange(travelled_m[0], travelled_m[-1], _ROAD_POSE_SPACING_M)
     path = trajectory.at(np.interp(even_m, travelled_m, fine_t_s)).T_world_imu
-    return Scene(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, np.random.default_rng(_WORLD_SEED)))
+    return Scene(trajectory, world.roadside(path, _ROAD_LANDMARKS_PER_POSE, _landmark_rng(drawn)))
 
 
-def _road_positions(t_s: Array) -> Array:
+def _road_positions(t_s: Array, streets: _Streets) -> Array:
     """Return positions (N, 3) along the road, from a speed, a turn rate and a slope given as functions of time."""
     dt_s = 0.02
     fine_s = np.arange(t_s[0], t_s[-1] + dt_s, dt_s)
     speed_mps = 7.5 + 4.5 * np.cos(2.0 * np.pi * fine_s / _CORNER_EVERY_S)
-    turn_radps = 0.04 * np.sin(2.0 * np.pi * fine_s / 9.0)
+    turn_radps = 0.04 * np.sin(2.0 * np.pi * fine_s / 9.0 + streets.bend_phase)
     corners_s = np.arange(0.5 * _CORNER_EVERY_S, t_s[-1], _CORNER_EVERY_S)
     for i, corner_s in enumerate(corners_s):
         # The integral of this bell is a right angle.
         bell = np.exp(-(((fine_s - corner_s) / 2.2) ** 2)) / (2.2 * np.sqrt(np.pi))
-        turn_radps += _CORNER_TURNS[i % len(_CORNER_TURNS)] * 0.5 * np.pi * bell
+        turn_radps += streets.corner_turns[i % len(streets.corner_turns)] * 0.5 * np.pi * bell
     heading = dt_s * np.cumsum(turn_radps)
     travelled_m = dt_s * np.cumsum(speed_mps)
     x = dt_s * np.cumsum(speed_mps * np.cos(heading))
     y = dt_s * np.cumsum(speed_mps * np.sin(heading))
-    z = 2.0 * np.sin(2.0 * np.pi * travelled_m / 180.0) + 0.4 * np.sin(2.0 * np.pi * travelled_m / 47.0)
+    long, short = streets.hill_phases
+    z = 2.0 * np.sin(2.0 * np.pi * travelled_m / 180.0 + long) + 0.4 * np.sin(2.0 * np.pi * travelled_m / 47.0 + short)
     return np.stack([np.interp(t_s, fine_s, axis) for axis in (x, y, z)], axis=-1)
 
 
-def hall(duration_s: float) -> Scene:
+def hall(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     """Return a flight of about 1 m/s through a hall of 10 x 10 x 4.5 m, turning about and shaken on all axes."""
     knots, t_s = _knots(0.2, duration_s)
+    # Phases (rad) of the way along x, y and z, and of yaw, pitch and roll.
+    at, turned = ((0.0, 1.0, 0.5), (0.0, 0.0, 0.7)) if drawn is None else drawn.uniform(0.0, 2.0 * np.pi, (2, 3))
     position = np.stack(
         [
-            2.0 * np.sin(0.45 * t_s) + 0.04 * np.sin(2.9 * t_s),
-            1.8 * np.sin(0.60 * t_s + 1.0) + 0.04 * np.sin(3.3 * t_s),
-            2.1 + 0.6 * np.sin(0.80 * t_s + 0.5) + 0.03 * np.sin(3.7 * t_s),
+            2.0 * np.sin(0.45 * t_s + at[0]) + 0.04 * np.sin(2.9 * t_s),
+            1.8 * np.sin(0.60 * t_s + at[1]) + 0.04 * np.sin(3.3 * t_s),
+            2.1 + 0.6 * np.sin(0.80 * t_s + at[2]) + 0.03 * np.sin(3.7 * t_s),
         ],
         axis=-1,
     )
-    yaw = 0.25 * t_s + 0.4 * np.sin(0.7 * t_s)
-    pitch, roll = 0.25 * np.sin(1.1 * t_s), 0.2 * np.sin(1.4 * t_s + 0.7)
+    yaw = 0.25 * t_s + 0.4 * np.sin(0.7 * t_s + turned[0])
+    pitch, roll = 0.25 * np.sin(1.1 * t_s + turned[1]), 0.2 * np.sin(1.4 * t_s + turned[2])
     zero = np.zeros_like(t_s)
     tilt = so3_exp(np.stack([zero, pitch, zero], axis=-1)) @ so3_exp(np.stack([roll, zero, zero], axis=-1))
     rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
     trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
-    points = world.room(_HALL_LOWER_M, _HALL_UPPER_M, _HALL_LANDMARKS, np.random.default_rng(_WORLD_SEED))
-    return Scene(trajectory, points)
+    return Scene(trajectory, world.room(_HALL_LOWER_M, _HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
+
+
+def _landmark_rng(drawn: np.random.Generator | None) -> np.random.Generator:
+    """Return the stream that landmarks come from: always the same one where the scene is not drawn."""
+    return np.random.default_rng(_WORLD_SEED) if drawn is None else drawn
 
 
 def _knots(step_s: float, reach_s: float) -> tuple[UniformKnots, Array]:
