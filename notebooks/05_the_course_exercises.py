@@ -396,8 +396,8 @@ off_m = np.linalg.norm(mine[-1][:3, 3] - sequence.truth.T_world_imu[FRAMES - 1, 
 print(f"at the end your filter states {1e3 * sigma_m:.1f} mm and is off by {1e3 * off_m:.0f} mm")
 
 # %% [markdown]
-# Before you believe the trajectory, look at **NEES pose**: the squared error over the covariance that is stated, 1 for a
-# filter that knows itself. This one uses every measurement twice, for the map and then, as if the map were exact, for
+# Before you believe the trajectory, look at **NEES pose**: the squared error over the covariance that is stated, 1 for
+# a filter that knows itself. This one uses every measurement twice, for the map and then, as if the map were exact, for
 # the pose. Its covariance collapses, and from then on it listens to nobody.
 #
 # **What to do about it**, one step at a time, is the ladder of [notebook 3](03_why_the_smoother_wins.ipynb): let the
