@@ -30,6 +30,7 @@ QUICK = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "
         ("compare", "--max-frames", "1"),
         ("compare", "--max-frames", "many"),
         ("compare", "--seed", "-1"),
+        ("compare", "drive", "--workers", "100000"),
         ("compare", "--estimators", ","),
         ("compare", "drive", "flight", "--truth", "gt.tum"),
         ("compare", "drive", "--keep", "no-such-fault"),

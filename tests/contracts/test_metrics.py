@@ -50,6 +50,7 @@ ADDED = {
         "efficiency_percent",
         "bound_position_m",
         "bound_rotation_deg",
+        "error_over_bound",
         *(f"{kind}_{block}" for kind in ("excess", "claimed") for block in _BLOCKS),
     ],
     "peak_rss_mb": ["frame_cpu_ms_mean"],

@@ -7,6 +7,7 @@ import pytest
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp, se3_inverse
+from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
 from toolkit.metrics._shared.cramer_rao import efficient
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -123,20 +124,54 @@ def test_without_a_request_it_is_not_computed_and_says_how(sequence, make_run):
     ("lacking", "why"),
     [
         ("truth", "no ground truth"),
-        ("prior", "drawn about the truth"),
         ("bias", "lacks bias"),
         ("stamps", "every frame"),
+        ("exact", "the truth is not exact"),
     ],
 )
-def test_a_recording_that_has_no_bound_says_why(make_run, lacking, why):
+def test_without_an_exact_truth_the_bound_is_what_the_model_claims_and_says_why(make_run, lacking, why):
     sequence = simulate(SHORT["drive"], 0)
     run, truth = with_error(sequence, make_run, np.zeros(6)), sequence.truth
+    shaken = truth.T_world_imu.copy()
+    shaken[:, :3, 3] += 0.05 * np.random.default_rng(0).standard_normal((len(shaken), 3))
     without = {
-        "truth": {"truth": None},
-        "prior": {"prior": None},
-        "bias": {"truth": replace(truth, bias=None)},
-        "stamps": {"truth": replace(truth, t_ns=truth.t_ns + 1000)},
+        "truth": None,
+        "bias": replace(truth, bias=None),
+        "stamps": replace(truth, t_ns=truth.t_ns + 1000),
+        "exact": replace(truth, T_world_imu=shaken),
     }
-    values, notes = scores(run, replace(sequence, **without[lacking]))
-    assert set(values.values()) == {None}
+    exact, _ = scores(run, sequence)
+    values, notes = scores(run, replace(sequence, truth=without[lacking]))
+    assert values["excess_variance"] is None
     assert why in notes["excess_variance"]
+    assert why in notes["bound_position_m"]
+    # The start of this run is drawn; what the model claims has the start from the measurements, which is the gauge.
+    assert 0.0 < values["bound_position_m"] < 1.1 * exact["bound_position_m"]
+    assert (values["error_over_bound"] is None) == (lacking == "truth")
+
+
+@pytest.mark.parametrize("name", ["drive", "flight"])
+def test_a_full_smoother_attains_and_claims_the_bound_from_a_measured_start(run_estimator, name):
+    """What a simulation without its drawn prior is, and a recording whose truth has every state."""
+    sequence = replace(simulate(SHORT[name], 1), prior=None)
+    values, _ = scores(run_estimator("batch", sequence, start_from_measurements(sequence)), sequence, "final")
+    assert values["excess_variance"] < 0.05
+    assert values["claimed_variance"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_full_smoother_claims_the_models_bound_where_there_is_no_truth(run_estimator):
+    sequence = replace(simulate(SHORT["drive"], 1), prior=None, truth=None)
+    run = run_estimator("batch", sequence, start_from_measurements(sequence))
+    values, notes = scores(run, sequence, "final")
+    # Two in a thousand sightings are cut from batch's last solve.
+    assert values["claimed_variance"] == pytest.approx(1.0, abs=0.02)
+    assert "linearised at its own answer" in notes["claimed_variance"]
+
+
+def test_an_estimate_without_every_state_has_no_bound_to_be_held_against(make_run):
+    sequence = replace(simulate(SHORT["flight"], 0), truth=None)
+    poses = np.broadcast_to(np.eye(4), (sequence.frame_count, 4, 4))
+    trajectory = Trajectory(sequence.frames_t_ns, poses)
+    values, notes = scores(make_run(sequence.frames_t_ns, poses, causal=trajectory, final=trajectory), sequence)
+    assert set(values.values()) == {None}
+    assert notes["bound_position_m"] == "the estimate lacks velocity or biases"

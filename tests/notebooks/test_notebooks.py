@@ -31,8 +31,8 @@ def execution() -> ModuleType:
     return module
 
 
-def test_there_are_four_notebooks() -> None:
-    assert [source.stem[:2] for source in SOURCES] == ["01", "02", "03", "04"]
+def test_there_are_five_notebooks() -> None:
+    assert [source.stem[:2] for source in SOURCES] == ["01", "02", "03", "04", "05"]
 
 
 @each

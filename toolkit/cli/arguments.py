@@ -1,6 +1,7 @@
 """What the subcommands share: the parser, the kinds of arguments and the exit statuses."""
 
 import argparse
+import math
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
     from toolkit.gate.trajectory_check import Truths
     from toolkit.settings import Settings
+
+# Each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
+MOST_WORKERS = 1024
 
 _EXIT_STATUSES = """\
 exit status:
@@ -121,8 +125,8 @@ def truths_given(given: Iterable[str]) -> "Truths":
     return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})
 
 
-def at_least(least: int) -> Callable[[str], int]:
-    """Return a parser of whole numbers that are no smaller than ``least``."""
+def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
+    """Return a parser of whole numbers that are no smaller than ``least`` and no larger than ``most``."""
 
     def whole_number(text: str) -> int:
         try:
@@ -131,6 +135,8 @@ def at_least(least: int) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(f"expected a whole number, not {text!r}") from None
         if value < least:
             raise argparse.ArgumentTypeError(f"expected at least {least}, not {value}")
+        if value > most:
+            raise argparse.ArgumentTypeError(f"expected at most {most}, not {value}")
         return value
 
     return whole_number
@@ -197,7 +203,7 @@ def settings_asked(options: argparse.Namespace) -> "Settings":
 
 def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:
     """Add the number of processes; None stands for one a CPU."""
-    parser.add_argument("--workers", metavar="N", type=at_least(1), help=f"{what} (default: one a CPU)")
+    parser.add_argument("--workers", metavar="N", type=at_least(1, MOST_WORKERS), help=f"{what} (default: one a CPU)")
 
 
 def add_tracks_argument(parser: argparse.ArgumentParser) -> None:

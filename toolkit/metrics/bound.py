@@ -4,6 +4,9 @@ Van Trees, "Detection, estimation and modulation theory", part I (1968), section
 are had is in :mod:`toolkit.metrics._shared.cramer_rao`. The error of an unbiased estimator is that of the efficient one
 on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P and that of
 d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
+
+A recording without an exact truth has the bound that the model claims, linearised at the run's own last answer. The
+error over it is then a test of the model: where both are honest, it is about 1.
 """
 
 from dataclasses import dataclass
@@ -11,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics._shared.consistency import normalised, stated_errors
-from toolkit.metrics._shared.cramer_rao import efficient
+from toolkit.metrics._shared.consistency import body_errors, normalised, stated_errors
+from toolkit.metrics._shared.cramer_rao import claimed_bound, efficient
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 from toolkit.metrics._shared.state_errors import NO_SUCH_BLOCK, state_errors
+from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, POSITION, ROTATION, Layout
 
 ORDER = 85
@@ -40,6 +44,7 @@ METRICS = (
     ),
     _metric("bound_position_m", "least RMS position error of any unbiased estimator (m)", ("bound", "pos"), 4, "m"),
     _metric("bound_rotation_deg", "the same of the rotation (deg)", ("bound", "rot"), 3, "deg"),
+    _metric("error_over_bound", "RMS position error over bound_position_m", ("error", "/bound"), 2),
     *(
         _metric(
             f"excess_{key}",
@@ -85,21 +90,68 @@ def against_bound(evaluation: Evaluation) -> AgainstBound:
 
 
 def score(evaluation: Evaluation) -> Scores:
-    """Score an output against the bound."""
-    found = against_bound(evaluation)
+    """Score an output against the bound, or against the one the model claims where there is no exact truth."""
+    try:
+        found = against_bound(evaluation)
+    except Unavailable as why:
+        return _against_claimed_bound(evaluation, str(why))
     position_m = _rms(found.bound, POSITION)
     lost_m = float(np.sqrt(np.square(found.excess[:, POSITION]).sum(axis=1).mean()))
-    values: dict[str, float | None] = {
-        "efficiency_percent": 100.0 * position_m / float(np.hypot(position_m, lost_m)),
-        "bound_position_m": position_m,
-        "bound_rotation_deg": float(np.degrees(_rms(found.bound, ROTATION))),
-    }
+    values: dict[str, float | None] = {"efficiency_percent": 100.0 * position_m / float(np.hypot(position_m, lost_m))}
+    values |= _sizes(found.bound) | {"error_over_bound": _rms_error_m(evaluation) / position_m}
     blocks = _blocks(found.layout)
-    for key, block in blocks.items():
-        values[f"excess_{key}"] = None if block is None else _excess(found.excess, found.bound, block)
-    for key, block in blocks.items():
-        values[f"claimed_{key}"] = None if block is None else _claimed(found.stated, found.bound, block)
-    return Scores(values, {key: NO_SUCH_BLOCK for key, value in values.items() if value is None})
+    per_block: dict[str, float | None] = {
+        f"excess_{key}": None if block is None else _excess(found.excess, found.bound, block)
+        for key, block in blocks.items()
+    } | _claims(found.stated, found.bound, blocks)
+    return _in_order(values | per_block, {key: NO_SUCH_BLOCK for key, value in per_block.items() if value is None})
+
+
+def _in_order(values: dict[str, float | None], notes: dict[str, str]) -> Scores:
+    return Scores({metric.key: values[metric.key] for metric in METRICS}, notes)
+
+
+def _against_claimed_bound(evaluation: Evaluation, why: str) -> Scores:
+    """Score against the bound at the run's own last answer; ``why`` there is no other."""
+    run, sequence, estimate = evaluation.run, evaluation.sequence, evaluation.estimate
+    bound = claimed_bound(sequence, run.final or run.causal or estimate, evaluation.output)
+    lost = ["efficiency_percent", *(f"excess_{key}" for key in _BLOCKS)]
+    values: dict[str, float | None] = dict.fromkeys(lost) | _sizes(bound)
+    notes = dict.fromkeys(lost, why)
+    try:
+        values["error_over_bound"] = _rms_error_m(evaluation) / _rms(bound, POSITION)
+    except Unavailable as reason:
+        values["error_over_bound"], notes["error_over_bound"] = None, str(reason)
+    blocks = _blocks(motion_model(sequence.noise, sequence.gravity_world).layout)
+    values |= _claims(_stated(evaluation, bound.shape), bound, blocks)
+    notes |= {f"claimed_{key}": NO_SUCH_BLOCK for key, block in blocks.items() if block is None}
+    return _in_order(values, notes).remarked(values.keys() - notes.keys(), f"linearised at its own answer: {why}")
+
+
+def _stated(evaluation: Evaluation, shape: tuple[int, ...]) -> Array:
+    """Return the covariances (K, d, d) that an output states at the frames. Raises Unavailable where it has none."""
+    estimate, frames_t_ns = evaluation.estimate, evaluation.sequence.frames_t_ns
+    if estimate.cov is None or estimate.cov.shape[1:] != shape[1:]:
+        raise Unavailable("the estimator states no covariance of the whole state")
+    if not np.array_equal(estimate.t_ns, frames_t_ns):
+        raise Unavailable("the estimate lacks the state of a frame")
+    return estimate.cov
+
+
+def _rms_error_m(evaluation: Evaluation) -> float:
+    """Return the RMS distance from the true positions, as the NEES takes it: placed by the first pose if need be."""
+    return float(np.sqrt(np.square(body_errors(evaluation).distance_m).mean()))
+
+
+def _sizes(bound: Array) -> dict[str, float | None]:
+    return {
+        "bound_position_m": _rms(bound, POSITION),
+        "bound_rotation_deg": float(np.degrees(_rms(bound, ROTATION))),
+    }
+
+
+def _claims(stated: Array, bound: Array, blocks: dict[str, slice | None]) -> dict[str, float | None]:
+    return {f"claimed_{key}": None if one is None else _claimed(stated, bound, one) for key, one in blocks.items()}
 
 
 def _blocks(layout: Layout) -> dict[str, slice | None]:

@@ -10,6 +10,9 @@ nonlinear filtering"), the final one by eliminating the whole graph.
 Beside the bound stands the efficient estimate, one linear step from the truth on the same measurements. The error of
 any unbiased estimator is that of the efficient one plus a part that is not correlated with it: what is left after the
 efficient error is taken off is the estimator's own loss, without the draw of noise that both share.
+
+That needs a truth with every state, exact: the motion measured between its states must be as far from them as the
+stated noise says. Where a recording has none, the bound that the model claims is had at an estimate of the states.
 """
 
 from dataclasses import dataclass
@@ -18,8 +21,10 @@ from functools import lru_cache
 import gtsam
 import numpy as np
 
-from toolkit.estimate import Output
+from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
+from toolkit.initialization import start_from_measurements
+from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.consistency import starts_in_the_truths_world
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.models import stereo
@@ -28,19 +33,20 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief, Layout
 from toolkit.models.state_covariances import state_covs
-from toolkit.sequence import Packet, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig
 
 # A sighting whose residual at the truth is this improbable is a mismatch and informs nobody.
 _MISMATCH_PROBABILITY = 1e-6
 _POINT_ITERATIONS = 5
+# The motion's chi-square at an exact truth, over its degrees of freedom: 1, and 0.85 to 1.15 for 20 steps of an IMU.
+_EXACT = (0.8, 1.25)
 
 
 @dataclass(frozen=True, eq=False)
 class Efficient:
     """The bound at every frame (K, d, d), and the errors (K, d) of the efficient estimate.
 
-    In the order and on the side of an Estimate's covariance; an error is what takes the estimate to the truth.
-    """
+    In the order and on the side of an Estimate's covariance; an error is what takes the estimate to the truth."""
 
     layout: Layout
     covs: Array
@@ -51,9 +57,23 @@ class Efficient:
 def efficient(sequence: Sequence, output: Output) -> Efficient:
     """Return the efficient estimate of a sequence: from what is known at each frame, or from all of it.
 
-    Raises Unavailable where the truth lacks what the state has, or the sequence has no start drawn about it.
+    It starts as the estimators do: with the prior that was drawn for a simulation, or with the start from another
+    sequence's measurements, placed at the first pose. Raises Unavailable where the truth lacks what the state has, or
+    is not exact.
     """
-    problem = _problem(sequence)
+    return _solved(_problem_at_truth(sequence), output)
+
+
+@lru_cache(maxsize=2)
+def claimed_bound(sequence: Sequence, at: Trajectory, output: Output) -> Array:
+    """Return the bound (K, d, d) that the model claims, linearised at estimated states.
+
+    Raises Unavailable where a frame has no estimate of the whole state.
+    """
+    return _solved(_problem_at_estimate(sequence, at), output).covs
+
+
+def _solved(problem: "_Problem", output: Output) -> Efficient:
     return _causal(problem) if output == "causal" else _final(problem)
 
 
@@ -75,12 +95,10 @@ class _Problem:
 
 
 @lru_cache(maxsize=1)
-def _problem(sequence: Sequence) -> _Problem:
-    truth, prior = sequence.truth, sequence.prior
+def _problem_at_truth(sequence: Sequence) -> _Problem:
+    truth = sequence.truth
     if truth is None:
         raise Unavailable("the sequence has no ground truth")
-    if prior is None or not starts_in_the_truths_world(sequence):
-        raise Unavailable("the bound needs a start that was drawn about the truth, as a simulation's")
     lacking = [name for name in ("v_world", "bias") if getattr(truth, name) is None]
     if lacking:
         raise Unavailable(f"the ground truth lacks {' and '.join(lacking)}")
@@ -88,12 +106,62 @@ def _problem(sequence: Sequence) -> _Problem:
     rows = np.minimum(np.searchsorted(truth.t_ns, sequence.frames_t_ns), truth.t_ns.size - 1)
     if not np.array_equal(truth.t_ns[rows], sequence.frames_t_ns):
         raise Unavailable("the bound needs a truth at every frame's stamp")
-    model, poses = motion_model(sequence.noise, sequence.gravity_world), truth.T_world_imu[rows]
-    start = model.initial_belief(prior)
-    each = zip(poses, truth.v_world[rows], truth.bias[rows], strict=True)
-    states = tuple(Belief(start.layout, *state, start.cov) for state in each)
+    states = truth.T_world_imu[rows], truth.v_world[rows], truth.bias[rows]
+    drawn = sequence.prior is not None and starts_in_the_truths_world(sequence)
+    problem = _problem(sequence, sequence.prior if drawn else None, *states)
+    ratio = _motion_chi_square(problem)
+    if not _EXACT[0] < ratio < _EXACT[1]:
+        raise Unavailable(
+            f"the truth is not exact: the measured motion is off it by {ratio:.2g} times the stated noise, squared"
+        )
+    return problem
+
+
+@lru_cache(maxsize=1)
+def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> _Problem:
+    rows = np.minimum(np.searchsorted(at.t_ns, sequence.frames_t_ns), len(at) - 1)
+    if len(at) == 0 or not np.array_equal(at.t_ns[rows], sequence.frames_t_ns):
+        raise Unavailable("the estimate lacks the state of a frame")
+    imu = sequence.motion_kind == "imu"
+    if at.bias is None or (imu and at.v_world is None):
+        raise Unavailable("the estimate lacks velocity or biases")
+    v_world = np.zeros((rows.size, 3)) if at.v_world is None else at.v_world[rows]
+    states = at.T_world_imu[rows], v_world, at.bias[rows]
+    if not all(np.isfinite(part).all() for part in states):
+        raise Unavailable("the estimate is not finite")
+    return _problem(sequence, None, *states)
+
+
+def _problem(sequence: Sequence, prior: Prior | None, poses: Array, v_world: Array, bias: Array) -> _Problem:
+    """Return the problem about states (K, 4, 4), (K, 3), (K, 6), from the given prior or the measured start."""
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    start = model.initial_belief(_measured_start(sequence, poses[0]) if prior is None else prior)
+    states = tuple(Belief(start.layout, *state, start.cov) for state in zip(poses, v_world, bias, strict=True))
     packets, track_ids, points = _without_mismatches(tuple(sequence.packets()), poses, sequence.rig)
     return _Problem(sequence.rig, model, start, states, packets, track_ids, points)
+
+
+def _measured_start(sequence: Sequence, first_pose: Array) -> Prior:
+    """Return the state that estimators start from by default, placed at the first pose (4, 4) as their outputs are.
+
+    With an IMU its tilt is measured and stays; without one it is the whole pose.
+    """
+    start = start_from_measurements(sequence)
+    place = place_yaw if sequence.motion_kind == "imu" else place_pose
+    T_world_imu = place(first_pose, start.T_world_imu).apply(start.T_world_imu[None])[0]
+    v_world = T_world_imu[:3, :3] @ start.T_world_imu[:3, :3].T @ start.v_world
+    return Prior(T_world_imu, v_world, start.bias, start.cov, start.source)
+
+
+def _motion_chi_square(problem: _Problem) -> float:
+    """Return the mean squared distance of the true steps from the measured motion, over its degrees of freedom."""
+    distances = []
+    for before, packet in zip(problem.states, problem.packets[1:], strict=False):
+        assert packet.motion is not None
+        prediction = problem.model.integrate(packet.motion, before.bias).predict(before)
+        error = offset(before.predicted(prediction), problem.states[packet.index])
+        distances.append(float(error @ np.linalg.solve(prediction.noise, error)) / error.size)
+    return float(np.mean(distances)) if distances else 1.0
 
 
 def _without_mismatches(
