@@ -27,7 +27,7 @@ RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landma
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, FixedLag(setup, setup.settings.window.lag_s))
+    return Thinned(setup, FixedLag(setup, setup.settings.window.seconds(setup.motion_kind)))
 
 
 class FixedLag:

@@ -31,7 +31,7 @@ RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration, of several; none
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, Smart(setup, setup.settings.window.lag_s))
+    return Thinned(setup, Smart(setup, setup.settings.window.seconds(setup.motion_kind)))
 
 
 class Smart:

@@ -89,12 +89,26 @@ POLICIES: Mapping[PolicyName, Outliers] = {
 }
 
 
+# Until it leaves the window or ends, a track does not correct: a longer window sees a point from further apart, and
+# carries the newest pose further by the measured motion alone. An IMU bears that for a second, a noisy twist does not.
+_LAG_WITH_IMU_S, _LAG_S = 1.2, 0.6
+
+
 class Window(Struct, frozen=True, forbid_unknown_fields=True):
     """How much of the past a windowed estimator keeps, filter or smoother."""
 
-    lag_s: Annotated[
-        float, Meta(gt=0.0, le=3600.0, description="window of the windowed filters and smoothers", extra={"unit": "s"})
-    ] = 0.6
+    lag_s: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=3600.0,
+                description="window of the windowed filters and smoothers",
+                extra={"unit": "s", "none": f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}"},
+            ),
+        ]
+        | None
+    ) = None
     most_states: Annotated[
         int, Meta(ge=2, le=10_000, description="states in the window at most; of more frames they are thinned evenly")
     ] = 30
@@ -102,12 +116,18 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
         int, Meta(ge=0, le=500, description="landmarks msckf-slam keeps in its state for as long as they are seen")
     ] = 50
 
-    def interval(self, since_ns: int) -> int:
+    def seconds(self, motion_kind: str) -> float:
+        """Return how long the window is for a kind of motion: "imu", "twist" or "none"."""
+        if self.lag_s is not None:
+            return self.lag_s
+        return _LAG_WITH_IMU_S if motion_kind == "imu" else _LAG_S
+
+    def interval(self, since_ns: int, motion_kind: str) -> int:
         """Return which interval of time an instant after the first frame is in; of each one frame has a state.
 
         They are as long as the window never holds more than its most.
         """
-        return int(since_ns * (self.most_states - 1) // round(self.lag_s * _NS_PER_S))
+        return int(since_ns * (self.most_states - 1) // round(self.seconds(motion_kind) * _NS_PER_S))
 
 
 class Noise(Struct, frozen=True, forbid_unknown_fields=True):

@@ -35,7 +35,8 @@ class SlidingWindowFilter:
         self._rig, self._at = setup.rig, linearisation
         self._outliers = setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._lag_ns, self._most_landmarks = round(setup.settings.window.lag_s * NS_PER_S), landmarks
+        window_s = setup.settings.window.seconds(setup.motion_kind)
+        self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = JointBelief(self._motion.initial_belief(setup.prior))
         self._tracks = WindowTracks()

@@ -21,7 +21,7 @@ class Thinned:
 
     def __init__(self, setup: Setup, estimator: Estimator) -> None:
         self._estimator = estimator
-        self._window = setup.settings.window
+        self._window, self._motion_kind = setup.settings.window, setup.motion_kind
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._prior = self._motion.initial_belief(setup.prior)
         self._kept_ns: list[int] = []
@@ -53,7 +53,7 @@ class Thinned:
         return replace(finished, trajectory=Trajectory.of(sorted([*states, *carried], key=lambda state: state.t_ns)))
 
     def _interval(self, t_ns: int) -> int:
-        return self._window.interval(t_ns - self._kept_ns[0])
+        return self._window.interval(t_ns - self._kept_ns[0], self._motion_kind)
 
     def _carried(self, state: Estimate, t_ns: int, motion: Motion) -> Estimate:
         answer = predicted(self._prior.at(state), self._motion, motion).estimate(t_ns)

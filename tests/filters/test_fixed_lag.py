@@ -181,7 +181,7 @@ def test_a_landmark_first_seen_far_too_far_begins_anew_before_it_is_linearised_b
 
 def log_and_point(sequence: Sequence, track_id: int) -> tuple[tuple[str, ...], Array]:
     """Return the log of fixed-lag and one of its landmarks (3,) m."""
-    estimator = FixedLag(setup_of(sequence), DEFAULTS.window.lag_s)
+    estimator = FixedLag(setup_of(sequence), DEFAULTS.window.seconds(sequence.motion_kind))
     for packet in sequence.packets():
         estimator.step(packet)
     finished = estimator.finish()

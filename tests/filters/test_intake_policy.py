@@ -9,10 +9,14 @@ from toolkit.geometry import se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import Observations, Sequence, is_held_out
 from toolkit.settings import DEFAULTS, Settings, Window
-from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, Scenario, simulate
 from toolkit.simulation.scenarios import noise_free
 
-LAG_S, RATE_HZ = DEFAULTS.window.lag_s, 10.0
+RATE_HZ = 10.0
+
+
+def default_lag_s(scenario: Scenario) -> float:
+    return DEFAULTS.window.seconds("imu" if scenario is DRIVE_IMU else "twist")
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +69,9 @@ def test_a_landmark_has_a_disparity_of_a_pixel_or_more(exact, run_estimator, nam
 @pytest.mark.parametrize("name", ["msckf", "msckf-fej"])
 def test_a_track_corrects_the_window_once_its_first_pose_is_older_than_the_lag(run_estimator, name, scenario):
     """Whatever moves the IMU, as in the smoothers; a pose adds three rows to a track."""
-    sequence = simulate(noise_free(replace(scenario, duration_s=LAG_S + 0.4)), 0)
-    poses = round(LAG_S * RATE_HZ) + 2
+    lag_s = default_lag_s(scenario)
+    sequence = simulate(noise_free(replace(scenario, duration_s=lag_s + 0.4)), 0)
+    poses = round(lag_s * RATE_HZ) + 2
     seen = sequence.observations
     at_first = seen.track_id[seen.frame == 0]
     longest = max(at_first[~is_held_out(at_first)], key=lambda i: int((seen.track_id == i).sum()))
@@ -85,5 +90,5 @@ def test_a_state_is_open_to_what_is_seen_within_the_lag(run_estimator, name):
     as_is = run_estimator(name, sequence).final.T_world_imu
     otherwise = run_estimator(name, replace(sequence, observations=replace(seen, uv_px=moved))).final.T_world_imu
     changed_poses = np.flatnonzero((as_is != otherwise).any(axis=(1, 2)))
-    within = changed - round(LAG_S * RATE_HZ)
+    within = changed - round(default_lag_s(DRIVE) * RATE_HZ)
     assert within - 1 <= changed_poses[0] <= within + 1

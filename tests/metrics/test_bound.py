@@ -9,6 +9,7 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
+from toolkit.metrics._shared import cramer_rao
 from toolkit.metrics._shared.cramer_rao import efficient
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
@@ -166,6 +167,20 @@ def test_a_full_smoother_claims_the_models_bound_where_there_is_no_truth(run_est
     # Two in a thousand sightings are cut from batch's last solve.
     assert values["claimed_variance"] == pytest.approx(1.0, abs=0.02)
     assert "linearised at its own answer" in notes["claimed_variance"]
+
+
+def test_measurements_that_do_not_determine_a_state_have_no_bound(sequence, make_run, monkeypatch):
+    """As GTSAM says it of a graph that an estimator which has lost its way leaves."""
+
+    def indeterminate(*_):
+        raise RuntimeError("Indeterminate linear system detected while working near variable x80")
+
+    monkeypatch.setattr(cramer_rao, "state_covs", indeterminate)
+    efficient.cache_clear()
+    run = with_error(sequence, make_run, np.zeros(6))
+    found = score_run(run, "final", sequence, ("bound",))
+    assert {found.values[key] for key in KEYS} == {None}
+    assert "do not determine every state" in found.notes["bound_position_m"]
 
 
 def test_an_estimate_without_every_state_has_no_bound_to_be_held_against(make_run):

@@ -8,7 +8,6 @@ from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Paired, paired
 from toolkit.experiment.units import OUTPUTS
-from toolkit.geometry import IntArray
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
@@ -68,19 +67,19 @@ def rules_line(comparison: Comparison) -> str:
     """Return the rules that estimators had in common: the window, whether its cap binds, the outlier policy."""
     settings, sequence = comparison.settings, comparison.sequence
     window = settings.window
-    left_out = _left_out(sequence.frames_t_ns, window)
+    left_out = _left_out(sequence, window)
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
     return (
-        f"window {window.lag_s:g} s, at most {window.most_states} states{thinned}; "
+        f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
         f"outliers: {outliers_in_words(settings.outliers)}"
     )
 
 
-def _left_out(frames_t_ns: IntArray, window: Window) -> int:
+def _left_out(sequence: Sequence, window: Window) -> int:
     """Return how many frames have no state in a window, for it would hold too many."""
     last, left_out = -1, 0
-    for since_ns in (frames_t_ns - frames_t_ns[:1]).tolist():
-        interval = window.interval(since_ns)
+    for since_ns in (sequence.frames_t_ns - sequence.frames_t_ns[:1]).tolist():
+        interval = window.interval(since_ns, sequence.motion_kind)
         left_out += interval == last
         last = interval
     return left_out

@@ -74,7 +74,10 @@ def claimed_bound(sequence: Sequence, at: Trajectory, output: Output) -> Array:
 
 
 def _solved(problem: "_Problem", output: Output) -> Efficient:
-    return _causal(problem) if output == "causal" else _final(problem)
+    try:
+        return _causal(problem) if output == "causal" else _final(problem)
+    except (np.linalg.LinAlgError, RuntimeError) as error:  # GTSAM's
+        raise Unavailable("the measurements do not determine every state, as it is linearised") from error
 
 
 @dataclass(frozen=True, eq=False)
