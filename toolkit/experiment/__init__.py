@@ -5,7 +5,19 @@ kept of it) -> pipeline -> comparison (what comes of it) -> statistics -> consis
 be right).
 """
 
-from toolkit.experiment.comparison import Comparison, Record, Row
-from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run, stores_of, workers_of
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from toolkit.experiment.comparison import Comparison, Record, Row
+    from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run, stores_of, workers_of
 
 __all__ = ["Comparison", "Plan", "Record", "Row", "comparisons", "prepared_cases", "run", "stores_of", "workers_of"]
+_OF_COMPARISON = ("Comparison", "Record", "Row")
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is: a process that is started for one module takes a third of the time."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{'comparison' if name in _OF_COMPARISON else 'pipeline'}"), name)
