@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -33,10 +34,13 @@ def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
 
 
 @pytest.fixture(scope="session")
-def _short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _short_run(
+    tmp_path_factory: pytest.TempPathFactory, without_pixels: Callable[[], AbstractContextManager[None]]
+) -> Path:
     directory = tmp_path_factory.mktemp("short") / "run"
-    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10")
-    assert main([*words, "--out", str(directory)]) == 0
+    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+    with without_pixels():
+        assert main([*words, "--out", str(directory)]) == 0
     return directory
 
 
