@@ -19,8 +19,11 @@ def _audited_once(audited_once: None) -> None:
 
 
 @pytest.fixture
-def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
-    """Return a function that runs ``vislam`` with the given words and returns its exit status."""
+def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_process: None) -> Vislam:
+    """Return a function that runs ``vislam`` with the given words and returns its exit status.
+
+    All is done in this process but where the words ask for more.
+    """
     monkeypatch.chdir(tmp_path)
 
     def run(*words: str) -> int:
