@@ -60,6 +60,7 @@ def test_a_sequence_and_its_name_give_the_same(result: Result) -> None:
     assert ate(again) == ate(result)
 
 
+@pytest.mark.usefixtures("unrendered")
 @pytest.mark.parametrize("kind", [str, Path])
 def test_a_recording_and_its_truth_are_paths_or_strings(
     tmp_path: Path, result: Result, kind: Callable[[Path], str | Path]
