@@ -42,6 +42,18 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# What takes longest comes first, or one worker would still be at it when all others have ended. What stays together
+# here has its fixtures made once: it is from the end that another worker takes tests.
+_LONGEST = ("docs", "notebooks", "test_figures_on_real_data.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests that take longest first."""
+    places = {name: place for place, name in enumerate(_LONGEST)}
+    tests = PROJECT / "tests"
+    items.sort(key=lambda item: places.get(item.path.relative_to(tests).parts[0], len(places)))
+
+
 @pytest.fixture
 def starts_group() -> Iterator[Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]]:
     """Start Python, with arguments, a directory and variables, in a group of processes that the test's end ends."""

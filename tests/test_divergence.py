@@ -21,15 +21,23 @@ SCENARIOS = {"drive": DRIVE, "drive-imu": DRIVE_IMU, "flight": FLIGHT}
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS)
 
 
+# A recording has 100 or 200 frames; that a smoother works shows in fewer.
+FRAMES = {"batch": 60}
+
+
 @cache
 def recording(scenario: str, seed: int = 0) -> Sequence:
     return simulate(replace(SCENARIOS[scenario], duration_s=10.0), seed)
 
 
+def seen_by(name: str, scenario: str) -> Sequence:
+    return recording(scenario).truncated(FRAMES.get(name, 10**6))
+
+
 @pytest.fixture(scope="module")
 def run_on(run_estimator: Callable[..., Run]) -> Callable[[str, str], Run]:
     """Return a function that runs an estimator once on a scenario."""
-    return cache(lambda name, scenario: run_estimator(name, recording(scenario)))
+    return cache(lambda name, scenario: run_estimator(name, seen_by(name, scenario)))
 
 
 def jumping(trajectory: Trajectory, share: float, jump: Array) -> Trajectory:
@@ -45,7 +53,7 @@ def jumping(trajectory: Trajectory, share: float, jump: Array) -> Trajectory:
 @every_scenario
 @pytest.mark.parametrize("name", ["dead-reckoning", "ekf", "batch"])
 def test_a_run_that_works_contradicts_nothing(name, scenario, run_on):
-    assert contradiction(run_on(name, scenario).final, recording(scenario)) is None
+    assert contradiction(run_on(name, scenario).final, seen_by(name, scenario)) is None
 
 
 @every_scenario
@@ -103,11 +111,12 @@ def test_a_trajectory_without_a_step_contradicts_nothing(count):
     assert contradiction(Trajectory(truth.t_ns[:count], truth.T_world_imu[:count]), sequence) is None
 
 
-@pytest.mark.parametrize(("name", "status"), [("seed-ekf", "diverged"), ("ekf", "ok"), ("dead-reckoning", "ok")])
-def test_on_03_the_reports_filter_is_seen_to_diverge(name, status, real: Callable[[str], Path], run_estimator):
+def test_on_03_the_reports_filter_is_seen_to_diverge_and_no_other(real: Callable[[str], Path], run_estimator):
+    """One test, for workers do not share what takes longest: the recording and its audit."""
     sequence = audit(load_sequence(str(real("ucsd/03.npz")))).sequence
-    run = run_estimator(name, sequence, start_from_measurements(sequence))
-    assert run.status == status, run.log
+    prior = start_from_measurements(sequence)
+    runs = [run_estimator(name, sequence, prior) for name in ("seed-ekf", "ekf", "dead-reckoning")]
+    assert [run.status for run in runs] == ["diverged", "ok", "ok"], [run.log for run in runs]
 
 
 def gated(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, Array]:

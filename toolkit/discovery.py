@@ -8,9 +8,12 @@ import importlib
 import importlib.machinery
 import importlib.util
 import pkgutil
+import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from functools import lru_cache
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -72,6 +75,25 @@ def announced(group: str, error: type[VislamError] = VislamError) -> list[FoundM
             raise error(f"the entry point {group} names {package}, which is not a package here")
         found += modules_in(package, spec.submodule_search_locations)
     return found
+
+
+def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
+    """Return what installed distributions announce under a group.
+
+    Their files are read once for as long as Python's path and its folders, where they are installed, stay unchanged.
+    """
+    return _entry_points(group, tuple((folder, _changed_ns(Path(folder))) for folder in sys.path))
+
+
+@lru_cache(maxsize=8)
+def _entry_points(group: str, _path: tuple[tuple[str, int], ...]) -> tuple[metadata.EntryPoint, ...]:
+    return tuple(metadata.entry_points(group=group))
+
+
+def _changed_ns(path: Path) -> int:
+    with suppress(OSError):
+        return path.stat().st_mtime_ns
+    return 0
 
 
 def _spec(package: str) -> importlib.machinery.ModuleSpec | None:

@@ -8,13 +8,13 @@ that are rare in a filter that works and common in one that has diverged.
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.measured_motion import Motion
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import Sequence
@@ -40,7 +40,7 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     if not np.isfinite(trajectory.T_world_imu).all():
         first = int(np.flatnonzero(~np.isfinite(trajectory.T_world_imu).all(axis=(1, 2)))[0])
         return f"its poses are not numbers from estimate {first} on"
-    far = np.fromiter((d > FAR_STEP for d in _step_distances(trajectory, sequence)), dtype=bool)
+    far = _step_distances(trajectory, sequence) > FAR_STEP
     if far.size == 0 or far.mean() <= MOST_FAR_STEPS:
         return None
     return (
@@ -67,29 +67,43 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Iterator[float]:
-    """Yield the squared Mahalanobis distance of each step between neighbouring frames from the measured motion."""
+class _Step(NamedTuple):
+    """A step between neighbouring frames: its rows, and what the measured motion makes of the state at its start."""
+
+    start: int
+    end: int
+    T_world_imu: Array
+    transition: Array
+    noise: Array
+
+
+def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
+    """Return the squared Mahalanobis distances (S,) of steps between neighbouring frames from the measured motion."""
+    steps = list(_steps(trajectory, sequence))
+    if not steps:
+        return np.empty(0)
+    start, end, T_world_imu, transition, noise = map(np.array, zip(*steps, strict=True))
+    # In the tangent of the step's end.
+    deviation = se3_log(se3_inverse(T_world_imu) @ trajectory.T_world_imu[end])
+    cov = _LUMP_FRAMES * noise
+    if trajectory.cov is not None:
+        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], transition, noise)
+    return np.asarray((deviation * np.linalg.solve(cov, deviation[..., None])[..., 0]).sum(axis=1))
+
+
+def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
     model = motion_model(sequence.noise, sequence.gravity_world)
     row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
     for before, packet in pairwise(sequence.packets()):
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
         if start is None or end is None or packet.motion is None:
             continue
-        deviation, cov = _deviation(trajectory, start, end, packet.motion, model)
-        yield float(deviation @ np.linalg.solve(cov, deviation))
-
-
-def _deviation(trajectory: Trajectory, start: int, end: int, motion: Motion, model: MotionModel) -> tuple[Array, Array]:
-    """Return the step's deviation (6,) from the measured motion, in the tangent of its end, and its covariance."""
-    belief = _belief_at(trajectory, start, model)
-    prediction = model.integrate(motion, belief.bias).predict(belief)
-    noise = prediction.noise[POSE, POSE]
-    if model.layout.velocity is not None:
-        noise = noise + np.diag(_slack(trajectory, float(motion.dt_s.sum())))
-    cov = _LUMP_FRAMES * noise
-    if trajectory.cov is not None:
-        cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], prediction.transition[POSE], noise)
-    return se3_log(se3_inverse(prediction.T_world_imu) @ trajectory.T_world_imu[end]), cov
+        belief = _belief_at(trajectory, start, model)
+        prediction = model.integrate(packet.motion, belief.bias).predict(belief)
+        noise = prediction.noise[POSE, POSE]
+        if model.layout.velocity is not None:
+            noise = noise + np.diag(_slack(trajectory, float(packet.motion.dt_s.sum())))
+        yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
 
 
 def _belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
@@ -109,14 +123,13 @@ def _slack(trajectory: Trajectory, dt_s: float) -> Array:
 
 
 def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Array) -> Array:
-    """Return the pose covariance (6, 6) that the correction at the end of a step took away, where it took any.
+    """Return the pose covariance (S, 6, 6) that the correction at the end of each step took away, where it took any.
 
-    ``transition`` (6, d) is what of the state's error reaches the pose, ``noise`` (6, 6) what the step adds to it.
+    ``transition`` (S, 6, d) is what of the state's error reaches the pose, ``noise`` (S, 6, 6) what a step adds to it.
     """
-    if cov_start.shape[0] != transition.shape[1]:
-        return np.zeros((6, 6))
-    taken = transition @ cov_start @ transition.T + noise - cov_end[:6, :6]
-    if not np.isfinite(taken).all():
-        return np.zeros((6, 6))
+    if cov_start.shape[-1] != transition.shape[-1]:
+        return np.zeros_like(noise)
+    taken = transition @ cov_start @ np.swapaxes(transition, 1, 2) + noise - cov_end[:, :6, :6]
+    taken[~np.isfinite(taken).all(axis=(1, 2))] = 0.0
     size, axes = np.linalg.eigh(taken)
-    return np.asarray((axes * np.maximum(size, 0.0)) @ axes.T)
+    return np.asarray((axes * np.maximum(size, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))

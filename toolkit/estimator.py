@@ -12,6 +12,8 @@ import ast
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import Protocol, cast
 
 from toolkit.discovery import FoundModule, MissingDependency, announced
@@ -102,7 +104,8 @@ class EstimatorEntry:
                 raise EstimatorError(f"estimator {self.name} has no option {option}; it has {known}")
 
     def _tree(self) -> ast.Module:
-        return ast.parse(self.found.path.read_text(encoding="utf-8"))
+        file = self.found.path.stat()
+        return _parsed(self.found.path, (file.st_mtime_ns, file.st_size))
 
     def _constants(self) -> dict[str, object]:
         """Return the module's top-level assignments of literals, alone or in tuples, by name."""
@@ -138,6 +141,12 @@ def discover() -> dict[str, EstimatorEntry]:
     """Find every estimator of every announced package, by name, importing none of them."""
     found = {one.name: EstimatorEntry(one.name, one) for one in announced(ENTRY_POINT_GROUP, EstimatorError)}
     return dict(sorted(found.items()))
+
+
+@lru_cache(maxsize=64)
+def _parsed(path: Path, _state: tuple[int, int]) -> ast.Module:
+    """Return a module's syntax, which is read once in each state of the file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def _paired(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -18,8 +19,11 @@ def _audited_once(audited_once: None) -> None:
 
 
 @pytest.fixture
-def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
-    """Return a function that runs ``vislam`` with the given words and returns its exit status."""
+def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_process: None) -> Vislam:
+    """Return a function that runs ``vislam`` with the given words and returns its exit status.
+
+    All is done in this process but where the words ask for more.
+    """
     monkeypatch.chdir(tmp_path)
 
     def run(*words: str) -> int:
@@ -33,10 +37,13 @@ def vislam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Vislam:
 
 
 @pytest.fixture(scope="session")
-def _short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _short_run(
+    tmp_path_factory: pytest.TempPathFactory, without_pixels: Callable[[], AbstractContextManager[None]]
+) -> Path:
     directory = tmp_path_factory.mktemp("short") / "run"
-    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10")
-    assert main([*words, "--out", str(directory)]) == 0
+    words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+    with without_pixels():
+        assert main([*words, "--out", str(directory)]) == 0
     return directory
 
 

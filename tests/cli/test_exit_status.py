@@ -45,6 +45,7 @@ def test_a_wrong_command_line_is_2(vislam: Vislam, one_line: OneLine, words: tup
     one_line()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_run_that_is_marked_overconfident_ends_with_0(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     assert vislam("compare", "drive", "--estimators", "ekf", "--max-frames", "60", "--workers", "1") == 0
     assert "ekf is overconfident" in capsys.readouterr().out
@@ -78,6 +79,7 @@ def test_an_unknown_estimator_is_5_before_anything_runs(
     assert "oracle" in one_line()
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_diverged_estimator_is_1_and_its_results_are_written(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

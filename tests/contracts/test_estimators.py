@@ -26,6 +26,8 @@ def short(scenario: Scenario, duration_s: float) -> Scenario:
 
 SCENARIOS = {"drive": short(DRIVE, 4.0), "drive-imu": short(DRIVE_IMU, 4.0), "flight": short(FLIGHT, 2.0)}
 SEED = 4
+# What a broken measurement does shows at once: the recordings of these tests are so short.
+FRAMES_WITH_NAN = 12
 # Exact IMU samples at 1 kHz are integrated by the midpoint rule, which errs by dt^2 / 12 times the change of the jerk:
 # up to 1e-6 m and 1e-7 rad here. Twists are exact: only rounding is left, and the same limit is generous.
 NOISE_FREE_M, NOISE_FREE_RAD = {"twist": 1e-6, "imu": 5e-6}, 1e-6
@@ -243,7 +245,7 @@ def without_vision(sequence: Sequence, frames: range) -> Sequence:
 @both_kinds
 @pytest.mark.parametrize(
     ("blind", "frames"),
-    [(range(10, 11), 20), (range(10, 30), 40), (range(3), 15), (range(10**6), 40)],
+    [(range(10, 11), 20), (range(10, 30), 40), (range(3), 15), (range(10**6), 20)],
     ids=["one frame", "20 frames", "the first frames", "all frames"],
 )
 def test_frames_without_vision_do_not_break_it(
@@ -272,7 +274,7 @@ def with_nan(sequence: Sequence, where: str) -> Sequence:
         return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
     field = "v_mps" if sequence.motion_kind == "twist" else "accel_mps2"
     samples = getattr(sequence.motion, field).copy()
-    samples[len(samples) // 2, 1] = np.nan
+    samples[np.searchsorted(sequence.motion.t_ns, sequence.frames_t_ns[sequence.frame_count // 2]), 1] = np.nan
     return replace(sequence, motion=replace(sequence.motion, **{field: samples}))
 
 
@@ -280,7 +282,7 @@ def with_nan(sequence: Sequence, where: str) -> Sequence:
 @pytest.mark.parametrize("where", ["observation", "motion sample"])
 def test_a_measurement_that_is_not_a_number_never_reaches_it(name, build, scenario, where) -> None:
     with pytest.raises(DataError, match=f"{where} .*not finite"):
-        run_on(name, build, with_nan(recording(scenario), where))
+        run_on(name, build, with_nan(recording(scenario).truncated(FRAMES_WITH_NAN), where))
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -288,7 +290,7 @@ def test_a_measurement_that_is_not_a_number_never_reaches_it(name, build, scenar
 @pytest.mark.parametrize("field", ["T_world_imu", "cov"])
 def test_a_start_that_is_not_a_number_never_ends_ok(name, build, scenario, field) -> None:
     """The prior does not pass through packets(): here the estimator and the runner have to tell."""
-    sequence = recording(scenario)
+    sequence = recording(scenario).truncated(FRAMES_WITH_NAN)
     assert sequence.prior is not None
     bad = getattr(sequence.prior, field).copy()
     bad[0, 0] = np.nan
@@ -306,7 +308,7 @@ def test_a_start_that_is_not_a_number_never_ends_ok(name, build, scenario, field
 def test_a_packet_that_is_not_a_number_never_ends_in_a_finite_lie(name, build, scenario, monkeypatch) -> None:
     """With the gatekeeper asleep: a NaN in the motion must show, whatever the estimator does with it."""
     monkeypatch.setattr("toolkit.sequence.check_runnable", lambda sequence: None)
-    run = run_on(name, build, with_nan(recording(scenario), "motion sample"))
+    run = run_on(name, build, with_nan(recording(scenario).truncated(FRAMES_WITH_NAN), "motion sample"))
     assert run.status != "ok"
 
 

@@ -1,18 +1,24 @@
 """The documentation works as printed: files, programs and commands run, links lead somewhere, tables are the tool's."""
 
+import inspect
+import io
 import json
 import re
 import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
+from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.datasets.trajectories import tum
@@ -21,7 +27,7 @@ from toolkit.metrics import score_run
 from toolkit.report.records import read_metrics
 
 PROJECT = Path(__file__).parents[2]
-README = PROJECT / "README.md"
+README, EXTENDING = PROJECT / "README.md", PROJECT / "docs/extending.md"
 PAGES = (README, *sorted((PROJECT / "docs").glob("*.md")), PROJECT / "data/README.md")
 
 _FENCE = re.compile(r"^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?\n(?P<text>.*?)^```$", re.M | re.S)
@@ -48,90 +54,114 @@ def commands(block: Block) -> Iterator[str]:
         yield from (part for part in parts if part.startswith("vislam "))
 
 
-# Runs the commands and programs of a page one after the other, as a terminal and a script would, and says what each
-# printed. Those that are not to be whole draw every figure without rendering it, and start no further processes.
-_DRIVER = """
-import contextlib, io, json, sys
+def carry_out(steps: Sequence[str | Block]) -> list[str]:
+    """Do the commands and programs of a page one after the other, as a terminal and a script would.
+
+    Returns what each printed. All is done in this process, where no audit is done twice, no figure is rendered and no
+    process is started: see the fixtures of the tests. The first line of the README is run as a stranger runs it.
+    """
+    printed = []
+    for step in steps:
+        with redirect_stdout(io.StringIO()) as out:
+            if isinstance(step, Block):
+                exec(compile(step.text, "a block of the page", "exec"), {"__name__": "__main__"})
+            else:
+                # 1 is a result, too: an estimator of an example may diverge, and its text says so.
+                status = main(shlex.split(step)[1:])
+                assert status in (0, 1), (step, status)
+        printed.append(out.getvalue())
+    return printed
+
+
+def as_a_stranger(command: str, folder: Path) -> str:
+    """Run a command in processes of its own, with as many workers and all the pixels that a user gets."""
+    words = [sys.executable, "-m", "toolkit.cli", *shlex.split(command)[1:]]
+    ended = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode in (0, 1), ended.stderr
+    assert "Traceback" not in ended.stderr, ended.stderr
+    return ended.stdout
+
+
+@pytest.fixture
+def alone(
+    audited_once: None, one_process: None, unrendered: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Return an empty directory, the current one, with the recording a user is said to have."""
+    monkeypatch.chdir(tmp_path)
+    _write_own_drive(tmp_path)
+    return tmp_path
+
+
+FIRST_LINE = "vislam compare"
+MARKS = ("overconfident", "timid")
+
+
+@pytest.fixture(scope="module")
+def first_line(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the first line of the README prints, and the folder it was run in."""
+    folder = tmp_path_factory.mktemp("readme")
+    return as_a_stranger(FIRST_LINE, folder), folder
+
+
+# The page on extending drops files into the packages. A copy of them is where nothing else sees these.
+_IN_A_COPY = """
+import io, json, shlex, sys
+from collections import namedtuple
+from contextlib import redirect_stdout
 from pathlib import Path
 from matplotlib.figure import Figure
 from toolkit.cli import main
 from toolkit.experiment import pipeline
 
-usable_cpus, savefig = pipeline.usable_cpus, Figure.savefig
+pipeline.usable_cpus = lambda: 1
+Figure.savefig = lambda figure, path, **options: Path(path).touch()
+Sequence, Block = list, namedtuple("Block", "language title text")
 
-def run(kind, what, whole):
-    pipeline.usable_cpus = usable_cpus if whole else lambda: 1
-    Figure.savefig = savefig if whole else lambda figure, path, **options: Path(path).touch()
-    if kind == "vislam":
-        # 1 is a result, too: an estimator of an example may diverge, and its text says so.
-        status = main(what)
-        assert status in (0, 1), (what, status)
-    else:
-        exec(compile(what, "a block of the page", "exec"), {"__name__": "__main__"})
-
-printed = []
-for step in json.load(sys.stdin):
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        run(*step)
-    printed.append(out.getvalue())
-json.dump(printed, sys.stdout)
+{carry_out}
+steps = [step if isinstance(step, str) else Block(**step) for step in json.load(sys.stdin)]
+json.dump(carry_out(steps), sys.stdout)
 """
-# The first line of the README is run exactly as a stranger runs it.
-WHOLE = "vislam compare"
 
 
-class Desk:
-    """A copy of the packages in a directory of its own: files dropped into it are found, and nothing else sees them."""
+class Extended(NamedTuple):
+    """What the page on extending, and a user who follows it, are shown, and the folder in which that was."""
 
-    def __init__(self, directory: Path) -> None:
-        self.directory = directory
-
-    def write(self, page: Path) -> None:
-        """Write the files that a page shows to where it says."""
-        for block in blocks(page):
-            if block.title is not None:
-                (self.directory / block.title).write_text(block.text, encoding="utf-8")
-
-    def do(self, steps: Sequence[str | Block]) -> list[str]:
-        """Run commands and programs in one process, and return what each printed."""
-        words = [
-            ("vislam", shlex.split(step)[1:], step == WHOLE) if isinstance(step, str) else ("python", step.text, False)
-            for step in steps
-        ]
-        # -c puts the working directory first on the path, so the copy is what is imported.
-        ended = subprocess.run(
-            [sys.executable, "-c", _DRIVER],
-            cwd=self.directory,
-            input=json.dumps(words),
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-        assert ended.returncode == 0, ended.stderr
-        assert "Traceback" not in ended.stderr, ended.stderr
-        printed: list[str] = json.loads(ended.stdout)
-        return printed
-
-
-def desk_in(directory: Path) -> Desk:
-    for package in ("toolkit", "filters"):
-        shutil.copytree(PROJECT / package, directory / package, ignore=shutil.ignore_patterns("__pycache__"))
-    _write_own_drive(directory)
-    return Desk(directory)
-
-
-@pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return desk_in(tmp_path)
+    by_page: list[str]
+    listed: str
+    folder: Path
 
 
 @pytest.fixture(scope="module")
-def readme(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which all that the README shows was run, and printed the tables it shows."""
-    desk = desk_in(tmp_path_factory.mktemp("readme"))
-    assert_a_page_works(README, desk)
-    return desk.directory
+def extended(tmp_path_factory: pytest.TempPathFactory) -> Extended:
+    """Do what the page on extending shows, and then use all that it adds, in one process of a copy of the packages."""
+    folder = tmp_path_factory.mktemp("extending")
+    for package in ("toolkit", "filters"):
+        shutil.copytree(PROJECT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    _write_own_drive(folder)
+    write_files(EXTENDING, folder)
+    compare = "vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run"
+    steps = [*_steps(EXTENDING), "vislam list", compare]
+    # -c puts the working directory first on the path, so the copy is what is imported.
+    ended = subprocess.run(
+        [sys.executable, "-c", _IN_A_COPY.format(carry_out=inspect.getsource(carry_out))],
+        cwd=folder,
+        input=json.dumps([step if isinstance(step, str) else asdict(step) for step in steps]),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr, ended.stderr
+    *by_page, listed, _ = json.loads(ended.stdout)
+    return Extended(by_page, listed, folder)
+
+
+def write_files(page: Path, folder: Path) -> None:
+    """Write the files that a page shows to where it says."""
+    for block in blocks(page):
+        if block.title is not None:
+            (folder / block.title).write_text(block.text, encoding="utf-8")
 
 
 def _write_own_drive(directory: Path) -> None:
@@ -174,21 +204,45 @@ def _steps(page: Path) -> list[str | Block]:
 by_page = pytest.mark.parametrize("page", PAGES, ids=_name)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if _steps(page) and page != README], ids=_name)
-def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, desk: Desk) -> None:
-    assert_a_page_works(page, desk)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if _steps(page) and page not in (README, EXTENDING)], ids=_name
+)
+def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, alone: Path) -> None:
+    write_files(page, alone)
+    steps = _steps(page)
+    assert_tables_are_those_shown(page, dict(zip(steps, carry_out(steps), strict=True)))
 
 
-def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(readme: Path) -> None:
-    assert (readme / "runs").is_dir()
+def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(
+    first_line: tuple[str, Path], alone: Path
+) -> None:
+    steps = [step for step in _steps(README) if step != FIRST_LINE]
+    printed = {FIRST_LINE: first_line[0], **dict(zip(steps, carry_out(steps), strict=True))}
+    assert (first_line[1] / "runs").is_dir()
+    assert_tables_are_those_shown(README, printed)
+
+
+def test_everything_the_page_on_extending_shows_runs_and_prints_the_tables_shown(extended: Extended) -> None:
+    assert_tables_are_those_shown(EXTENDING, dict(zip(_steps(EXTENDING), extended.by_page, strict=True)))
+
+
+def test_on_the_first_lines_drive_the_decoupled_filter_is_marked_and_the_others_are_not(
+    first_line: tuple[str, Path],
+) -> None:
+    """A pose NEES of 37096, 0.51 and 1.08: causal and final, which are one row where they are the same."""
+    drive = re.findall(r"^drive: .*?^results: ", first_line[0], flags=re.M | re.S)[0]
+    marks = [(above.split()[0], line.strip()) for above, line in pairwise(drive.splitlines()) if line.strip() in MARKS]
+    assert marks == [("ekf", "overconfident")]
+    statuses = {row[1:3]: row[3] for row in _rows(drive)}
+    assert statuses == {("dead-reckoning", "both"): "ok", ("ekf", "both"): "ok", ("batch", "final"): "ok"}
 
 
 @pytest.mark.parametrize(("name", "output", "most_m"), [("ekf", "causal", 0.6), ("batch", "final", 0.4)])
 def test_the_first_line_of_the_readme_is_as_good_on_kitti00_as_measured_before(
-    readme: Path, real: Callable[[str], Path], name: str, output: Output, most_m: float
+    first_line: tuple[str, Path], real: Callable[[str], Path], name: str, output: Output, most_m: float
 ) -> None:
     """What issue 2 promises on a real IMU, judged by a truth that the built-in recording does not bring."""
-    (run,) = (readme / "runs").glob("*/kitti00")
+    (run,) = (first_line[1] / "runs").glob("*/kitti00")
     (entry,) = [one for one in read_metrics(run / "metrics.json").runs if (one.estimator, one.output) == (name, output)]
     assert entry.status == "ok"
     truth = load_truth(real("kitti00/gt_imu.tum"))
@@ -201,11 +255,8 @@ def test_the_first_line_of_the_readme_is_as_good_on_kitti00_as_measured_before(
     assert values["coverage_percent"] == 100.0
 
 
-def assert_a_page_works(page: Path, desk: Desk) -> None:
-    """Run everything a page shows, and compare the tables it prints with those shown."""
-    desk.write(page)
-    steps = _steps(page)
-    printed = dict(zip(steps, desk.do(steps), strict=True))
+def assert_tables_are_those_shown(page: Path, printed: Mapping[str | Block, str]) -> None:
+    """Compare the tables a page shows with those its commands printed."""
     for block in blocks(page):
         if block.text.startswith("$ vislam"):
             _assert_tables_agree(block.text, printed[block.text.partition("\n")[0].removeprefix("$ ")])
@@ -234,12 +285,9 @@ def _rows(text: str) -> dict[tuple[str, ...], list[str]]:
     return rows
 
 
-def test_the_examples_of_extending_do_what_the_page_says(desk: Desk) -> None:
-    desk.write(PROJECT / "docs/extending.md")
-    compare = "vislam compare drive --estimators constant-velocity,dead-reckoning --max-frames 60 --out run"
-    listed, _ = desk.do(["vislam list", compare])
-    assert all(name in listed for name in ("constant-velocity", "plain-json", "path_ratio"))
-    runs = json.loads((desk.directory / "run/metrics.json").read_text())["runs"]
+def test_the_examples_of_extending_do_what_the_page_says(extended: Extended) -> None:
+    assert all(name in extended.listed for name in ("constant-velocity", "plain-json", "path_ratio"))
+    runs = json.loads((extended.folder / "run/metrics.json").read_text())["runs"]
     assert [run["status"] for run in runs] == ["diverged", "diverged", "ok", "ok"]
     # White noise of 0.1 m on steps of 0.5 m and more lengthens a path by no more than a few percent.
     assert runs[-1]["metrics"]["path_ratio"] == pytest.approx(1.0, abs=0.1)

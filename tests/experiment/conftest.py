@@ -22,7 +22,7 @@ def units() -> Units:
     """Return a function that makes short runs of the drive, seed by seed."""
 
     def make(seeds: tuple[int, ...] = (0, 1, 2), estimators: tuple[str, ...] = ("dead-reckoning", "ekf")) -> list[Unit]:
-        recordings = [Recording("drive", seed, max_frames=30) for seed in seeds]
+        recordings = [Recording("drive", seed, duration_s=2.9) for seed in seeds]  # 30 frames
         return [Unit(one, one.seed, name, keep_run=True) for one in recordings for name in estimators]
 
     return make

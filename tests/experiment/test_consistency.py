@@ -81,21 +81,6 @@ def test_innovations_that_share_one_error_count_once_a_frame(make_evaluation: Ca
     assert nis_over_time(make_evaluation(100, dof=2.0)).independent_dof == pytest.approx(200.0)
 
 
-def test_on_a_drive_the_decoupled_filter_is_marked_and_the_others_are_not(run_estimator: Callable[..., Run]) -> None:
-    """README's table: pose NEES of 37096, 0.51 and 1.08."""
-    sequence = load_sequence("drive", seed=0)
-    marks = {}
-    for name in ("ekf", "dead-reckoning", "batch"):
-        outcome = outcome_of(run_estimator(name, sequence), sequence, 0)
-        marks[name] = {output: Row(output, (outcome,)).mark for output in outcome.outputs}
-        assert outcome.status == "ok"
-    assert marks == {
-        "ekf": {"causal": "overconfident", "final": "overconfident"},
-        "dead-reckoning": {"causal": "", "final": ""},
-        "batch": {"final": ""},
-    }
-
-
 def test_without_truth_innovations_mark_a_filter_that_is_told_half_the_noise(
     run_estimator: Callable[..., Run],
 ) -> None:

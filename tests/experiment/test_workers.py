@@ -22,12 +22,18 @@ from toolkit.metrics import cost
 from toolkit.progress import SILENT
 
 Units = Callable[..., list[Unit]]
+Jobs = Callable[..., list[Any]]
 StartsGroup = Callable[..., Popen[str]]
 
 _WORK = """
 import os, signal, time
 from pathlib import Path
+from typing import NamedTuple
 from toolkit.errors import DataError
+
+class Job(NamedTuple):
+    estimator: str
+    seed: int
 
 MARK = Path(__file__).with_name("mark")
 
@@ -91,7 +97,17 @@ def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType
     del sys.modules["work_for_tests"]
 
 
-def by_place(units: list[Unit], workers: int, work: Any) -> list[Any]:
+@pytest.fixture
+def jobs(work: ModuleType) -> Jobs:
+    """Return a function that makes work as named as units are; a process needs to import next to nothing for it."""
+
+    def make(seeds: tuple[int, ...], estimators: tuple[str, ...] = ("dead-reckoning", "ekf")) -> list[Any]:
+        return [work.Job(name, seed) for seed in seeds for name in estimators]
+
+    return make
+
+
+def by_place(units: list[Any], workers: int, work: Any) -> list[Any]:
     """Return the results in the order of the units, each of which must come exactly once."""
     found = list(results_of(units, workers, work, SILENT))
     assert sorted(place for place, _ in found) == list(range(len(units)))
@@ -132,69 +148,69 @@ def _but_cost(scored: Scored) -> dict[str, float | None]:
     return {key: value for key, value in scored.scores.values.items() if key not in _COST}
 
 
-def test_a_process_that_dies_twice_loses_its_unit_and_no_other(units: Units, work: ModuleType, tmp_path: Path) -> None:
-    results = by_place(units((0, 1), ("dead-reckoning", "ekf", "batch")), 2, work.dies)
+def test_a_process_that_dies_twice_loses_its_unit_and_no_other(jobs: Jobs, work: ModuleType, tmp_path: Path) -> None:
+    results = by_place(jobs((0, 1), ("dead-reckoning", "ekf", "batch")), 2, work.dies)
     assert results[4] == Lost("its process was ended by signal 9 before it answered")
     del results[4]
     assert results == [(name, 0) for name in ("dead-reckoning", "ekf", "batch")] + [("dead-reckoning", 1), ("batch", 1)]
     assert (tmp_path / "mark").read_text() == "tried tried "
 
 
-def test_a_process_that_dies_once_loses_nothing(units: Units, work: ModuleType) -> None:
-    results = by_place(units((0, 1)), 2, work.dies_once)
+def test_a_process_that_dies_once_loses_nothing(jobs: Jobs, work: ModuleType) -> None:
+    results = by_place(jobs((0, 1)), 2, work.dies_once)
     assert results == [(name, seed) for seed in (0, 1) for name in ("dead-reckoning", "ekf")]
 
 
-def test_a_process_that_leaves_without_a_word_says_its_status(units: Units, work: ModuleType) -> None:
-    assert by_place(units((0,)), 2, work.leaves) == [Lost("its process ended with status 3 before it answered")] * 2
+def test_a_process_that_leaves_without_a_word_says_its_status(jobs: Jobs, work: ModuleType) -> None:
+    assert by_place(jobs((0,)), 2, work.leaves) == [Lost("its process ended with status 3 before it answered")] * 2
 
 
-def test_a_unit_without_memory_is_lost_alone(units: Units, work: ModuleType) -> None:
-    kept, lost = by_place(units((0, 1), ("ekf",)), 2, work.is_short_of_memory)
+def test_a_unit_without_memory_is_lost_alone(jobs: Jobs, work: ModuleType) -> None:
+    kept, lost = by_place(jobs((0, 1), ("ekf",)), 2, work.is_short_of_memory)
     assert (kept, type(lost)) == (0, Lost)
 
 
-def test_an_error_of_the_recording_ends_everything_at_once(units: Units, work: ModuleType) -> None:
+def test_an_error_of_the_recording_ends_everything_at_once(jobs: Jobs, work: ModuleType) -> None:
     began = time.monotonic()
     with pytest.raises(DataError, match="nothing to see"):
-        list(results_of(units((0, 1), ("ekf",)), 2, work.refuses, SILENT))
+        list(results_of(jobs((0, 1), ("ekf",)), 2, work.refuses, SILENT))
     assert time.monotonic() - began < 30.0  # the other process, asleep for a minute, was not waited for
 
 
-def test_a_defect_is_told_with_the_traceback_of_its_process(units: Units, work: ModuleType) -> None:
+def test_a_defect_is_told_with_the_traceback_of_its_process(jobs: Jobs, work: ModuleType) -> None:
     with pytest.raises(ZeroDivisionError, match="a defect") as raised:
-        list(results_of(units((0,)), 2, work.is_broken, SILENT))
+        list(results_of(jobs((0,)), 2, work.is_broken, SILENT))
     assert "in is_broken" in str(raised.value.__cause__)
 
 
 def test_every_process_has_one_numeric_thread_and_ours_is_left_alone(
-    units: Units, work: ModuleType, monkeypatch: pytest.MonkeyPatch
+    jobs: Jobs, work: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    assert by_place(units((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
+    assert by_place(jobs((0,)), 2, work.tells_threads) == [("1", "1", "1")] * 2
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
 
 
 def test_a_process_that_holds_much_memory_goes_on_without_a_word(
-    units: Units, work: ModuleType, recwarn: pytest.WarningsRecorder
+    jobs: Jobs, work: ModuleType, recwarn: pytest.WarningsRecorder
 ) -> None:
     """Where psutil is there, loky takes a recording held in memory for a leak, says so and begins the process anew."""
     pytest.importorskip("psutil")
-    assert len(set(by_place(units((0, 1, 2, 3)), 2, work.holds_much))) <= 2
+    assert len(set(by_place(jobs((0, 1, 2, 3)), 2, work.holds_much))) <= 2
     assert not recwarn.list
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_progress_is_that_of_all_units_and_never_goes_back(units: Units, work: ModuleType, workers: int) -> None:
+def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: ModuleType, workers: int) -> None:
     heard: list[tuple[int, int]] = []
 
     class Listening:
         def advance(self, done: int, total: int, stage: str = "") -> None:
             heard.append((done, total))
 
-    asked = units((0, 1), ("ekf",))
+    asked = jobs((0, 1), ("ekf",))
     assert sorted(result for _, result in results_of(asked, workers, work.goes_on, Listening())) == [0, 1]
     shares = [done / total for done, total in heard]
     assert shares == sorted(shares)

@@ -17,10 +17,10 @@ WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
 
 @cache
 def answer(name: str, part: Window | Outliers = Window()) -> Run:  # noqa: B008 - frozen
-    """Run an estimator over three seconds in which one sighting in a hundred is of another point."""
+    """Run an estimator over two seconds in which one sighting in a hundred is of another point."""
     settings = Settings(window=part) if isinstance(part, Window) else Settings(outliers=part)
     camera = replace(DRIVE.camera, outlier_rate=0.01, max_tracks=40)
-    sequence = simulate(replace(DRIVE, duration_s=3.0, camera=camera), 6)
+    sequence = simulate(replace(DRIVE, duration_s=2.0, camera=camera), 6)
     assert sequence.prior is not None
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.final is not None, run.log

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,10 +53,15 @@ def without_truth(sequence: Sequence) -> Comparison:
 
 
 @pytest.fixture(scope="session")
-def run_directory(comparison: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run directory of the comparison; it is shared and must not be changed."""
+def run_directory(
+    comparison: Comparison,
+    tmp_path_factory: pytest.TempPathFactory,
+    without_pixels: Callable[[], AbstractContextManager[None]],
+) -> Path:
+    """The run directory of the comparison; it is shared and must not be changed. Nobody looks at its figures."""
     target = tmp_path_factory.mktemp("runs") / "made-up"
-    write_run(comparison, target, MadeBy("vislam compare made-up --seed 3", Configuration()))
+    with without_pixels():
+        write_run(comparison, target, MadeBy("vislam compare made-up --seed 3", Configuration()))
     return target
 
 

@@ -108,6 +108,7 @@ def test_the_same_estimator_has_one_colour_in_every_run(run_directory: Path, com
     assert not {one["id"] for one in first["rows"]} & {one["id"] for one in second["rows"]}
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_without_truth_there_is_a_page_too(without_truth: Comparison, tmp_path: Path) -> None:
     (case,) = payload_of([read_run(written(without_truth, tmp_path / "run"))])["cases"]
     assert case["truth"] is None
@@ -212,6 +213,7 @@ def test_most_honest_is_a_contest_of_nees_between_estimators() -> None:
     assert highlights([_with_figures("one", nis_mean=1.0), _with_figures("other", nis_mean=2.0)], "twist") == []
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_the_page_marks_who_is_overconfident(comparison: Comparison, rescored: Rescored, tmp_path: Path) -> None:
     sure = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 9.0}, {}))
     (case,) = payload_of([read_run(written(sure, tmp_path / "run"))])["cases"]

@@ -6,17 +6,25 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib.figure import Figure
 
 from toolkit.errors import OutputError
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.report import run_directory
+from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import MadeBy, check_run_directory, write_run
 from toolkit.report.scores_json import metrics_document
 
-# Where it does not matter what is in a figure's file.
-unrendered = pytest.mark.usefixtures("unrendered")
+# Where it does not matter which figures there are, and what is in their files.
+one_figure = pytest.mark.usefixtures("one_figure")
+
+
+@pytest.fixture(name="one_figure")
+def _one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have an empty figure stand for all there are: to draw them takes longer than to write all else."""
+    monkeypatch.setattr(run_directory, "drawn", lambda _comparison: [NamedFigure("top_all", "From above.", Figure())])
 
 
 def write(comparison: Comparison, target: Path) -> None:
@@ -39,7 +47,7 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert all(f"(figures/{name}.png)" in report for name in figures)
 
 
-@unrendered
+@one_figure
 def test_the_manifest_says_how_to_repeat_the_run(comparison: Comparison, tmp_path: Path) -> None:
     write(comparison, tmp_path / "run")
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
@@ -65,7 +73,7 @@ def test_a_failure_while_writing_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@unrendered
+@one_figure
 def test_a_failure_while_writing_keeps_the_earlier_run(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -82,7 +90,7 @@ def test_a_failure_while_writing_keeps_the_earlier_run(
     assert (tmp_path / "run" / "manifest.json").read_bytes() == before
 
 
-@unrendered
+@one_figure
 def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,7 +110,7 @@ def test_an_interrupt_between_the_renames_brings_the_earlier_run_back(
     assert (target / "metrics.json").is_file()
 
 
-@unrendered
+@one_figure
 def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, tmp_path: Path) -> None:
     target = tmp_path / "run"
     write(comparison, target)
@@ -118,7 +126,7 @@ def test_an_earlier_run_is_replaced_with_all_its_files(comparison: Comparison, t
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-@unrendered
+@one_figure
 def test_the_manifest_lists_every_file_of_the_run(comparison: Comparison, tmp_path: Path) -> None:
     write(comparison, tmp_path / "run")
     files = {str(path.relative_to(tmp_path / "run")) for path in (tmp_path / "run").rglob("*") if path.is_file()}
@@ -129,7 +137,7 @@ def test_the_manifest_lists_every_file_of_the_run(comparison: Comparison, tmp_pa
 @pytest.mark.parametrize(
     "name", ["notes.txt", "figures/top_view_for_the_paper.png", "raw/imu.csv", "trajectories/other.tum", "report.html"]
 )
-@unrendered
+@one_figure
 def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
     comparison: Comparison, tmp_path: Path, name: str, of_an_earlier_version: bool
 ) -> None:
@@ -151,7 +159,7 @@ def test_a_file_of_the_users_own_in_a_run_directory_is_never_lost(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-@unrendered
+@one_figure
 def test_a_link_in_a_run_directory_is_not_followed_nor_lost(comparison: Comparison, tmp_path: Path) -> None:
     write(comparison, tmp_path / "run")
     (tmp_path / "run" / "report.md").unlink()
@@ -161,7 +169,7 @@ def test_a_link_in_a_run_directory_is_not_followed_nor_lost(comparison: Comparis
         check_run_directory(tmp_path / "run")
 
 
-@unrendered
+@one_figure
 def test_a_file_that_comes_while_the_run_is_written_is_not_lost(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,7 +189,7 @@ def test_a_file_that_comes_while_the_run_is_written_is_not_lost(
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
-@unrendered
+@one_figure
 def test_no_directory_is_left_above_a_run_that_failed(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,7 +208,7 @@ def test_a_name_too_long_is_refused_before_anything_runs(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
-@unrendered
+@one_figure
 def test_an_empty_directory_is_used(comparison: Comparison, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     write(comparison, tmp_path / "run")

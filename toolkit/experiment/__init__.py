@@ -2,10 +2,22 @@
 
 Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
 kept of it) -> pipeline -> comparison (what comes of it) -> statistics -> consistency (whose stated uncertainty cannot
-be right).
+be right). What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
 """
 
-from toolkit.experiment.comparison import Comparison, Record, Row
-from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run, stores_of, workers_of
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from toolkit.experiment.comparison import Comparison, Record, Row
+    from toolkit.experiment.pipeline import Plan, comparisons, prepared_cases, run, stores_of, workers_of
 
 __all__ = ["Comparison", "Plan", "Record", "Row", "comparisons", "prepared_cases", "run", "stores_of", "workers_of"]
+
+_OF_COMPARISON = ("Comparison", "Record", "Row")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{'comparison' if name in _OF_COMPARISON else 'pipeline'}"), name)

@@ -228,11 +228,13 @@ def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Ite
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
     # A worker of a cluster stands in another folder.
     source = case.source if plan.scheduler is None else _located(case.source)
+    single = len(plan.seeds) == 1
     for seed in plan.seeds:
-        recording = case.prepared if len(plan.seeds) == 1 else plan.recording(source, seed)
+        # What is ready here is not made ready again, but a cluster's workers had to be sent all of it.
+        is_ready = single or (seed == plan.seeds[0] and plan.scheduler is None)
+        recording = case.prepared if is_ready else plan.recording(source, seed)
         for name in names:
-            build, single = plan.own.get(name), len(plan.seeds) == 1
-            keep_trajectories = plan.keep_trajectories and not single
+            build, keep_trajectories = plan.own.get(name), plan.keep_trajectories and not single
             yield Unit(recording, seed, name, plan.settings, build, single, keep_trajectories)
 
 

@@ -9,6 +9,7 @@ Source: Geiger, Ziegler & Stiller, "StereoScan" (2011), section III-A, with the 
 Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment" (2000), section 6.1.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -93,31 +94,31 @@ def _two_views(sequence: Sequence, intervals: int) -> _TwoViews:
 
 def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tuple[Array, Array, Array]:
     """Return one step (K - 1, 6) for every interval, on the right of its motion, the sum of its weights, and points."""
-    T_after_before = se3_inverse(T_before_after)[views.interval]
-    rotation = T_after_before[:, :3, :3]
-    moved = (rotation @ views.points[:, :, None])[..., 0] + T_after_before[:, :3, 3]
+    T_after_before = se3_inverse(T_before_after)
+    rotation = np.take(T_after_before[:, :3, :3], views.interval, axis=0)
+    moved = (rotation @ views.points[:, :, None])[..., 0] + T_after_before[views.interval, :3, 3]
     moved[:, 2] = np.maximum(moved[:, 2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
     d_point_d_uv, d_after = _triangulation_jacobian(views.points, rig), projection_jacobian(moved, rig)
     d_uv_d_before = d_after @ rotation @ d_point_d_uv
     before_px = (views.uv_before_px - project(views.points, rig))[:, :, None]
     residual_px = (views.uv_after_px - project(moved, rig))[:, :, None] - d_uv_d_before @ before_px
     spread = d_uv_d_before @ rig.cov_uv_px2
-    cov_px2 = rig.cov_uv_px2 + spread @ np.swapaxes(d_uv_d_before, 1, 2)
-    information = np.linalg.inv(_ridged(cov_px2))
-    weighted_px = information @ residual_px
-    weight = _cauchy_weights((residual_px * weighted_px).sum(axis=(1, 2)), views)
-    d_uv_d_step = np.concatenate([d_after @ skew(moved), -d_after], axis=-1)
-    transposed = np.swapaxes(d_uv_d_step, 1, 2) * weight[:, None, None]
-    hessian = _sum_by_interval(transposed @ information @ d_uv_d_step, views.first)
-    gradient = _sum_by_interval(transposed @ weighted_px, views.first)
+    whitener = _whitener(_ridged(rig.cov_uv_px2 + spread @ np.swapaxes(d_uv_d_before, 1, 2)))
+    white = whitener @ residual_px
+    weight = _cauchy_weights((white**2).sum(axis=(1, 2)), views)
+    # A step [phi, rho] on the right of the motion moves a point p of the later view by [p]x phi - rho.
+    d_white = whitener @ d_after
+    equations = np.sqrt(weight)[:, None, None] * np.concatenate([d_white @ skew(moved), -d_white, white], axis=-1)
+    normal = _normal_by_interval(equations, views.first)
     # The ridge keeps an interval without tracks where it is; it is far below one sighting's information.
-    hessian = _ridged(hessian) + 1e-6 * np.eye(6)
-    step = np.asarray(np.linalg.solve(hessian, gradient)[..., 0], dtype=np.float64)
+    hessian = _ridged(normal[:, :6, :6]) + 1e-6 * np.eye(6)
+    step = np.asarray(np.linalg.solve(hessian, normal[:, :6, 6:])[..., 0], dtype=np.float64)
     # The best point is between what the two views say of it: the first one's, corrected by its share of the residual.
-    corrected_px = before_px + np.swapaxes(spread, 1, 2) @ weighted_px
+    corrected_px = before_px + np.swapaxes(whitener @ spread, 1, 2) @ white
     points = views.points + (d_point_d_uv @ corrected_px)[..., 0]
     points[:, 2] = np.clip(points[:, 2], LEAST_DEPTH_M, MOST_DEPTH_M)
-    return step, _sum_by_interval(weight, views.first), points
+    support = np.bincount(views.interval, weight, len(step)).astype(np.float64)
+    return step, support, points
 
 
 def _triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
@@ -138,18 +139,39 @@ def _ridged(matrices: Array) -> Array:
     return np.asarray(matrices + (RIDGE * trace)[:, None, None] * np.eye(matrices.shape[-1]))
 
 
+def _whitener(cov: Array) -> Array:
+    """Return the lower triangular W (N, 3, 3) with W cov W^T = 1: the inverses of cov's Cholesky factors, all at once.
+
+    cov = L D L^T with ones on the diagonal of L, so W = D^(-1/2) L^(-1).
+    """
+    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(cov, 0, 2).copy()
+    l10, l20 = b / a, c / a
+    pivot1 = d - l10 * b
+    l21 = (e - l20 * b) / pivot1
+    pivot2 = f - l20 * c - l21 * l21 * pivot1
+    whitener = np.zeros_like(cov)
+    whitener[:, 0, 0], whitener[:, 1, 1], whitener[:, 2, 2] = np.sqrt(1.0 / np.stack([a, pivot1, pivot2]))
+    whitener[:, 1, 0] = -l10 * whitener[:, 1, 1]
+    whitener[:, 2, 1] = -l21 * whitener[:, 2, 2]
+    whitener[:, 2, 0] = (l10 * l21 - l20) * whitener[:, 2, 2]
+    return whitener
+
+
 def _cauchy_weights(chi2: Array, views: _TwoViews) -> Array:
     """Return the weights (P,) of squared residuals (P,), scaled by the median of their own interval."""
-    order = np.lexsort((chi2, views.interval))
-    middle = np.minimum((views.first[:-1] + views.first[1:]) // 2, chi2.size - 1)
-    scale2 = np.maximum(chi2[order][middle] / CHI2_3_MEDIAN, LEAST_SCALE2)
+    tracks = np.diff(views.first)
+    # One row an interval, filled up with NaN, which comes after all else in the order.
+    by_interval = np.full((tracks.size, tracks.max()), np.nan)
+    by_interval[views.interval, np.arange(chi2.size) - views.first[views.interval]] = chi2
+    by_interval.sort(axis=1)
+    middle = by_interval[np.arange(tracks.size), np.minimum(tracks // 2, tracks.max() - 1)]
+    scale2 = np.maximum(middle / CHI2_3_MEDIAN, LEAST_SCALE2)
     weights: Array = 1.0 / (1.0 + chi2 / (CAUCHY_SIGMAS**2 * scale2[views.interval]))
     return weights
 
 
-def _sum_by_interval(values: Array, first: IntArray) -> Array:
-    """Sum the rows (P, ...) of each interval, which are consecutive, to (K - 1, ...)."""
-    filled = np.flatnonzero(np.diff(first))
-    sums = np.zeros((first.size - 1, *values.shape[1:]))
-    sums[filled] = np.add.reduceat(values, first[filled], axis=0)
-    return sums
+def _normal_by_interval(equations: Array, first: IntArray) -> Array:
+    """Return A^T A (K - 1, d, d) of the equations (P, 3, d) of each interval, which are consecutive."""
+    d = equations.shape[-1]
+    of_intervals = (equations[a:b].reshape(-1, d) for a, b in pairwise(first.tolist()))
+    return np.array([rows.T @ rows for rows in of_intervals])

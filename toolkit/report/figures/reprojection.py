@@ -62,15 +62,16 @@ def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
 
 
 def _histogram(axes: Axes, kind: str, error_px: Array, colour: str) -> None:
-    share = np.full(error_px.size, 100.0 / error_px.size)
     median_px = float(np.median(error_px))
     label = (
         f"{kind}: median {median_px:.2f} px\n({100.0 * float(np.mean(error_px > _FAR_PX)):.1f} % above {_FAR_PX:g} px)"
     )
-    shown_px, bins = np.maximum(error_px, _SMALLEST_PX), _BINS.tolist()
+    counts, _ = np.histogram(np.maximum(error_px, _SMALLEST_PX), bins=_BINS)
+    share = 100.0 * counts / error_px.size
+    # One outline: sixty bars look the same and take longer to draw.
     if kind == "in-sample":
-        axes.hist(shown_px, bins=bins, weights=share, color=colour, alpha=0.35, label=label)
+        axes.stairs(share, _BINS, fill=True, color=colour, alpha=0.35, label=label)
         axes.axvline(median_px, color=colour, linewidth=1.0, alpha=0.5)
     else:
-        axes.hist(shown_px, bins=bins, weights=share, color=colour, histtype="step", linewidth=1.5, label=label)
+        axes.stairs(share, _BINS, color=colour, linewidth=1.5, label=label)
         axes.axvline(median_px, color=colour, linewidth=1.0)
