@@ -175,6 +175,7 @@ def test_audit_start_and_facts_are_told(comparison: Comparison) -> None:
     for text in (comparison_text(comparison), report_text(comparison, {})):
         words = " ".join(text.split())
         assert comparison.findings[0].detail in words
+        assert "not decidable: time-offset, twist-lag: too little change of rotation" in words
         assert comparison.prior.source in words
         assert all(fact in words for fact in comparison.sequence.provenance.facts)
 
