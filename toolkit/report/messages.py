@@ -108,7 +108,9 @@ def outcome(finding: Finding) -> str:
     """Say in one or two words what became of a finding."""
     if finding.repaired:
         return "too much lost" if finding.blocking else "repaired"
-    return "not repaired" if finding.blocking else "for information"
+    if finding.blocking:
+        return "not repaired"
+    return "warning" if finding.warning else "for information"
 
 
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
