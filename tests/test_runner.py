@@ -129,6 +129,18 @@ def test_poses_that_are_not_finite_are_a_divergence(sequence):
     assert any("not numbers from estimate 7" in line for line in done.log)
 
 
+def test_a_run_is_judged_by_what_it_gave_alone(sequence):
+    """Judging a run again, as from a file, gives the status and the reasons it had."""
+    poses = np.tile(np.eye(4), (sequence.frame_count, 1, 1))
+    poses[::2, 0, 3] = 50.0
+    astray = Trajectory(sequence.frames_t_ns, poses)
+    run = Run("astray", "ok", astray, astray, Landmarks.none(), None)
+    again = runner.judged(run, sequence)
+    assert again.status == "diverged"
+    assert again.log[-1].startswith("the trajectory diverged: ")
+    assert runner.judged(replace(run, causal=None), sequence).log == again.log
+
+
 class Unconverged(Perfect):
     def finish(self) -> Finished:
         return replace(super().finish(), converged=False)

@@ -116,13 +116,18 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
     if not finished.converged:
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
-    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said))
+    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
+    return judged(run, sequence)
+
+
+def judged(run: Run, sequence: Sequence) -> Run:
+    """Return a run that came to its end with the status ``diverged``, and why in its log, where it contradicts itself.
+
+    ``sequence`` is what it read; the truth is not looked at.
+    """
     reasons = [contradiction(trajectory, sequence) for trajectory in _to_judge(run)] + [gate_collapse(run.info)]
-    for reason in dict.fromkeys(reasons):
-        if reason is not None:
-            status = "diverged"
-            log.append(f"the trajectory diverged: {reason}")
-    return replace(run, status=status, log=tuple(log))
+    found = [f"the trajectory diverged: {reason}" for reason in dict.fromkeys(reasons) if reason is not None]
+    return replace(run, status="diverged", log=(*run.log, *found)) if found else run
 
 
 def _to_judge(run: Run) -> Iterator[Trajectory]:

@@ -1,7 +1,7 @@
 """The table of faults: what the audit must say of each of them, in each kind of recording.
 
-A verdict is ``repaired`` (named, repaired, nothing blocks), ``blocks`` (named and blocking) or ``undecided`` (named as
-not decidable, nothing else found).
+A verdict is ``repaired`` (named, repaired, nothing blocks), ``blocks`` (named and blocking), ``warned`` (named, not
+to be repaired, nothing blocks) or ``undecided`` (not decidable, no fault found beside it but a warning).
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class Case(NamedTuple):
     plant: Callable[..., Sequence]
     dose: float
     found: str
-    verdict: Literal["repaired", "blocks", "undecided"]
+    verdict: Literal["repaired", "blocks", "warned", "undecided"]
     in_detail: str = ""
     scenarios: tuple[str, ...] = ALL
 
@@ -38,6 +38,7 @@ CASES = [
     Case(faults.dropped_sightings, 1.0, "no-sightings", "blocks"),
     Case(faults.nan_span, 3600.0, "not-finite", "blocks", "of the sightings"),
     Case(faults.identity_intrinsics, 1.0, "intrinsics", "blocks", "fx_px = 1 "),
+    Case(faults.zero_intrinsics, 0.0, "intrinsics", "blocks", "fx_px = 0 "),
     Case(faults.transposed_intrinsics, 0.0, "intrinsics", "blocks", "(cx_px, cy_px) = (0, 0)"),
     Case(faults.shifted_pixels, 5000.0, "intrinsics", "blocks", "lies outside the sightings"),
     Case(faults.baseline_unit, 1000.0, "units", "repaired", "it is in millimetres, 0.54 m", TWIST),
@@ -61,6 +62,16 @@ CASES = [
     Case(faults.camera_clock, 0.02, "time-offset", "repaired", "stamped late", IMU),
     Case(faults.camera_clock, -0.02, "time-offset", "repaired", "stamped early", IMU),
     Case(faults.camera_clock, 0.25, "time-offset", "repaired", "stamped late"),
+    Case(faults.disturbed_motion, 2.0, "conflict", "warned", "vision and odometry disagree at 5-10 s", TWIST),
+    Case(faults.disturbed_motion, 2.0, "conflict", "warned", "m/s^2 of specific force", IMU),
+    Case(faults.moving_objects, 0.8, "conflict", "warned"),
+    Case(faults.turned_camera, 0.15, "miscalibration", "warned", "as if it were turned"),
+    Case(faults.shifted_pixels, 30.0, "miscalibration", "warned", "px off", TWIST),
+    Case(faults.misaligned_rows, 60.0, "miscalibration", "warned", "px off", TWIST),
+    Case(faults.linear_unit, 1.1, "miscalibration", "warned", "speed is 1.09", TWIST),
+    Case(faults.linear_unit, 0.8, "miscalibration", "warned", "times gravity", IMU),
+    Case(faults.blackout, 1.0, "thin-vision", "warned", "s ("),
+    Case(faults.few_tracks, 3.0, "thin-vision", "warned", "for 100% of the time"),
 ]
 
 
@@ -89,13 +100,14 @@ every_case = pytest.mark.parametrize(
 def test_the_fault_is_named_with_the_right_verdict(case: Case, scenario: str) -> None:
     outcome = audited(case, scenario)
     if case.verdict == "undecided":
-        assert not outcome.findings
+        assert all(finding.warning for finding in outcome.findings)
         assert case.in_detail in outcome.undecided[case.found]
         return
     found = {finding.fault: finding for finding in outcome.findings}
     assert case.in_detail in found[case.found].detail
     assert any(finding.blocking for finding in outcome.findings) == (case.verdict == "blocks")
     assert found[case.found].blocking == (case.verdict == "blocks")
+    assert found[case.found].warning == (case.verdict == "warned")
 
 
 @every_case

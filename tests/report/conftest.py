@@ -26,6 +26,7 @@ Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 
 SEED = 3
 FINDING = Finding("stale-frames", 91, True, "91 of 1106 frames repeat the one before; their tracks end there", False)
+UNDECIDED = {"time-offset": "too little change of rotation", "twist-lag": "too little change of rotation"}
 
 
 @pytest.fixture(scope="session")
@@ -111,7 +112,7 @@ def rescored() -> Rescored:
 def compared(sequence: Sequence, runs: tuple[Run, ...]) -> Comparison:
     assert sequence.prior is not None
     outcomes = tuple(outcome_of(run, sequence, SEED) for run in runs)
-    return Comparison("made-up", sequence, (FINDING,), sequence.prior, (SEED,), outcomes)
+    return Comparison("made-up", sequence, (FINDING,), sequence.prior, (SEED,), outcomes, undecided=UNDECIDED)
 
 
 def _run(name: str, sequence: Sequence, turn_rad: float, growth: float = 1.0) -> Run:

@@ -94,6 +94,10 @@ def test_every_axis_unit_is_known(page: str) -> None:
         assert column["meaning"]
 
 
+def test_what_the_audit_could_not_judge_is_shown(case: Json, comparison: Comparison) -> None:
+    assert case["words"]["undecided"] == comparison.undecided
+
+
 def test_a_failed_run_is_shown_without_a_track_and_with_reasons(case: Json) -> None:
     one = row(case, "broken")
     assert one["status"] == "failed"

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
 from toolkit.documents import parse, to_text
 from toolkit.experiment.comparison import Comparison, Row
@@ -42,11 +43,21 @@ def test_the_metrics_package_knows_every_key_of_the_contract() -> None:
 
 
 def test_key_order_is_stable(document: dict[str, Any]) -> None:
-    assert list(document) == ["schema", "sequence", "audit", "runs"]
+    assert list(document) == ["schema", "sequence", "audit", "undecided", "runs"]
     expected = ["name", "hash", "frames", "tracks", "observations", "duration_s", "path_m", "motion"]
     assert list(document["sequence"]) == expected
     for run in document["runs"]:
         assert list(run["metrics"]) == list(describe())
+
+
+def test_what_the_audit_could_not_judge_is_told(comparison: Comparison, document: dict[str, Any]) -> None:
+    assert comparison.undecided
+    assert document["undecided"] == comparison.undecided
+
+
+def test_a_document_of_before_faults_could_be_undecided_is_read(document: dict[str, Any]) -> None:
+    older = {key: value for key, value in document.items() if key != "undecided"}
+    assert parse(json.dumps(older), Metrics).undecided is UNSET
 
 
 def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], without_truth: Comparison) -> None:

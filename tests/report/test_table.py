@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.audit import Finding
 from toolkit.errors import VislamError
 from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
@@ -175,8 +176,21 @@ def test_audit_start_and_facts_are_told(comparison: Comparison) -> None:
     for text in (comparison_text(comparison), report_text(comparison, {})):
         words = " ".join(text.split())
         assert comparison.findings[0].detail in words
+        assert "not decidable: time-offset, twist-lag: too little change of rotation" in words
         assert comparison.prior.source in words
         assert all(fact in words for fact in comparison.sequence.provenance.facts)
+
+
+def test_a_warning_of_the_audit_stands_above_the_table_whatever_the_status(comparison: Comparison) -> None:
+    warning = Finding("conflict", 1, False, "vision and odometry disagree at 41-50 s", False, warning=True)
+    for text in (
+        comparison_text(replace(comparison, findings=(warning,))),
+        report_text(replace(comparison, findings=(warning,)), {}),
+    ):
+        above, below = text.split("estimator", 1)
+        assert "what the audit says of: conflict" in " ".join(above.split())
+        assert "disagree at 41-50 s" in below
+    assert "what the audit says of" not in comparison_text(comparison)
 
 
 def test_a_recording_without_image_features_says_so(comparison: Comparison) -> None:

@@ -77,6 +77,27 @@ def test_outlier_tracks_begin_where_they_were_and_slide(drive: Sequence) -> None
     assert moved[later].any(axis=1).mean() == pytest.approx(0.3, abs=0.1)
 
 
+def test_moving_points_keep_their_height_over_the_road_and_move_for_a_third_of_the_time(drive: Sequence) -> None:
+    before, after = drive.observations, faults.moving_objects(drive, 1.0, 0).observations
+    seen_s = seen_at_s(faults.moving_objects(drive, 1.0, 0))
+    key = {(f, t): uv for f, t, uv in zip(before.frame, before.track_id, before.uv_px, strict=True)}
+    moved = np.array(
+        [not np.allclose(key[f, t], uv) for f, t, uv in zip(after.frame, after.track_id, after.uv_px, strict=True)]
+    )
+    assert np.ptp(seen_s[moved]) == pytest.approx(drive.duration_s / 3.0, abs=0.3)  # but for the first sightings in it
+    depth_and_row = [
+        (uv[2] - drive.rig.cy_px) / (uv[0] - uv[1]) - (key[f, t][2] - drive.rig.cy_px) / (key[f, t][0] - key[f, t][1])
+        for f, t, uv in zip(after.frame, after.track_id, after.uv_px, strict=True)
+    ]
+    assert np.allclose(depth_and_row, 0.0, atol=1e-9)
+
+
+def test_disturbed_motion_is_off_by_the_dose_for_a_third_of_the_samples(drive: Sequence) -> None:
+    off = np.linalg.norm(faults.disturbed_motion(drive, 1.5, 0).motion.values - drive.motion.values, axis=1)
+    assert np.allclose(off[off > 0.0], 1.5)
+    assert (off > 0.0).mean() == pytest.approx(1.0 / 3.0, abs=0.03)
+
+
 def test_few_tracks_last_as_long_as_they_did(drive: Sequence) -> None:
     few = faults.few_tracks(drive, 3, 0).observations
     assert np.bincount(few.frame, minlength=drive.frame_count).tolist() == [3] * drive.frame_count

@@ -14,7 +14,8 @@ class Finding:
     """One fault found in a recording, as it is reported.
 
     ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means
-    that the fault is harmful and still there, so that a check of the recording has to fail.
+    that the fault is harmful and still there, so that a check of the recording has to fail. A ``warning`` has no
+    repair and does not block, but every result has to be read with it in mind.
     """
 
     fault: str
@@ -22,6 +23,7 @@ class Finding:
     repaired: bool
     detail: str
     blocking: bool
+    warning: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class Symptom:
 
     ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
     the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks. One
-    that ``spoils_vision`` and is not repaired leaves nothing to conclude from the tracks.
+    that ``warns`` does not block either, but may spoil results. One that ``spoils_vision`` and is not repaired leaves
+    nothing to conclude from the tracks.
     """
 
     count: int
@@ -38,6 +41,7 @@ class Symptom:
     treatment: str
     remedy: Sequence | None
     harmful: bool = True
+    warns: bool = False
     spoils_vision: bool = False
 
 

@@ -62,8 +62,8 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
         u, v = (f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
         where = f"(cx_px, cy_px) = ({centre[0]:.0f}, {centre[1]:.0f}) lies outside the sightings, u {u}, v {v} px"
         found.append(({"cx_px": float(middle[0]), "cy_px": float(middle[1])}, where))
-    if not NARROWEST < width_px / rig.fx_px < WIDEST:
-        angle_deg = np.degrees(2.0 * np.arctan(0.5 * width_px / rig.fx_px))
+    if not NARROWEST * rig.fx_px < width_px < WIDEST * rig.fx_px:
+        angle_deg = np.degrees(2.0 * np.arctan2(0.5 * width_px, rig.fx_px))
         usual_px = width_px / USUAL
         words = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
         found.append(({"fx_px": usual_px, "fy_px": usual_px}, words))

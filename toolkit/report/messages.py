@@ -54,13 +54,19 @@ def sequence_line(sequence: Sequence) -> str:
 
 
 def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what stands above a table: the recording, matched pairs and coverage the rows share, the common rules."""
+    """Yield what stands above a table: the recording, pairs and coverage the rows share, the common rules, warnings.
+
+    The warnings are the audit's: they hold for every row, whatever its status.
+    """
     seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
     yield sequence_line(comparison.sequence) + seeds
     shared = ", ".join(shared_values(comparison, columns))
     if shared:
         yield f"scored: {shared}"
     yield rules_line(comparison)
+    warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
+    if warnings:
+        yield f"whatever its status, no result stands without what the audit says of: {', '.join(warnings)}"
 
 
 def rules_line(comparison: Comparison) -> str:
@@ -107,7 +113,9 @@ def outcome(finding: Finding) -> str:
     """Say in one or two words what became of a finding."""
     if finding.repaired:
         return "too much lost" if finding.blocking else "repaired"
-    return "not repaired" if finding.blocking else "for information"
+    if finding.blocking:
+        return "not repaired"
+    return "warning" if finding.warning else "for information"
 
 
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:

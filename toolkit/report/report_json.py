@@ -120,6 +120,7 @@ def _words(comparison: Comparison) -> Words:
         audit=tuple(
             AuditWords(fault=f.fault, count=f.count, outcome=outcome(f), detail=f.detail) for f in comparison.findings
         ),
+        undecided=dict(comparison.undecided),
         facts=comparison.sequence.provenance.facts,
         changes=dict(comparison.changes),
     )

@@ -30,6 +30,7 @@ def metrics_document(comparison: Comparison) -> Metrics:
         audit=tuple(
             AuditEntry(fault=f.fault, count=f.count, repaired=f.repaired, detail=f.detail) for f in comparison.findings
         ),
+        undecided=dict(comparison.undecided),
         runs=tuple(_run(row) for row in comparison.rows),
     )
 

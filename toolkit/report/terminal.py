@@ -51,6 +51,8 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
     if any(f.blocking for f in findings):
         lines += ["", *_spoiling(findings)]
+    elif any(f.warning for f in findings):
+        lines += ["", f"results have to be read with this in mind: {', '.join(f.fault for f in findings if f.warning)}"]
     elif findings and not audited.undecided:
         lines += ["", "nothing is left that spoils a result"]
     return "\n".join(lines)

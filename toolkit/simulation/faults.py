@@ -15,6 +15,7 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
 from toolkit.measured_motion import TwistNoise, TwistSamples
+from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, Truth
 
@@ -48,6 +49,27 @@ def outlier_tracks(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequ
     step_px = (slides * speed_px * np.stack([np.cos(angle), np.sin(angle)])).T
     age = seen.frame - seen.frame[first][row]
     return _with_pixels(sequence, seen.uv_px + age[:, None] * step_px[row][:, [0, 0, 1]])
+
+
+def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Let a share of the points move as one for a third of the recording: traffic that flows with the vehicle.
+
+    They move in the camera's axes, level in the image, by a quarter of the scene's median depth a second. What comes
+    closer than half a metre is lost.
+    """
+    seen, rig = sequence.observations, sequence.rig
+    rng, (begin_s, end_s) = np.random.default_rng(seed), _span_s(sequence, sequence.duration_s / 3.0, seed)
+    seen_s = _frames_s(sequence)[seen.frame]
+    moves = _struck_tracks(sequence, dose, seed) & (seen.uv_px[:, 0] > seen.uv_px[:, 1])
+    moves &= (seen_s >= begin_s) & (seen_s < end_s)
+    angle, points = rng.uniform(0.0, 2.0 * np.pi), triangulate(seen.uv_px[moves], rig)
+    velocity_mps = 0.25 * np.median(points[:, 2]) * np.array([np.cos(angle), 0.0, np.sin(angle)])
+    _, first, row = np.unique(seen.track_id[moves], return_index=True, return_inverse=True)
+    moved = points + (seen_s[moves] - seen_s[moves][first][row])[:, None] * velocity_mps
+    uv_px, kept = seen.uv_px.copy(), np.ones(len(seen), dtype=bool)
+    kept[moves] = moved[:, 2] > 0.5
+    uv_px[moves & kept] = project(moved[kept[moves]], rig)
+    return replace(sequence, observations=Observations(seen.frame, seen.track_id, uv_px).select(kept))
 
 
 def few_tracks(sequence: Sequence, dose: float = 3.0, seed: int = 0) -> Sequence:
@@ -118,6 +140,14 @@ def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
     rng, values = np.random.default_rng(seed), sequence.motion.values.copy()
     values[rng.integers(len(values) // 4, 3 * len(values) // 4), rng.integers(6)] = dose
     return _with_values(sequence, values)
+
+
+def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Add so many m/s, or m/s^2, along an axis drawn to a third of the motion samples: wheels that slip, vibration."""
+    begin_s, end_s = _span_s(sequence, sequence.duration_s / 3.0, seed)
+    axis, t_s = np.random.default_rng(seed).standard_normal(3), _samples_s(sequence)
+    added = np.concatenate([dose * axis / np.linalg.norm(axis), np.zeros(3)])
+    return _with_values(sequence, sequence.motion.values + ((t_s >= begin_s) & (t_s < end_s))[:, None] * added)
 
 
 def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:

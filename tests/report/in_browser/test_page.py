@@ -168,3 +168,9 @@ def test_a_hostile_name_runs_nothing(page: Page, run_called: Callable[[str], Pat
     assert page.find("h1").text == HOSTILE
     assert page.run("return window.broken === undefined")
     assert page.run("return document.querySelectorAll('img').length") == 0
+
+
+def test_faults_that_could_not_be_judged_stand_together_by_their_reason(page: Page, single: Path) -> None:
+    page.open(single)
+    told = [entry.get_attribute("textContent") for entry in page.all(".findings li")]
+    assert told[-1] == "not decidable time-offset, twist-lag: too little change of rotation"

@@ -50,6 +50,12 @@ class AuditEntry(Struct, frozen=True, kw_only=True):
     detail: Annotated[str, Meta(description="one sentence")]
 
 
+Undecided = (
+    Annotated[dict[str, str], Meta(description="by fault, why it could not be judged; absent before it was added")]
+    | UnsetType
+)
+
+
 class Judged(Struct, frozen=True, kw_only=True):
     """What a run's errors, or its innovations, say of the uncertainty it states."""
 
@@ -93,4 +99,5 @@ class Metrics(Struct, frozen=True, kw_only=True):
     schema: Literal["vislam.metrics/1"]
     sequence: SequenceRead
     audit: Annotated[tuple[AuditEntry, ...], Meta(description="in the order checked; empty for a clean recording")]
+    undecided: Undecided = UNSET
     runs: Annotated[tuple[ScoredRun, ...], Meta(description="by estimator, causal before final")]

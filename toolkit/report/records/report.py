@@ -7,10 +7,11 @@ digits; what is not finite is null.
 from collections.abc import Sized
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct
 from msgspec.structs import asdict
 
 from toolkit.estimate import Output
+from toolkit.report.records.metrics import Undecided
 
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
 Numbers = tuple[float | None, ...]
@@ -118,6 +119,7 @@ class Words(Struct, frozen=True, kw_only=True):
     remarks: tuple[str, ...]
     start: str
     audit: tuple[AuditWords, ...]
+    undecided: Undecided = UNSET
     facts: tuple[str, ...]
     changes: Annotated[dict[str, str], Meta(description="on a ladder, what each rung changes")]
 

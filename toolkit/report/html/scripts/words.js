@@ -9,11 +9,11 @@ const STATUS_WORDS = {
 
 /** What the case says in words: trouble first, then notes, the audit, the recording, how to repeat it. */
 function wordsOf(one) {
-  const { notes, remarks = [], audit, facts = [], start } = one.words;
+  const { notes, remarks = [], audit, undecided = {}, facts = [], start } = one.words;
   return [
     el("div", { class: "words" },
       listCard("Notes", notes, "Nothing out of the ordinary."),
-      audit ? auditCard(audit) : listCard("Is the stated uncertainty honest?", one.words.verdicts),
+      audit ? auditCard(audit, undecided) : listCard("Is the stated uncertainty honest?", one.words.verdicts),
       listCard("The recording", [`Every estimator started from: ${start}`, ...facts]),
       manifestCard(one)),
     remarks.length ? folded("Remarks on single numbers", el("ul", {}, remarks.map((text) => el("li", { text })))) : null,
@@ -27,12 +27,17 @@ function listCard(title, lines, none = "") {
   return el("section", { class: "card" }, el("h3", { text: title }), body);
 }
 
-function auditCard(findings) {
+/** The faults that were found, then those that could not be judged, together where the reason is the same. */
+function auditCard(findings, undecided) {
   const list = findings.map((found) => el("li", {},
     el("span", { class: `outcome ${found.outcome.replaceAll(" ", "-")}`, text: found.outcome }), " ",
     el("b", { text: found.fault }), `: ${found.detail}`));
+  const unjudged = [...new Set(Object.values(undecided))].map((why) => el("li", {},
+    el("span", { class: "outcome", text: "not decidable" }), " ",
+    el("b", { text: Object.keys(undecided).filter((fault) => undecided[fault] === why).join(", ") }), `: ${why}`));
   return el("section", { class: "card" }, el("h3", { text: "What the audit found" }),
-    list.length ? el("ul", { class: "findings" }, list) : el("p", { text: "No fault found in the recording." }));
+    list.length ? null : el("p", { text: "No fault found in the recording." }),
+    list.length || unjudged.length ? el("ul", { class: "findings" }, list, unjudged) : null);
 }
 
 function folded(title, ...content) {

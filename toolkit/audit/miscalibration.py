@@ -1,0 +1,63 @@
+"""A calibration that is nearly right: the camera turned in its mount, a principal point or a scale a little off.
+
+Too little to be told from noise in single frames, and enough to bend every trajectory. What is wrong the recording does
+not say: a camera turned by an angle and a principal point off by the focal length times that angle look the same.
+"""
+
+import numpy as np
+
+from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.turn import turn_of_camera
+from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
+
+SIGMAS = 5.0
+# What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
+# and by rotations; ratios of speed of 0.96 to 1.02. Chosen with them in view.
+SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.004}
+SYSTEMATIC_RATIO = 0.05
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Compare directions and sizes of the camera's motion with the measured ones."""
+    intervals, rig = evidence.intervals, evidence.sequence.rig
+    if intervals is None:
+        return evidence.blind
+    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam)
+    if (np.abs(turn.rad) > SIGMAS * turn.error_rad + SYSTEMATIC_RAD[evidence.sequence.motion_kind]).any():
+        angle = float(np.linalg.norm(turn.rad))
+        said.append(
+            f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
+            f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
+        )
+    speed, rotation = speed_ratio(intervals), rotation_ratio(intervals)
+    if speed is not None and 1.0 / MOST_RATIO < speed.value < MOST_RATIO and _is_off(speed):
+        said.append(f"the samples' speed is {speed.value:.3f} +- {speed.error:.3f} times the camera's")
+    if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
+        said.append(f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera")
+    force = force_ratio(evidence.sequence)
+    if force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO and _is_off(force):
+        said.append(f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)")
+    if not said:
+        return None
+    return Symptom(
+        count=len(said),
+        detail="; ".join(said),
+        treatment="check the extrinsic, the principal point, the baseline and the scale of the samples",
+        remedy=None,
+        harmful=False,
+        warns=True,
+    )
+
+
+def _is_off(ratio: Scalar) -> bool:
+    return abs(ratio.value - 1.0) > SIGMAS * ratio.error + SYSTEMATIC_RATIO
+
+
+FAULT = Fault(
+    "miscalibration",
+    "a camera turned a little against its extrinsic, or a scale that is a little off",
+    check,
+    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+)

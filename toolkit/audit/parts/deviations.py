@@ -1,0 +1,182 @@
+"""By how much the motion samples deviate from the camera's own motion, interval by interval, and for how long.
+
+Neither tells alone which of the two is wrong. What the mean of a stretch of time deviates by is held against what such
+means scatter by in the rest of the recording, which holds noise, slip and what else is usual there.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter, minimum_filter
+
+from toolkit.audit.parts.intervals import Intervals, interval_means
+from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
+from toolkit.audit.parts.vision import CameraMotion
+from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
+
+# Length of the stretches that are averaged: longer than a correction of the steering, shorter than a red light.
+STRETCH_S = 2.0
+# Of fewer intervals no mean is taken.
+LEAST_IN_STRETCH = 8
+# From so many stretches on a recording shows itself how much their means scatter.
+LEAST_STRETCHES = 10
+# The specific force is compared with gravity as it was within so many seconds: the gyro's drift turns it after that.
+GRAVITY_S = 10.0
+# A velocity is the median of so many; its standard deviation is that of a single one times this, for normal errors.
+_MEDIAN_OF, _MEDIAN_ERROR = 5, 0.536
+# The quartile of the absolute value of a normal variable, over its standard deviation.
+_LOWER_QUARTILE = 0.3186
+
+
+class Deviation(NamedTuple):
+    """Samples less camera, at times (n,) s from the first frame: (n, 3), named ``what``, in ``unit``.
+
+    ``noise`` (3,) is the standard deviation of the mean of n intervals times the root of n, or times n where
+    ``telescopes``: a change of velocity averages to that between the ends.
+    """
+
+    what: str
+    unit: str
+    t_s: Array
+    value: Array
+    noise: Array
+    telescopes: bool
+
+
+class Span(NamedTuple):
+    """A time (s from the first frame) during which a deviation lasts, and the largest size of its means there."""
+
+    begin_s: float
+    end_s: float
+    size: float
+
+
+def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> tuple[Deviation, ...]:
+    """Return what can be compared: rotation, and the velocity of twists or the specific force of an IMU.
+
+    The gyro's constant bias is taken off first.
+    """
+    T_imu_cam = sequence.rig.T_imu_cam
+    frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    t_s = 0.5 * (frame_s[intervals.interval] + frame_s[intervals.interval + 1])
+    w_radps = intervals.w_radps - intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    bias_radps = np.median(w_radps, axis=0)
+    rotation = _of_medians("rate of rotation", "rad/s", t_s, w_radps - bias_radps)
+    if intervals.v_mps is None:
+        return rotation, _specific_force(sequence, camera, bias_radps)
+    lever_mps = np.cross(intervals.w_radps - bias_radps, T_imu_cam[:3, 3])
+    v_mps = intervals.v_mps + lever_mps - intervals.v_cam_mps @ T_imu_cam[:3, :3].T
+    return rotation, _of_medians("velocity", "m/s", t_s, v_mps)
+
+
+def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
+    """Return the spans in which the means of the stretches deviate by so many of their standard deviations.
+
+    Those are what white noise makes of them, or in a long recording what they scatter by in its quieter half, if that
+    is more. ``least`` is the smallest deviation that counts, in its unit.
+    """
+    stretches = _stretches(deviation)
+    if not stretches.centre_s.size:
+        return []
+    noise = stretches.noise
+    if np.ptp(stretches.centre_s) > LEAST_STRETCHES * STRETCH_S:
+        off_centre = np.abs(stretches.mean - np.median(stretches.mean, axis=0))
+        noise = np.maximum(noise, np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
+    improbable = np.linalg.norm(stretches.mean / noise, axis=1) > sigmas
+    return _spans(stretches, np.asarray(improbable & (np.linalg.norm(stretches.mean, axis=1) > least)))
+
+
+class _Stretches(NamedTuple):
+    """Centres (m,) s of the stretches, the means (m, 3) of a deviation in them and the noise (m, 3) of those."""
+
+    centre_s: Array
+    mean: Array
+    noise: Array
+
+
+def _stretches(deviation: Deviation) -> _Stretches:
+    """Average a deviation over every stretch that begins with one of its intervals and is whole."""
+    t_s, value = deviation.t_s, deviation.value
+    begin = np.flatnonzero(t_s + STRETCH_S <= t_s[-1:] + 1e-9)
+    end = np.searchsorted(t_s, t_s[begin] + STRETCH_S)
+    enough = end - begin >= LEAST_IN_STRETCH
+    if deviation.telescopes:  # from end to end without a gap
+        step_s = np.diff(t_s, append=t_s[-1:])
+        gaps = np.concatenate([[0], np.cumsum(step_s > 1.5 * np.median(step_s))])
+        enough &= gaps[np.maximum(end - 1, 0)] == gaps[begin]
+    begin, end = begin[enough], end[enough]
+    count = (end - begin)[:, None]
+    average = np.mean if deviation.telescopes else np.median
+    mean = np.array([average(value[i:j], axis=0) for i, j in zip(begin, end, strict=True)]).reshape(-1, 3)
+    noise = deviation.noise / (count if deviation.telescopes else np.sqrt(count))
+    return _Stretches(0.5 * (t_s[begin] + t_s[end - 1]), mean, noise)
+
+
+def _spans(stretches: _Stretches, deviates: BoolArray) -> list[Span]:
+    """Join stretches that deviate and overlap; each counts from a quarter to three quarters of its length."""
+    spans: list[Span] = []
+    size = np.linalg.norm(stretches.mean, axis=1)
+    for row in np.flatnonzero(deviates).tolist():
+        centre_s, here = float(stretches.centre_s[row]), float(size[row])
+        span = Span(centre_s - 0.25 * STRETCH_S, centre_s + 0.25 * STRETCH_S, here)
+        if spans and span.begin_s <= spans[-1].end_s:
+            span = Span(spans[-1].begin_s, span.end_s, max(spans.pop().size, here))
+        spans.append(span)
+    return spans
+
+
+def _of_medians(what: str, unit: str, t_s: Array, value: Array) -> Deviation:
+    return Deviation(what, unit, t_s, value, MEDIAN_TO_MEAN_ERROR * _scatter(value), telescopes=False)
+
+
+def _scatter(value: Array) -> Array:
+    """Return the standard deviation (3,) from one interval to the next, which what lasts does not raise."""
+    change = np.abs(np.diff(value, axis=0))
+    return np.asarray(MAD_TO_SIGMA * np.median(change, axis=0) / np.sqrt(2.0))
+
+
+def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array) -> Deviation:
+    """Return what the change of the camera's velocity leaves of the specific force, less gravity as it is around then.
+
+    In the axes of the first frame, into which the gyro turns everything, the velocity changes by the specific force
+    plus gravity, a constant but for the drift of the gyro. Of five velocities the median is taken.
+    """
+    R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
+    frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
+    middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
+    w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
+    v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
+    h_s = np.diff(middle_ns)[:, None] / NS_PER_S
+    mean = interval_means(motion.t_ns, motion.values, middle_ns)
+    half = so3_exp(0.5 * h_s * (mean[:, 3:] - bias_radps))
+    R_first_imu = _chained(half @ half)
+    v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
+    smooth = np.asarray(median_filter(v_first, size=(_MEDIAN_OF, 1), mode="nearest"))
+    force = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1)
+    sound = minimum_filter(camera.known, size=_MEDIAN_OF, mode="nearest")
+    rows = np.flatnonzero(sound[1:] & sound[:-1])
+    t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
+    value = (np.diff(smooth, axis=0) / h_s - force)[rows]
+    bend = np.abs(np.diff(v_first, n=2, axis=0))[rows[rows < len(v_first) - 2]]
+    sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
+    noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
+    return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
+
+
+def _chained(rotation: Array) -> Array:
+    """Return the products (n + 1, 3, 3) of the first 0, 1, ... n rotations (n, 3, 3)."""
+    chained = np.tile(np.eye(3), (len(rotation) + 1, 1, 1))
+    for k in range(len(rotation)):
+        chained[k + 1] = chained[k] @ rotation[k]
+    return chained
+
+
+def _around(t_s: Array, value: Array) -> Array:
+    """Return the median (n, 3) of values (n, 3) within GRAVITY_S of each, taken once a second."""
+    knots_s: Array = np.unique(np.floor(t_s))
+    first: IntArray = np.searchsorted(t_s, knots_s - GRAVITY_S)
+    last: IntArray = np.searchsorted(t_s, knots_s + 1.0 + GRAVITY_S)
+    medians = np.array([np.median(value[i:j], axis=0) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
+    return medians[np.searchsorted(knots_s, np.floor(t_s))]
