@@ -220,7 +220,7 @@ def test_every_number_is_found_again_to_the_bit(store: OutcomeStore, tmp_path: P
     assert [type(value) for value in kept.values()][:3] == [int, float, float]
 
 
-BOUND = ("bound_", "efficiency", "excess_", "claimed_")
+BOUND = ("bound_", "efficiency", "excess_", "claimed_", "error_over_bound")
 
 
 def test_two_processes_do_not_write_into_one_another(store: OutcomeStore, tmp_path: Path) -> None:
