@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, wilcoxon
+from scipy.special import ndtri
 
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import Baseline, BaselineError, Case
@@ -119,6 +119,8 @@ def judge_speeds(found: Sequence[Timed], version: str, rate: float) -> Iterator[
 
 def _beyond_p(differences: Array) -> float:
     """Return the p-value that the median of differences (n,) exceeds the margin."""
+    from scipy.stats import wilcoxon  # its import takes as long as all the others', and most checks do without
+
     excess = differences - np.log1p(MARGIN)
     return float(wilcoxon(excess, alternative="greater").pvalue) if np.any(excess) else 1.0
 
@@ -131,7 +133,7 @@ def _scale(differences: Array) -> float:
 def _seen(differences: Array, rate: float) -> float:
     """Return the change that one test at ``rate`` sees with 95 % power; its efficiency is 3/pi of the t-test's."""
     error = _scale(differences) * np.sqrt(np.pi / 3.0 / differences.size)
-    return float(np.log1p(MARGIN) + (norm.isf(rate) + norm.ppf(POWER)) * error)
+    return float(np.log1p(MARGIN) + (ndtri(POWER) - ndtri(rate)) * error)
 
 
 def pairs_needed(differences: Array) -> int:
