@@ -33,6 +33,7 @@ from toolkit.measured_motion import (
     motions_between,
 )
 from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.track_noise import TrackNoise
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
 HELD_OUT_ONE_IN = 10
@@ -63,7 +64,7 @@ class StereoRig:
 
     ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
     ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
-    variance is half of theirs.
+    variance is half of theirs. ``track_noise`` says how the errors of one track hang together; None is not at all.
     """
 
     fx_px: float
@@ -73,6 +74,7 @@ class StereoRig:
     baseline_m: float
     T_imu_cam: Array
     cov_uv_px2: Array
+    track_noise: TrackNoise | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))

@@ -20,6 +20,7 @@ _NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
+TrackModel = Literal["white", "correlated"]
 Scalar = bool | int | float | str
 
 
@@ -148,6 +149,20 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     motion_scale: Annotated[
         float, Meta(gt=0.0, le=1e3, description="factor on the white-noise densities of the motion samples")
     ] = 1.0
+    tracks: Annotated[
+        TrackModel,
+        Meta(description="errors of a track's sightings: each by itself, or a walk and an offset"),
+    ] = "white"
+    track_white_px: Annotated[
+        float,
+        Meta(gt=0.0, le=100.0, description="correlated: white part, in column and row", extra={"unit": "px"}),
+    ] = 0.03
+    track_walk_px: Annotated[
+        float, Meta(ge=0.0, le=100.0, description="correlated: walk per root frame", extra={"unit": "px"})
+    ] = 0.13
+    track_offset_px: Annotated[
+        float, Meta(ge=0.0, le=100.0, description="correlated: offset of a track's disparity", extra={"unit": "px"})
+    ] = 0.7
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):

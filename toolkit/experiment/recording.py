@@ -18,6 +18,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, Varied
 from toolkit.simulation import SCENARIOS, simulate
+from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
 STARTS: dict[Start, Callable[[Sequence], Prior]] = {
@@ -116,5 +117,13 @@ def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
     rig = sequence.rig
     if asked.pixel_sigma_px is not None:
         rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (asked.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
+    if asked.tracks == "correlated":
+        rig = replace(rig, track_noise=_stated_track_noise(asked))
     noise = sequence.noise if asked.motion_scale == 1.0 else sequence.noise.scaled(asked.motion_scale)
     return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
+
+
+def _stated_track_noise(asked: Noise) -> TrackNoise:
+    """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
+    white, walk, offset = asked.track_white_px, asked.track_walk_px, asked.track_offset_px
+    return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))

@@ -1,0 +1,43 @@
+"""How the errors of one track's sightings hang together: white noise, a random walk, and an offset of its own.
+
+A tracker that follows a patch from image to image adds a little error at every step (a walk), and one that matched left
+and right once, at the track's birth, is wrong by the same disparity for the track's whole life (an offset). White noise
+alone is what simulators draw and what most estimators assume.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.arrays import freeze_arrays
+from toolkit.geometry import Array
+
+# (c, d, v) = CHANNELS @ (uL, uR, v): the mean column, the disparity, the row. Their errors are taken as independent.
+CHANNELS = np.array([[0.5, 0.5, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+CHANNELS.flags.writeable = False
+
+
+@dataclass(frozen=True, eq=False)
+class TrackNoise:
+    """Standard deviations (3,) in the channels (c, d, v) of the parts of a track's error.
+
+    ``white_px`` px of every sighting by itself; ``walk_px`` px per root frame; ``offset_px`` px of the track, constant.
+    The covariance of the errors of sightings j and k, whose ages in frames are a_j and a_k, is
+    ``white^2 [j = k] + walk^2 min(a_j, a_k) + offset^2``.
+    """
+
+    white_px: Array
+    walk_px: Array
+    offset_px: Array
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, white_px=(3,), walk_px=(3,), offset_px=(3,))
+
+    def cov(self, ages: Array) -> Array:
+        """Return the covariance (..., 3, n, n) px^2, a channel each, of sightings of a track with ages (..., n) frames.
+
+        The age of a sighting is the number of frames since the track's first one.
+        """
+        younger = np.minimum(ages[..., :, None], ages[..., None, :])[..., None, :, :]
+        white, walk, offset = (sd[:, None, None] ** 2 for sd in (self.white_px, self.walk_px, self.offset_px))
+        return np.asarray(white * np.eye(ages.shape[-1]) + walk * younger + offset)
