@@ -20,7 +20,7 @@ _NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
-TrackModel = Literal["white", "correlated"]
+TrackModel = Literal["white", "correlated", "fitted"]
 Scalar = bool | int | float | str
 
 
@@ -151,7 +151,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.0
     tracks: Annotated[
         TrackModel,
-        Meta(description="errors of a track's sightings: each by itself, or a walk and an offset"),
+        Meta(description="errors of a track's sightings: each by itself, a stated walk and offset, or fitted"),
     ] = "white"
     track_white_px: Annotated[
         float,
@@ -163,6 +163,18 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     track_offset_px: Annotated[
         float, Meta(ge=0.0, le=100.0, description="correlated: offset of a track's disparity", extra={"unit": "px"})
     ] = 0.7
+    track_fit_s: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=86400.0,
+                description="fitted: how much of the beginning, so that later causal answers rest on the past",
+                extra={"unit": "s", "none": "all of it"},
+            ),
+        ]
+        | None
+    ) = None
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):

@@ -18,6 +18,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, Varied
 from toolkit.simulation import SCENARIOS, simulate
+from toolkit.track_errors import fit_track_noise, in_words
 from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
@@ -70,6 +71,8 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     with threadpool_limits(limits=1, user_api="blas"):
         audited = audited_recording(recording, progress)
         whole = _with_noise(audited.sequence, recording.noise)
+        if recording.noise.tracks == "fitted":
+            whole = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
         sequence = _cut(whole, recording)
         return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
 
@@ -107,9 +110,13 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
 
 def _cut(sequence: Sequence, recording: Recording) -> Sequence:
     if recording.duration_s is not None:
-        end_ns = sequence.frames_t_ns[0] + round(recording.duration_s * NS_PER_S)
-        sequence = sequence.truncated(int((sequence.frames_t_ns <= end_ns).sum()))
+        sequence = _first_seconds(sequence, recording.duration_s)
     return sequence if recording.max_frames is None else sequence.truncated(recording.max_frames)
+
+
+def _first_seconds(sequence: Sequence, duration_s: float) -> Sequence:
+    end_ns = sequence.frames_t_ns[0] + round(duration_s * NS_PER_S)
+    return sequence.truncated(int((sequence.frames_t_ns <= end_ns).sum()))
 
 
 def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
@@ -127,3 +134,18 @@ def _stated_track_noise(asked: Noise) -> TrackNoise:
     """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
     white, walk, offset = asked.track_white_px, asked.track_walk_px, asked.track_offset_px
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
+
+
+def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> Sequence:
+    """Return the whole recording with the noise of the tracks that are used, or of their first seconds.
+
+    Where they turn out white the noise stays the recording's own. Raises DataError where it cannot be fitted.
+    """
+    fitted = fit_track_noise(used if fit_s is None else _first_seconds(used, fit_s))
+    basis = "all that is used of the recording, so that causal answers know it too early"
+    if fit_s is not None:
+        basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
+    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted)}"
+    provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
+    rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
+    return replace(whole, rig=rig, provenance=provenance)

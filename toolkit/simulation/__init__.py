@@ -1,11 +1,11 @@
 """Simulated recordings with exact truth: a smooth trajectory, landmarks to look at, and sensors with known noise.
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
-``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` plants
-what goes wrong.
+``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` and ``track_faults``
+plant what goes wrong.
 """
 
-from toolkit.simulation import faults
+from toolkit.simulation import faults, track_faults
 from toolkit.simulation.scenarios import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
 
-__all__ = ["DRIVE", "DRIVE_IMU", "FLIGHT", "SCENARIOS", "Scenario", "faults", "noise_free", "simulate"]
+__all__ = ["DRIVE", "DRIVE_IMU", "FLIGHT", "SCENARIOS", "Scenario", "faults", "noise_free", "simulate", "track_faults"]

@@ -15,6 +15,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, StereoRig
 from toolkit.simulation.trajectory import SmoothTrajectory
 from toolkit.simulation.world import Camera, Tracks
+from toolkit.track_noise import CHANNELS, TrackNoise
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +84,25 @@ def with_pixel_noise(
     if step_px > 0.0:
         noisy_px = np.round(noisy_px / step_px) * step_px
     return Observations(exact.frame, exact.track_id, noisy_px)
+
+
+def with_track_noise(clean: Observations, noise: TrackNoise, rng: np.random.Generator) -> Observations:
+    """Add to every track white noise, a walk from its first sighting on and an offset, in mean column, disparity, row.
+
+    Frames in which a track is not seen count for its walk as well.
+    """
+    order = np.lexsort((clean.frame, clean.track_id))
+    frame = clean.frame[order]
+    track, first, row = np.unique(clean.track_id[order], return_index=True, return_inverse=True)
+    steps = np.diff(frame, prepend=0)
+    steps[first] = 0
+    walk = np.cumsum(np.sqrt(steps)[:, None] * rng.standard_normal((len(clean), 3)), axis=0)
+    errors_px = noise.walk_px * (walk - walk[first][row])
+    errors_px += noise.offset_px * rng.standard_normal((track.size, 3))[row]
+    errors_px += noise.white_px * rng.standard_normal((len(clean), 3))
+    uv_px = clean.uv_px.copy()
+    uv_px[order] += errors_px @ np.linalg.inv(CHANNELS).T
+    return Observations(clean.frame, clean.track_id, uv_px)
 
 
 def with_outliers(clean: Observations, camera: Camera, rng: np.random.Generator) -> Observations:

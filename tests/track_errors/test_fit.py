@@ -1,0 +1,131 @@
+"""Noise that was planted is found, white noise stays white, and the parts of the fit are what they say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.errors import DataError
+from toolkit.experiment.recording import Recording, prepare
+from toolkit.geometry import se3_exp, se3_inverse, se3_log
+from toolkit.sequence import Sequence
+from toolkit.settings import settings_of
+from toolkit.simulation import SCENARIOS, noise_free, simulate
+from toolkit.simulation.track_faults import match_offset, track_walk
+from toolkit.track_errors import fit_track_noise
+from toolkit.track_errors.adjustment import adjusted, started
+from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood
+from toolkit.track_errors.linearised import linearised
+from toolkit.track_errors.tracklets import MOST_SIGHTINGS, middle_of_pair, tracklets
+from toolkit.track_noise import TrackNoise
+
+WALK_PX, OFFSET_PX = 0.13, 0.7
+MODEL = Tailed(TrackNoise(np.array([0.3, 0.4, 0.2]), np.array([0.1, 0.2, 0.15]), np.array([0.0, 0.6, 0.0])), 6.0)
+
+
+def drive_of(seconds: float, seed: int = 0) -> Sequence:
+    return simulate(replace(SCENARIOS["drive"], duration_s=seconds), seed)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Sequence:
+    return simulate(replace(noise_free(SCENARIOS["drive"]), duration_s=15.0), 0)
+
+
+@pytest.fixture(scope="module")
+def walking(exact: Sequence) -> Sequence:
+    return match_offset(track_walk(exact, WALK_PX, 1), OFFSET_PX, 2)
+
+
+def test_a_planted_walk_and_offset_are_found(walking: Sequence) -> None:
+    fit = fit_track_noise(walking)
+    assert fit.correlated
+    # About 800 tracks of eight sightings: 2 to 4 % by chance, and white noise of 0.02 px in place of none.
+    np.testing.assert_allclose(fit.noise.walk_px, WALK_PX, rtol=0.12)
+    np.testing.assert_allclose(fit.noise.offset_px, [0.0, OFFSET_PX, 0.0], rtol=0.12)
+    assert fit.noise.white_px.max() < 0.06
+    assert fit.gain > 5.0 * fit.gain_error
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_white_noise_comes_out_white(seed: int) -> None:
+    fit = fit_track_noise(drive_of(12.0, seed))
+    assert not fit.correlated
+    # c is the mean of two columns of 1 px, d their difference, v the mean of two rows; 700 tracks are good for 3 %.
+    np.testing.assert_allclose(fit.noise.white_px, [np.sqrt(0.5), np.sqrt(2.0), np.sqrt(0.5)], rtol=0.1)
+
+
+def test_the_settings_put_the_fitted_noise_on_the_rig_and_say_so(walking: Sequence) -> None:
+    asked = settings_of({"noise": {"tracks": "fitted", "track_fit_s": 10.0}}, "test").noise
+    prepared = prepare(Recording(walking, noise=asked))
+    noise = prepared.sequence.rig.track_noise
+    assert noise is not None and noise.offset_px[1] == pytest.approx(OFFSET_PX, rel=0.15)
+    assert "fitted to the first 10 s" in prepared.sequence.provenance.facts[-1]
+    white = prepare(Recording(drive_of(12.0), noise=asked)).sequence
+    assert white.rig.track_noise is None
+    assert "each sighting by itself" in white.provenance.facts[-1]
+
+
+def test_too_few_tracks_are_refused_with_what_to_do(exact: Sequence) -> None:
+    with pytest.raises(DataError, match=r"too few to fit their noise.*noise\.tracks=correlated"):
+        fit_track_noise(exact.truncated(3))
+
+
+def test_withheld_tracks_are_not_looked_at(walking: Sequence) -> None:
+    seen = np.concatenate([group.track_id for group in tracklets(walking)])
+    assert np.isin(seen, walking.visible.track_id).all()
+    assert not np.isin(seen, walking.held_out.track_id).any()
+
+
+def test_tracklets_are_the_first_sightings_up_to_a_gap(exact: Sequence) -> None:
+    seen = exact.observations
+    lost = (seen.frame == 9) & (seen.track_id % 2 == 0)
+    for group in tracklets(replace(exact, observations=seen.select(~lost))):
+        assert group.sightings <= MOST_SIGHTINGS
+        even = group.track_id % 2 == 0
+        assert not ((group.frames == 9).any(axis=1) & even).any()
+
+
+def test_derivatives_are_those_of_the_residuals(exact: Sequence) -> None:
+    rng = np.random.default_rng(0)
+    group = tracklets(exact)[4].select(slice(0, 5))
+    poses = started(exact, (group,)).T_world_middle
+    group = group.moved(rng.standard_normal((5, 3)))
+    at, step = linearised(group, poses, exact.rig), 1e-6
+    for axis in range(3):
+        further = linearised(group.moved(step * np.eye(3)[axis]), poses, exact.rig).residual_px
+        # A central difference would do no better: the second derivative times the step is 1e-7.
+        np.testing.assert_allclose((at.residual_px - further) / step, at.d_landmark[..., axis], atol=1e-5)
+    frame, sighting = int(group.first_frame[0] + 2), 2
+    for axis in range(6):
+        turned = poses.copy()
+        turned[frame] = turned[frame] @ se3_exp(step * np.eye(6)[axis])
+        # A landmark is given in its first frame, which stays.
+        further = linearised(group.select(slice(0, 1)), turned, exact.rig).residual_px
+        change = (at.residual_px[0, sighting] - further[0, sighting]) / step
+        np.testing.assert_allclose(change, at.d_pose[0, sighting, :, axis], rtol=1e-3, atol=1e-2)
+
+
+def test_the_gradient_is_that_of_the_likelihood(walking: Sequence) -> None:
+    state = started(walking, (tracklets(walking)[5].select(slice(0, 20)),))
+    group = Residuals.of(linearised(state.tracks[0], state.T_world_middle, walking.rig), 1.0)
+    at, step = likelihood(group, MODEL), 1e-6
+    parts = np.stack([MODEL.noise.white_px, MODEL.noise.walk_px, MODEL.noise.offset_px])
+    for part, channel in [(0, 0), (0, 1), (1, 1), (1, 2), (2, 1)]:
+        further = parts**2
+        further[part, channel] += step
+        change = likelihood(group, Tailed(TrackNoise(*np.sqrt(further)), 6.0)).each.sum() - at.each.sum()
+        assert change / step == pytest.approx(at.by_variance[part, channel], rel=1e-3)
+    change = likelihood(group, Tailed(MODEL.noise, 6.0 + step)).each.sum() - at.each.sum()
+    assert change / step == pytest.approx(at.by_degrees, rel=1e-3)
+
+
+def test_adjusted_poses_are_the_true_ones_where_tracks_are_exact(exact: Sequence) -> None:
+    assert exact.truth is not None
+    state = adjusted(started(exact, tracklets(exact)), MODEL, exact, 4)
+    true_poses = exact.truth.T_world_imu @ exact.rig.T_imu_cam @ middle_of_pair(exact.rig)
+    error = se3_log(se3_inverse(se3_inverse(true_poses[0]) @ true_poses) @ state.T_world_middle)
+    # Exact to the last step of Gauss-Newton, and to the ties to motions found from two views.
+    assert np.abs(error).max() < 1e-4
+    # Six unknowns a frame of about 2.5 equations from each of 85 tracks.
+    assert 0.93 < state.freedom < 0.98

@@ -1,0 +1,87 @@
+"""What real trackers do to whole tracks, to plant in a recording: errors that last, unlike noise of single sightings.
+
+Injectors as in :mod:`toolkit.simulation.faults`, ``fault(sequence, dose, seed) -> Sequence``; what goes wrong with
+single sightings, clocks (``camera_clock``) and the scale of samples (``linear_unit``, ``angular_unit``) is there.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray
+from toolkit.models.stereo import project, triangulate
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Observations, Sequence
+from toolkit.simulation.sensors import with_track_noise
+from toolkit.track_noise import CHANNELS, TrackNoise
+
+_NONE = np.zeros(3)
+# Points whose tracks begin within so many seconds are taken to be on one vehicle.
+_ONE_VEHICLE_S = 2.0
+
+
+def track_walk(sequence: Sequence, dose: float = 0.13, seed: int = 0) -> Sequence:
+    """Let every track wander by the dose (px per root frame) in mean column, disparity and row: a tracker's drift."""
+    return _with_track_noise(sequence, TrackNoise(_NONE, np.full(3, dose), _NONE), seed)
+
+
+def match_offset(sequence: Sequence, dose: float = 0.7, seed: int = 0) -> Sequence:
+    """Put every track's disparity off by a constant of its own of the dose (px): matched once, at birth, and wrong."""
+    return _with_track_noise(sequence, TrackNoise(_NONE, _NONE, np.array([0.0, dose, 0.0])), seed)
+
+
+def disparity_scale(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequence:
+    """Make all disparities larger by a share: a baseline or a focal length that is off, so that vision falls short."""
+    cdv_px = sequence.observations.uv_px @ CHANNELS.T
+    return _with_pixels(sequence, (cdv_px * np.array([1.0, 1.0 + dose, 1.0])) @ np.linalg.inv(CHANNELS).T)
+
+
+def persistent_mismatch(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
+    """Let a share of the tracks slip to another point, 5 to 30 px away, and follow that one to their end."""
+    rng, seen = np.random.default_rng(seed), sequence.observations
+    track, first, row, length = _tracks(seen)
+    slips = rng.uniform(size=track.size) < dose
+    at, angle = rng.uniform(size=track.size) * length, rng.uniform(0.0, 2.0 * np.pi, track.size)
+    away_px = (slips * rng.uniform(5.0, 30.0, track.size) * np.stack([np.cos(angle), np.sin(angle)])).T
+    slipped = seen.frame - seen.frame[first][row] > at[row]
+    return _with_pixels(sequence, seen.uv_px + slipped[:, None] * away_px[row][:, [0, 0, 1]])
+
+
+def moving_objects(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequence:
+    """Let a share of the points drive along the camera's course at a speed of their vehicle, up to 1.5 times its own.
+
+    Points whose tracks begin within two seconds are on one vehicle. Raises DataError where no truth says where the
+    camera was at the frames.
+    """
+    truth, seen, rng = sequence.truth, sequence.observations, np.random.default_rng(seed)
+    if truth is None or not np.isin(sequence.frames_t_ns, truth.t_ns).all():
+        raise DataError(f"{sequence.name}: moving objects need the truth at every frame")
+    poses = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns)] @ sequence.rig.T_imu_cam
+    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    velocity = np.gradient(poses[:, :3, 3], t_s, axis=0)
+    track, first, row, _ = _tracks(seen)
+    begin = seen.frame[first]
+    vehicle = (t_s[begin] / _ONE_VEHICLE_S).astype(np.int64)
+    speed = rng.uniform(0.3, 1.5, size=vehicle.max(initial=0) + 1)[vehicle] * (rng.uniform(size=track.size) < dose)
+    travelled = (speed[:, None] * velocity[begin])[row] * (t_s[seen.frame] - t_s[begin][row])[:, None]
+    points = triangulate(seen.uv_px, sequence.rig)
+    moved = points + (np.swapaxes(poses[seen.frame][:, :3, :3], 1, 2) @ travelled[:, :, None])[..., 0]
+    kept = moved[:, 2] > 0.5
+    shift_px = project(moved[kept], sequence.rig) - project(points[kept], sequence.rig)
+    left = seen.select(kept)
+    return replace(sequence, observations=replace(left, uv_px=left.uv_px + shift_px))
+
+
+def _with_track_noise(sequence: Sequence, noise: TrackNoise, seed: int) -> Sequence:
+    noisy = with_track_noise(sequence.observations, noise, np.random.default_rng(seed))
+    return replace(sequence, observations=noisy)
+
+
+def _tracks(seen: Observations) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return ids (T,), first rows (T,), the track of each row (N,), and lengths in sightings (T,)."""
+    return np.unique(seen.track_id, return_index=True, return_inverse=True, return_counts=True)
+
+
+def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))

@@ -1,0 +1,192 @@
+"""Which track noise a recording has: fitted to its visible tracks, and chosen among white, walk, offset and both.
+
+Poses and noise are found in turn: an adjustment of all tracks under the noise as it is known, then the noise that makes
+what is left most probable. A walk, or an offset, is believed only where it explains far more than chance would: by the
+criterion of Schwarz ("Estimating the dimension of a model", 1978), and beyond three standard errors over stretches of
+the recording, since tracks that are seen together err together.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.sequence import Sequence, check_runnable
+from toolkit.track_errors.adjustment import Adjusted, adjusted, started
+from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood
+from toolkit.track_errors.linearised import linearised
+from toolkit.track_errors.tracklets import tracklets
+from toolkit.track_noise import TrackNoise
+
+# With fewer tracks of three sightings a noise of seven parameters and its choice are not to be had.
+FEWEST_TRACKS = 100
+# Rounds of poses and noise; they end earlier where a round gains less than this log-likelihood a track.
+_ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
+# Smallest white noise, walk and offset (px), white noise never being nothing: a coordinate is not finer than this.
+_LEAST_PX = np.repeat([[0.02], [0.002], [0.01]], 3, axis=1)
+_MOST_PX = 100.0
+_DEGREES = (2.0, 200.0)
+# Walks and offsets below so many times their smallest are none.
+_NONE = 2.5
+# Where the search begins, of no effect on where it ends.
+_START_PX = np.array([[0.3, 0.5, 0.3], [0.1, 0.1, 0.1], [0.5, 0.5, 0.5]])
+_START_DEGREES = 5.0
+_STRETCHES, _SIGMAS = 12, 3.0
+
+# Parts (white, walk, offset) x (c, d, v) that a kind of noise has, the simplest first. The landmark takes up an offset
+# in c and v.
+_KINDS: dict[str, BoolArray] = {
+    "white": np.array([[1, 1, 1], [0, 0, 0], [0, 0, 0]], dtype=bool),
+    "offset": np.array([[1, 1, 1], [0, 0, 0], [0, 1, 0]], dtype=bool),
+    "walk": np.array([[1, 1, 1], [1, 1, 1], [0, 0, 0]], dtype=bool),
+    "walk and offset": np.array([[1, 1, 1], [1, 1, 1], [0, 1, 0]], dtype=bool),
+}
+_RICHEST = _KINDS["walk and offset"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What was fitted, and what speaks for it.
+
+    ``noise`` is that of most tracks, ``degrees`` of freedom those of the tracks' Student-t: the fewer, the more stray.
+    ``gain`` is the log-likelihood a track over white noise, with its standard error. ``adjusted`` has the poses and
+    landmarks it was fitted about.
+    """
+
+    noise: TrackNoise
+    degrees: float
+    gain: float
+    gain_error: float
+    adjusted: Adjusted
+
+    @property
+    def correlated(self) -> bool:
+        """Say whether the errors of a track hang together."""
+        return bool(self.noise.walk_px.any() or self.noise.offset_px.any())
+
+    @property
+    def tracks(self) -> int:
+        """Return the number of tracks."""
+        return sum(len(group.first_frame) for group in self.adjusted.tracks)
+
+
+def fit_track_noise(sequence: Sequence) -> Fit:
+    """Fit the noise of a sequence's visible tracks; the truth is not looked at.
+
+    Raises DataError where time, motion samples or tracks do not allow it.
+    """
+    check_runnable(sequence)
+    groups = tracklets(sequence)
+    count = sum(len(group.first_frame) for group in groups)
+    if count < FEWEST_TRACKS:
+        raise DataError(
+            f"{sequence.name}: {count} visible tracks have three sightings or more, too few to fit their noise to "
+            f"({FEWEST_TRACKS} are needed); state it with noise.tracks=correlated, or leave it white"
+        )
+    state, value = started(sequence, groups), -np.inf
+    model: Tailed | None = None
+    for _ in range(_ROUNDS):
+        model, reached = _most_likely(_residuals(state, sequence), _RICHEST, model)
+        if reached.each.mean() < value + _ENOUGH:
+            break
+        value = float(reached.each.mean())
+        state = adjusted(state, model, sequence, _STEPS)
+    assert model is not None
+    return _chosen(state, model, sequence)
+
+
+def _residuals(state: Adjusted, sequence: Sequence) -> list[Residuals]:
+    return [
+        Residuals.of(linearised(group, state.T_world_middle, sequence.rig), state.freedom) for group in state.tracks
+    ]
+
+
+def _most_likely(groups: list[Residuals], free: BoolArray, start: Tailed | None) -> tuple[Tailed, Likelihood]:
+    """Return the most likely noise with the parts (3, 3) that are free, and its likelihood."""
+    begin = _START_PX if start is None else np.maximum(_parts(start.noise), 2.0 * _LEAST_PX)
+    degrees = _START_DEGREES if start is None else start.degrees
+    count = sum(group.px.shape[1] for group in groups)
+
+    def model(x: Array) -> Tailed:
+        parts_px = np.zeros((3, 3))
+        parts_px[free] = np.exp(x[:-1])
+        return Tailed(TrackNoise(*parts_px), float(np.exp(x[-1])))
+
+    def cost(x: Array) -> tuple[float, Array]:
+        now = model(x)
+        found = joined(likelihood(group, now) for group in groups)
+        by_log = (2.0 * found.by_variance * _parts(now.noise) ** 2)[free]
+        return -float(found.each.mean()), -np.append(by_log, found.by_degrees * now.degrees) / count
+
+    lowest, highest = np.append(_LEAST_PX[free], _DEGREES[0]), np.append(np.full(free.sum(), _MOST_PX), _DEGREES[1])
+    x = np.log(np.clip(np.append(begin[free], degrees), lowest, highest))
+    bounds = list(zip(np.log(lowest), np.log(highest), strict=True))
+    best = model(minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds).x)
+    return best, joined(likelihood(group, best) for group in groups)
+
+
+def _parts(noise: TrackNoise) -> Array:
+    return np.stack([noise.white_px, noise.walk_px, noise.offset_px])
+
+
+def _chosen(state: Adjusted, richest: Tailed, sequence: Sequence) -> Fit:
+    """Return the simplest noise that no richer one beats."""
+    groups = _residuals(state, sequence)
+    frames = np.concatenate([group.first_frame for group in state.tracks])
+    stretch = frames * _STRETCHES // sequence.frame_count
+    kinds = [(free, *_most_likely(groups, free, richest)) for free in _KINDS.values()]
+    white = best = kinds[0]
+    for richer in kinds[1:]:
+        gain = _Gain.over(stretch, richer[2].each - best[2].each)
+        if gain.is_credible(int(richer[0].sum() - best[0].sum())):
+            best = richer
+    gain = _Gain.over(stretch, best[2].each - white[2].each)
+    model = best[1]
+    return Fit(_without_traces(model.noise), model.degrees, gain.mean, gain.error, state)
+
+
+@dataclass(frozen=True)
+class _Gain:
+    """The mean log-likelihood a track that one noise gains over another, its standard error, the number of tracks."""
+
+    mean: float
+    error: float
+    tracks: int
+
+    @classmethod
+    def over(cls, stretch: IntArray, each: Array) -> "_Gain":
+        """Return the gain of tracks (B,), which are in so many stretches (B,) of the recording."""
+        apart = np.bincount(stretch, each - each.mean(), _STRETCHES)
+        return cls(float(each.mean()), float(np.sqrt((apart**2).sum())) / each.size, each.size)
+
+    def is_credible(self, further: int) -> bool:
+        """Say whether it is worth so many further parameters."""
+        return bool(self.mean > max(_SIGMAS * self.error, 0.5 * further * np.log(self.tracks) / self.tracks))
+
+
+def _without_traces(noise: TrackNoise) -> TrackNoise:
+    walk_px, offset_px = (
+        np.where(part < _NONE * least, 0.0, part) for part, least in zip(_parts(noise)[1:], _LEAST_PX[1:], strict=True)
+    )
+    return TrackNoise(noise.white_px, walk_px, offset_px)
+
+
+def in_words(fit: Fit) -> str:
+    """Return the fitted noise in a line."""
+    noise = fit.noise
+    parts = [f"white {_of_channels(noise.white_px)}"]
+    if noise.walk_px.any():
+        parts.append(f"a walk of {_of_channels(noise.walk_px)} per root frame")
+    if noise.offset_px.any():
+        parts.append(f"an offset of {noise.offset_px[1]:.2f} px in d")
+    if not fit.correlated:
+        return f"{parts[0]}, each sighting by itself; the recording's own noise stands"
+    return (
+        f"{', '.join(parts)}; {fit.gain:.1f} +- {fit.gain_error:.1f} in log-likelihood a track better than white noise"
+    )
+
+
+def _of_channels(parts_px: Array) -> str:
+    return "/".join(f"{part:.2f}" for part in parts_px) + " px in c/d/v"
