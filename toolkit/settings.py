@@ -243,6 +243,9 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     start: Annotated[
         Literal["measurements", "truth"], Meta(description="where the first state comes from; the truth is labelled")
     ] = "measurements"
+    card: Annotated[
+        bool, Meta(description="in the report, what the recording's tracks are like; takes some seconds")
+    ] = False
     first_seed: Annotated[int, Meta(ge=0, description="seed of simulated sequences, the first of several")] = 0
     seeds: Annotated[
         int, Meta(ge=1, le=100_000, description="how many seeds a simulated sequence is repeated over")

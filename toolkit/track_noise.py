@@ -33,6 +33,11 @@ class TrackNoise:
     def __post_init__(self) -> None:
         freeze_arrays(self, white_px=(3,), walk_px=(3,), offset_px=(3,))
 
+    @property
+    def is_correlated(self) -> bool:
+        """Say whether the errors of a track hang together at all."""
+        return bool(self.walk_px.any() or self.offset_px.any())
+
     def cov(self, ages: Array) -> Array:
         """Return the covariance (..., 3, n, n) px^2, a channel each, of sightings of a track with ages (..., n) frames.
 

@@ -19,7 +19,8 @@ from toolkit.report.records.schemas import RECORDS, schema_files
 
 Document = dict[str, Any]
 
-# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records.
+# Written by the commands of revision 0d93a31 on `drive`: the hand-written predecessors of the records; the card by the
+# first command that made one.
 OLD = Path(__file__).parent / "documents"
 SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
 CASES = {
@@ -32,6 +33,7 @@ CASES = {
     "baseline.json": "baseline-1",
     "trajectory-baseline.json": "trajectory-baseline-1",
     "check.json": "check-2",
+    "card.json": "card-1",
 }
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from toolkit.geometry import Array
     from toolkit.sequence import Prior
     from toolkit.sequence import Sequence as Recorded
+    from toolkit.track_errors import Card
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +175,7 @@ class Comparison:
     ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
     changes against the rung before; ``ignored`` which common rules an estimator does not obey, and why. ``undecided``
-    has the faults that the audit could not judge, and why.
+    has the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks, where asked for.
     """
 
     source: str
@@ -188,6 +189,7 @@ class Comparison:
     settings: Settings = DEFAULTS
     workers: int = 1
     undecided: Mapping[str, str] = field(default_factory=dict)
+    card: Card | None = None
 
     @property
     def over_seeds(self) -> bool:

@@ -66,6 +66,7 @@ class Plan:
             noise=settings.noise,
             frontend=settings.frontend,
             vary=settings.vary,
+            card=settings.card and seed == self.seeds[0],
         )
 
 
@@ -270,6 +271,7 @@ def _comparison(
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
+        card=case.prepared.card,
     )
 
 

@@ -18,7 +18,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, Varied
 from toolkit.simulation import SCENARIOS, simulate
-from toolkit.track_errors import fit_track_noise, in_words
+from toolkit.track_errors import Card, card_of, fit_track_noise, in_words
 from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
@@ -34,7 +34,8 @@ class Recording:
 
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
     reports and leaves as they are. ``max_frames`` and ``duration_s`` cut it; a simulation of ``duration_s`` is made
-    that long. ``vary`` says what the seed draws of a simulation.
+    that long. ``vary`` says what the seed draws of a simulation; ``card`` asks for the card of its tracks, which comes
+    with a fitted noise in any case.
     """
 
     source: str | Sequence
@@ -47,13 +48,15 @@ class Recording:
     noise: Noise = DEFAULTS.noise
     frontend: Frontend = DEFAULTS.frontend
     vary: Varied = DEFAULTS.vary
+    card: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A recording as the estimators read it, what the audit found in it before, and the state they start from.
 
-    ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why.
+    ``whole`` is the recording before it was cut; ``undecided`` has the faults that could not be judged, and why;
+    ``card`` is that of the tracks the noise was fitted to.
     """
 
     sequence: Sequence
@@ -61,6 +64,7 @@ class Prepared:
     prior: Prior
     whole: Sequence
     undecided: Mapping[str, str] = field(default_factory=dict)
+    card: Card | None = None
 
 
 def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
@@ -71,10 +75,14 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     with threadpool_limits(limits=1, user_api="blas"):
         audited = audited_recording(recording, progress)
         whole = _with_noise(audited.sequence, recording.noise)
+        card = None
         if recording.noise.tracks == "fitted":
-            whole = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
+            whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
+        elif recording.card:
+            used = _cut(whole, recording)
+            card = card_of(used, fit_track_noise(used))
         sequence = _cut(whole, recording)
-        return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided)
+        return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided, card)
 
 
 def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:
@@ -83,6 +91,16 @@ def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audi
     # The audit looks for what is not finite: what NumPy would say of it on the way says nothing more.
     with np.errstate(all="ignore"):
         return audit(sequence, recording.keep)
+
+
+def recording_card(recording: Recording, progress: Progress = SILENT) -> tuple[Sequence, Card]:
+    """Return a recording, audited and cut, and the card of its tracks; no state to start from is looked for.
+
+    Raises as :func:`prepare`, and DataError where the tracks are too few.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        sequence = _cut(audited_recording(recording, progress).sequence, recording)
+        return sequence, card_of(sequence, fit_track_noise(sequence))
 
 
 @lru_cache(maxsize=1)
@@ -136,16 +154,17 @@ def _stated_track_noise(asked: Noise) -> TrackNoise:
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
 
 
-def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> Sequence:
-    """Return the whole recording with the noise of the tracks that are used, or of their first seconds.
+def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> tuple[Sequence, Card]:
+    """Return the whole recording with the noise of the tracks that are used, or of their first seconds, and their card.
 
     Where they turn out white the noise stays the recording's own. Raises DataError where it cannot be fitted.
     """
-    fitted = fit_track_noise(used if fit_s is None else _first_seconds(used, fit_s))
+    used = used if fit_s is None else _first_seconds(used, fit_s)
+    fitted = fit_track_noise(used)
     basis = "all that is used of the recording, so that causal answers know it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
     fact = f"noise of tracks, fitted to {basis}: {in_words(fitted)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
-    return replace(whole, rig=rig, provenance=provenance)
+    return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import numpy as np
+from msgspec import UNSET
 
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
@@ -12,6 +13,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.report.card import card_record
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
 from toolkit.report.figures.top_view import last_word
@@ -74,6 +76,7 @@ def report_document(comparison: Comparison) -> Report:
         steps=tuple(_steps(comparison)),
         maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
         words=_words(comparison),
+        card=UNSET if comparison.card is None else card_record(comparison.card),
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 
 from toolkit.experiment.comparison import Comparison
+from toolkit.report.card import card_lines
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
@@ -79,6 +80,7 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         *_section("Where every estimator started", [comparison.prior.source]),
         *_section("What the audit found in the recording", finding_lines(comparison)),
         *_section("What to know about this recording", comparison.sequence.provenance.facts),
+        *_section("What its tracks are like", () if comparison.card is None else card_lines(comparison.card)),
         "## Figures",
         *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
         "## How to read the table",

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from toolkit.audit import Audit, Finding
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
+from toolkit.report.card import card_lines
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
@@ -31,6 +32,8 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
     lines += section("start", [comparison.prior.source], width)
     lines += section("audit", finding_lines(comparison), width)
     lines += section("facts", comparison.sequence.provenance.facts, width)
+    if comparison.card is not None:
+        lines += section("tracks", card_lines(comparison.card), width)
     lines += section("pairs", paired_lines(comparison), width)
     lines += section("nees", consistency_lines(comparison), width)
     lines += section("notes", note_lines(comparison, columns), width)

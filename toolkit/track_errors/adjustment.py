@@ -159,9 +159,12 @@ def _normal_equations(tracks: tuple[Tracklets, ...], poses: Array, rig: StereoRi
             rows -= basis @ taken
             rows *= np.sqrt(model.weights((rows[..., -1] ** 2).sum(axis=1), group.equations))[:, None, None]
             _add(system, some.first_frame, rows[..., :-1], rows[..., -1])
-            steps.append(np.linalg.solve(upper, taken))
-        step = np.concatenate(steps)
-        system.landmarks.append((step[..., -1], step[..., :-1]))
+            step = np.linalg.solve(upper, taken)
+            # A landmark is given in its first frame and moves with that pose, which the equations do not let it.
+            step[..., :6] -= here.d_pose[:, 0]
+            steps.append(step)
+        all_steps = np.concatenate(steps)
+        system.landmarks.append((all_steps[..., -1], all_steps[..., :-1]))
     return system
 
 

@@ -64,7 +64,7 @@ class Fit:
     @property
     def correlated(self) -> bool:
         """Say whether the errors of a track hang together."""
-        return bool(self.noise.walk_px.any() or self.noise.offset_px.any())
+        return self.noise.is_correlated
 
     @property
     def tracks(self) -> int:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from msgspec import to_builtins
+from msgspec import UNSET, to_builtins
 from msgspec.structs import asdict
 
 from toolkit.geometry import Array
@@ -62,6 +62,7 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
         "title": title,
         "sequence": asdict(sequence),
         "words": to_builtins(report.words),
+        "card": [] if report.card is UNSET else report.card.words,
         "alignment": report.alignment,
         "error": None if report.error is None else asdict(report.error),
         "highlights": highlights(rows, sequence.motion),

@@ -1,12 +1,14 @@
 """The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
-Reading order: metrics (one run of each estimator), seeds (many), report (what the figures draw), manifest, check.
-How they are read and written is :mod:`toolkit.documents`; :mod:`toolkit.report.records.schemas` writes docs/schemas.
+Reading order: metrics (one run of each estimator), seeds (many), report (what the figures draw), card (what
+the tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
+:mod:`toolkit.report.records.schemas` writes docs/schemas.
 """
 
 from pathlib import Path
 
 from toolkit.documents import read
+from toolkit.report.records.card import CardRecord
 from toolkit.report.records.check import OLDER, CheckDocument
 from toolkit.report.records.manifest import Manifest
 from toolkit.report.records.metrics import Metrics
@@ -14,12 +16,14 @@ from toolkit.report.records.report import Report, SeedsReport
 from toolkit.report.records.seeds import Seeds
 
 __all__ = [
+    "CardRecord",
     "CheckDocument",
     "Manifest",
     "Metrics",
     "Report",
     "Seeds",
     "SeedsReport",
+    "read_card",
     "read_check",
     "read_manifest",
     "read_metrics",
@@ -59,3 +63,8 @@ def read_manifest(path: Path) -> Manifest:
 def read_check(path: Path) -> CheckDocument:
     """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
     return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER)
+
+
+def read_card(path: Path) -> CardRecord:
+    """Read what ``vislam card --json`` wrote; raises DataError, in one line with the place, where it is not that."""
+    return read(path, CardRecord, remedy="repeat vislam card")

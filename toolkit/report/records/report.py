@@ -7,10 +7,11 @@ digits; what is not finite is null.
 from collections.abc import Sized
 from typing import Annotated, Literal
 
-from msgspec import UNSET, Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.estimate import Output
+from toolkit.report.records.card import CardRecord
 from toolkit.report.records.metrics import Undecided
 
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
@@ -136,6 +137,7 @@ class Report(Struct, frozen=True, kw_only=True):
     steps: tuple[StepTimes, ...]
     maps: tuple[DrawnMap, ...]
     words: Words
+    card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where asked for")] = UNSET
 
 
 class MeanNeesSeries(_Columns, frozen=True, kw_only=True):

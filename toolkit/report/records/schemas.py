@@ -10,7 +10,7 @@ import msgspec
 from toolkit.documents import schema
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
-from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
+from toolkit.report.records import CardRecord, CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
 
 # By the name of the schema's file, without its ending.
 RECORDS: Mapping[str, type[msgspec.Struct]] = {
@@ -22,6 +22,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "baseline-1": BaselineRecord,
     "trajectory-baseline-1": TrajectoryBaselineRecord,
     "check-2": CheckDocument,
+    "card-1": CardRecord,
 }
 
 

@@ -15,6 +15,7 @@ function wordsOf(one) {
       listCard("Notes", notes, "Nothing out of the ordinary."),
       audit ? auditCard(audit, undecided) : listCard("Is the stated uncertainty honest?", one.words.verdicts),
       listCard("The recording", [`Every estimator started from: ${start}`, ...facts]),
+      one.card?.length ? listCard("What its tracks are like", one.card) : null,
       manifestCard(one)),
     remarks.length ? folded("Remarks on single numbers", el("ul", {}, remarks.map((text) => el("li", { text })))) : null,
     logsOf(one),

@@ -1,0 +1,55 @@
+"""``vislam card``: what the tracks of a recording are like, and so why a smoother wins on it or does not."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, kept_faults, with_tracks
+
+if TYPE_CHECKING:
+    from toolkit.cli.arguments import Subcommands
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "card",
+        help="say what the tracks of a recording are like",
+        description="Fit the noise of a recording's tracks and say what they are like: how their errors hang together, "
+        "how many are at odds with the motion, how vision's scale compares with the measured motion. No truth is used.",
+        epilog=epilog("vislam card drive"),
+    )
+    parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the card as JSON, too (see docs/tracks.md)")
+    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
+    add_repair_arguments(parser)
+    add_tracks_argument(parser)
+    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of a simulated sequence (default: 0)")
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Print the card and return 0."""
+    from toolkit.audit import faults
+    from toolkit.documents import to_text
+    from toolkit.experiment.recording import Recording, recording_card
+    from toolkit.files import check_file, replaced_file
+    from toolkit.progress import of_this_process
+    from toolkit.report.card import card_record, card_text
+    from toolkit.report.prose import width_of_output
+    from toolkit.settings import settings_of
+
+    if options.json is not None:
+        check_file(options.json)
+    keep = kept_faults(options, faults())
+    frontend = settings_of(with_tracks({}, options), "the command line").frontend
+    recording = Recording(options.sequence, options.seed, keep=keep, max_frames=options.max_frames, frontend=frontend)
+    with of_this_process()(options.sequence) as progress:
+        sequence, card = recording_card(recording, progress)
+    print(card_text(sequence, card, width_of_output()))
+    if options.json is not None:
+        with replaced_file(options.json) as file:
+            file.write_text(to_text(card_record(card)), encoding="utf-8")
+    return 0

@@ -1,0 +1,155 @@
+"""The card of a recording in words and as a record: why a smoother does or does not win on it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from toolkit.geometry import Array
+from toolkit.report.messages import sequence_line
+from toolkit.report.prose import WIDTH, Width, filled
+from toolkit.report.records.card import CardRecord
+from toolkit.report.table import Table, as_text
+from toolkit.sequence import Sequence
+from toolkit.track_errors import Card
+
+# Shares and lengths from which they are remarked on.
+_MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
+# A scale is off where it is so many standard errors and so much away from one.
+_SIGMAS, _SCALE_OFF = 3.0, 0.005
+_DIGITS = 6
+
+
+def card_lines(card: Card) -> Iterator[str]:
+    """Yield what the card says, a sentence or two each."""
+    few, middle, many = card.seen_frames
+    yield (
+        f"{card.a_frame:.0f} visible tracks a frame, seen in {middle:.0f} frames in the median ({few:.0f} to "
+        f"{many:.0f} in 80 %), at a depth of {card.depth_m[1]:.1f} m ({card.depth_m[0]:.1f} to {card.depth_m[2]:.1f} m)"
+    )
+    yield _noise(card)
+    if middle < _FEW_FRAMES:
+        yield (
+            f"tracks are short: most poses share few points with any but the next, and a smoother can do little that "
+            f"a filter has not done; half of the tracks are gone after {middle:.0f} frames"
+        )
+    yield (
+        f"{card.tails:.1%} of the residuals lie beyond four robust standard deviations, and {card.at_odds:.1%} of the "
+        f"tracks are at odds with the motion" + (_STRAYS if card.at_odds > _MANY_AT_ODDS else "")
+    )
+    if card.blind_intervals > _MANY_BLIND * card.intervals:
+        yield (
+            f"{card.blind_intervals} of {card.intervals} intervals have no common track: there every estimator rests "
+            "on the measured motion alone, and no smoother repairs what that gets wrong"
+        )
+    yield from _scale(card)
+
+
+_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
+
+
+def _noise(card: Card) -> str:
+    lags = "/".join(f"{one:.2f}" for one in card.correlation[0])
+    if not card.correlated:
+        return (
+            f"errors of a track are white, {_channels(card.noise.white_px)} (correlation from frame to frame {lags}): "
+            "what every estimator assumes, so that a smoother, which sees more, should win"
+        )
+    parts = []
+    if card.noise.walk_px.any():
+        parts.append(f"they walk by {_channels(card.noise.walk_px)} per root frame")
+    if card.noise.offset_px.any():
+        parts.append(f"each disparity is off by {card.noise.offset_px[1]:.2f} px for the track's whole life")
+    return (
+        f"errors of a track hang together: {' and '.join(parts)}, beside white noise of "
+        f"{_channels(card.noise.white_px)} (correlation from frame to frame {lags}; {card.gain:.1f} +- "
+        f"{card.gain_error:.1f} in log-likelihood a track better than white). Told white noise, an estimator takes "
+        "every further sighting of a track for news, a smoother most of all: it is too sure of itself and need not "
+        "win; noise.tracks=fitted tells it"
+    )
+
+
+def _scale(card: Card) -> Iterator[str]:
+    if card.scale is None:
+        return
+    off, error = card.scale.value - 1.0, card.scale.error
+    if abs(off) > max(_SIGMAS * error, _SCALE_OFF):
+        yield (
+            f"vision is {abs(off):.1%} +- {error:.1%} {'long' if off > 0.0 else 'short'} against the measured motion: "
+            "calibration or odometry is off by as much, and errors after an SE(3) alignment show that first"
+        )
+    else:
+        yield f"vision and the measured motion agree in scale, to {abs(off):.1%} +- {error:.1%}"
+
+
+def _channels(parts_px: Array) -> str:
+    return "/".join(f"{part:.2f}" for part in parts_px) + " px in c/d/v"
+
+
+def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
+    """Return the card as plain text: what it says, and the residuals along tracks as a table."""
+    headings = (("lag",), *(((name,)) for name in ("corr. c", "d", "v", "spread c", "d", "v", "fitted c", "d", "v")))
+    rows = tuple(
+        (str(lag + 1), *map(_cell, (*card.correlation[lag], *spread, *fitted)))
+        for lag, (spread, fitted) in enumerate(zip(np.sqrt(card.structure_px2), np.sqrt(card.fitted_px2), strict=True))
+    )
+    lines = [filled(sequence_line(sequence), width), ""]
+    lines += [filled(line, width) for line in card_lines(card)]
+    lines += ["", as_text(Table(headings, rows, labels=1)), ""]
+    lines.append(
+        filled(
+            "lag in frames; corr.: autocorrelation of the residuals along a track; spread: how far two sightings of a "
+            "track err apart, in px, divided by root two; fitted: the same as the fitted noise has it",
+            width,
+        )
+    )
+    return "\n".join(lines)
+
+
+def _cell(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "-"
+
+
+def card_record(card: Card) -> CardRecord:
+    """Return the card as a record; what is not finite becomes null."""
+    scale = card.scale
+    return CardRecord(
+        schema="vislam.card/1",
+        tracks=card.tracks,
+        tracks_a_frame=_short(card.a_frame),
+        seen_frames=_three(card.seen_frames),
+        depth_m=_three(card.depth_m),
+        intervals=card.intervals,
+        intervals_without_common_track=card.blind_intervals,
+        correlated=card.correlated,
+        white_px=_three(card.noise.white_px),
+        walk_px=_three(card.noise.walk_px),
+        offset_px=_three(card.noise.offset_px),
+        degrees_of_freedom=_short(card.degrees),
+        gain=_short(card.gain),
+        gain_error=_short(card.gain_error),
+        correlation=_lags(card.correlation),
+        structure_px2=_lags(card.structure_px2),
+        fitted_px2=_lags(card.fitted_px2),
+        left_right_correlation=_short(card.left_right),
+        tails=_short(card.tails),
+        at_odds=_short(card.at_odds),
+        scale=None if scale is None else _short(scale.value),
+        scale_error=None if scale is None else _short(scale.error),
+        words=tuple(card_lines(card)),
+    )
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    first, second, third = map(_short, values.tolist())
+    return first, second, third
+
+
+def _lags(rows: Array) -> tuple[tuple[float | None, float | None, float | None], ...]:
+    def number(value: float) -> float | None:
+        return _short(value) if np.isfinite(value) else None
+
+    return tuple((number(row[0]), number(row[1]), number(row[2])) for row in rows.tolist())
