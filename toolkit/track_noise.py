@@ -38,6 +38,10 @@ class TrackNoise:
         """Say whether the errors of a track hang together at all."""
         return bool(self.walk_px.any() or self.offset_px.any())
 
+    def scaled(self, factor: float) -> "TrackNoise":
+        """Return the noise with all its standard deviations multiplied."""
+        return TrackNoise(factor * self.white_px, factor * self.walk_px, factor * self.offset_px)
+
     def cov(self, ages: Array) -> Array:
         """Return the covariance (..., 3, n, n) px^2, a channel each, of sightings of a track with ages (..., n) frames.
 

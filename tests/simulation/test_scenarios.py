@@ -10,7 +10,18 @@ from toolkit.datasets import simulated
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import check_runnable
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
+from toolkit.simulation import (
+    DRIVE,
+    DRIVE_IMU,
+    DRIVE_REALISTIC,
+    FLIGHT,
+    FLIGHT_REALISTIC,
+    SCENARIOS,
+    Scenario,
+    noise_free,
+    simulate,
+)
+from toolkit.track_noise import CHANNELS
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 
@@ -141,8 +152,34 @@ def test_a_minute_is_simulated_in_time(scenario: Scenario, limit_s: float) -> No
 
 
 def test_the_built_in_recordings_have_names_and_take_a_seed() -> None:
-    assert set(simulated.BUILT_IN) == {"drive", "drive-imu", "flight"}
+    assert set(simulated.BUILT_IN) == {"drive", "drive-imu", "flight", "drive-realistic", "flight-realistic"}
     for name, make in simulated.BUILT_IN.items():
         sequence = make(3)
         assert sequence.name == name
         assert "seed 3" in sequence.provenance.source
+
+
+@pytest.mark.parametrize("scenario", [DRIVE_REALISTIC, FLIGHT_REALISTIC], ids=lambda scenario: scenario.name)
+def test_errors_of_realistic_tracks_are_those_stated(scenario: Scenario) -> None:
+    short = replace(scenario, duration_s=8.0, slip_share=0.0)
+    exact, noisy = (simulate(each, 3).observations for each in (noise_free(short), short))
+    assert np.array_equal(exact.track_id, noisy.track_id) and short.track_noise is not None
+    error_px = (noisy.uv_px - exact.uv_px) @ CHANNELS.T
+    first, row = np.unique(noisy.track_id, return_index=True, return_inverse=True)[1:]
+    age = noisy.frame - noisy.frame[first][row]
+    for old in (0, 4):
+        cov = short.track_noise.cov(np.array([float(old)]))[:, 0, 0]
+        # Some two hundred tracks and more: four standard errors of a standard deviation are 20 %.
+        np.testing.assert_allclose(error_px[age == old].std(axis=0), np.sqrt(cov), rtol=0.2)
+
+
+def test_a_share_of_realistic_tracks_slips_and_stays() -> None:
+    short = replace(DRIVE_REALISTIC, duration_s=8.0)
+    slipped, sound = (simulate(each, 3).observations for each in (short, replace(short, slip_share=0.0)))
+    # Where a slip led out of the image the track has ended.
+    both = np.isin(sound.frame * 10_000 + sound.track_id, slipped.frame * 10_000 + slipped.track_id)
+    away = np.abs(slipped.uv_px - sound.uv_px[both])[:, 2] > 0.0
+    tracks, at = np.unique(slipped.track_id, return_index=True)
+    assert not away[at].any()
+    # Half of a track's sightings at most are before a slip on average, and tracks of one sighting show none.
+    assert 0.2 * short.slip_share < np.unique(slipped.track_id[away]).size / tracks.size <= 1.5 * short.slip_share

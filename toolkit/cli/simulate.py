@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
 
 # Repeated from toolkit.simulation.SCENARIOS (a test compares them), which would cost the help half a second.
-SCENARIOS = ("drive", "drive-imu", "flight")
+SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
 
 
 def add_to(subcommands: Subcommands) -> None:

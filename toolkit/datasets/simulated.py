@@ -1,4 +1,4 @@
-"""Built-in simulated recordings: drive, drive-imu and flight, made afresh from a seed."""
+"""Built-in simulated recordings: drive, drive-imu and flight, and with realistic tracks, made afresh from a seed."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -6,6 +6,28 @@ plant what goes wrong.
 """
 
 from toolkit.simulation import faults, track_faults
-from toolkit.simulation.scenarios import DRIVE, DRIVE_IMU, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
+from toolkit.simulation.scenarios import (
+    DRIVE,
+    DRIVE_IMU,
+    DRIVE_REALISTIC,
+    FLIGHT,
+    FLIGHT_REALISTIC,
+    SCENARIOS,
+    Scenario,
+    noise_free,
+    simulate,
+)
 
-__all__ = ["DRIVE", "DRIVE_IMU", "FLIGHT", "SCENARIOS", "Scenario", "faults", "noise_free", "simulate", "track_faults"]
+__all__ = [
+    "DRIVE",
+    "DRIVE_IMU",
+    "DRIVE_REALISTIC",
+    "FLIGHT",
+    "FLIGHT_REALISTIC",
+    "SCENARIOS",
+    "Scenario",
+    "faults",
+    "noise_free",
+    "simulate",
+    "track_faults",
+]

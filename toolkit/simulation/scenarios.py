@@ -1,5 +1,7 @@
 """The simulated recordings: `drive` (a car, twist or IMU) and `flight` (hand-held or aerial, IMU).
 
+Both also as `-realistic`, with tracks whose errors hang together as those of real trackers do (docs/tracks.md).
+
 Trajectory and landmarks belong to the scenario; the seed draws the prior's error, the biases, all noise,
 the chance ends of tracks and the outliers, each from a stream of its own, and other ones for every scenario: two
 scenarios under one seed are independent draws. Repeating a scenario over seeds is therefore a Monte-Carlo experiment
@@ -22,6 +24,7 @@ from toolkit.simulation.scenes import SceneOf, hall, road
 from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
 from toolkit.simulation.world import Camera
+from toolkit.track_noise import TrackNoise
 
 START_NS = 1_600_000_000 * NS_PER_S
 # Standard deviations of the prior: rotation (rad), position (m), velocity (m/s), all in the body frame.
@@ -37,6 +40,8 @@ class Scenario:
     ``scene`` builds the trajectory and the world for a duration; ``varied`` lets every seed draw its own.
     ``noise_scale`` multiplies every drawn error (pixels, motion, biases, prior) and leaves the stated noise as it is,
     so that 0 gives exact measurements an estimator can still weigh.
+    Where there is a ``track_noise``, the errors of tracks are drawn from it and not from the rig's covariance, which is
+    what a data sheet would state; a ``slip_share`` of the tracks slips to another point and stays there.
     """
 
     name: str
@@ -47,6 +52,8 @@ class Scenario:
     duration_s: float = 60.0
     noise_scale: float = 1.0
     varied: bool = False
+    track_noise: TrackNoise | None = None
+    slip_share: float = 0.0
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
 
 
@@ -56,7 +63,9 @@ def noise_free(scenario: Scenario) -> Scenario:
     Exact IMU samples are instantaneous, so their integral is exact only in the limit: the midpoint rule errs
     by the square of the sample interval.
     """
-    exact = replace(scenario, noise_scale=0.0, camera=replace(scenario.camera, step_px=0.0, outlier_rate=0.0))
+    exact = replace(
+        scenario, noise_scale=0.0, slip_share=0.0, camera=replace(scenario.camera, step_px=0.0, outlier_rate=0.0)
+    )
     return replace(exact, motion=replace(exact.motion, rate_hz=1000.0)) if isinstance(exact.motion, Imu) else exact
 
 
@@ -79,9 +88,11 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
             f"a simulation of {scenario.duration_s:g} s cannot be had; its duration is from "
             f"{1.0 / scenario.camera.rate_hz:g} to {LONGEST_S:g} s"
         )
-    prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng, world_rng = (
-        np.random.default_rng(stream) for stream in np.random.SeedSequence((seed, _number(scenario.name))).spawn(6)
+    streams = np.random.SeedSequence((seed, _number(scenario.name))).spawn(7)
+    prior_rng, motion_rng, tracks_rng, pixels_rng, outliers_rng, world_rng, slips_rng = map(
+        np.random.default_rng, streams
     )
+    track_rngs = [tracks_rng, pixels_rng, outliers_rng, slips_rng]
     scene = scenario.scene(scenario.duration_s, world_rng) if scenario.varied else scenario.scene(scenario.duration_s)
     frames_t_ns = sensors.stamps_ns(START_NS, scenario.camera.rate_hz, scenario.duration_s)
     motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
@@ -91,7 +102,7 @@ def simulate(scenario: Scenario, seed: int) -> Sequence:
         rig=scenario.rig,
         noise=scenario.motion.noise,
         frames_t_ns=frames_t_ns,
-        observations=_observe(scenario, scene.points, motion.T_world_imu, (tracks_rng, pixels_rng, outliers_rng)),
+        observations=_observe(scenario, scene.points, motion.T_world_imu, track_rngs),
         motion=measured.samples,
         provenance=_provenance(scenario, seed),
         prior=_prior(scenario, motion, prior_rng),
@@ -113,15 +124,20 @@ def _measure_motion(
     return sensors.measure_twist(sensor, scale, t_ns, T_world_imu, rng)
 
 
-def _observe(
-    scenario: Scenario, points: Array, T_world_imu: Array, streams: tuple[np.random.Generator, ...]
-) -> Observations:
+def _observe(scenario: Scenario, points: Array, T_world_imu: Array, streams: list[np.random.Generator]) -> Observations:
     rig, camera = scenario.rig, scenario.camera
-    tracks_rng, pixels_rng, outliers_rng = streams
+    tracks_rng, pixels_rng, outliers_rng, slips_rng = streams
     tracks = world.follow(world.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
     exact = sensors.sightings(tracks, points, T_world_imu, rig)
-    noisy = sensors.with_pixel_noise(exact, scenario.noise_scale, rig.cov_uv_px2, camera.step_px, pixels_rng)
-    return sensors.with_outliers(noisy, camera, outliers_rng)
+    scale = scenario.noise_scale
+    if scenario.track_noise is not None:
+        exact, scale = sensors.with_track_noise(exact, scenario.track_noise.scaled(scale), pixels_rng), 0.0
+    noisy = sensors.with_pixel_noise(exact, scale, rig.cov_uv_px2, camera.step_px, pixels_rng)
+    noisy = sensors.with_outliers(noisy, camera, outliers_rng)
+    if not scenario.slip_share:
+        return noisy
+    slipped = sensors.with_slips(noisy, scenario.slip_share, rig, slips_rng)
+    return sensors.while_in_image(slipped, camera.size_px)
 
 
 def _at_frames(measured: MotionMeasurements, frames_t_ns: IntArray) -> Array:
@@ -212,4 +228,19 @@ FLIGHT = Scenario(
     camera=Camera(rate_hz=20.0, size_px=(752, 480), depth_m=(0.8, 7.0), max_tracks=100, loss_per_frame=0.02),
     motion=_EUROC_IMU,
 )
-SCENARIOS = {scenario.name: scenario for scenario in (DRIVE, DRIVE_IMU, FLIGHT)}
+# What the fit finds on real drives and on EuRoC's images, and what their tracks are like (docs/tracks.md).
+DRIVE_REALISTIC = replace(
+    DRIVE,
+    name="drive-realistic",
+    camera=replace(DRIVE.camera, depth_m=(4.0, 100.0), max_tracks=75, loss_per_frame=0.06),
+    track_noise=TrackNoise(np.full(3, 0.02), np.array([0.09, 0.13, 0.11]), np.array([0.0, 0.9, 0.0])),
+    slip_share=0.08,
+)
+FLIGHT_REALISTIC = replace(
+    FLIGHT,
+    name="flight-realistic",
+    camera=replace(FLIGHT.camera, max_tracks=120, loss_per_frame=0.05),
+    track_noise=TrackNoise(np.full(3, 0.02), np.array([0.08, 0.12, 0.07]), np.array([0.0, 0.6, 0.0])),
+    slip_share=0.04,
+)
+SCENARIOS = {scenario.name: scenario for scenario in (DRIVE, DRIVE_IMU, FLIGHT, DRIVE_REALISTIC, FLIGHT_REALISTIC)}

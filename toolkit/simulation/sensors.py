@@ -121,6 +121,31 @@ def with_outliers(clean: Observations, camera: Camera, rng: np.random.Generator)
     return Observations(clean.frame, clean.track_id, uv_px)
 
 
+def with_slips(clean: Observations, share: float, rig: StereoRig, rng: np.random.Generator) -> Observations:
+    """Let a share of the tracks slip to another point, 5 to 30 px away, and follow that one to their end.
+
+    The other point is nearer to the middle of the image, so that it is in it.
+    """
+    track, first, row, length = np.unique(clean.track_id, return_index=True, return_inverse=True, return_counts=True)
+    slips = rng.uniform(size=track.size) < share
+    at, angle = rng.uniform(size=track.size) * length, rng.uniform(0.0, 0.5 * np.pi, track.size)
+    length_px = slips * rng.uniform(5.0, 30.0, track.size)
+    towards = np.where(clean.uv_px[first][:, [0, 2]] < [rig.cx_px, rig.cy_px], 1.0, -1.0)
+    away_px = towards * (length_px * np.stack([np.cos(angle), np.sin(angle)])).T
+    slipped = clean.frame - clean.frame[first][row] > at[row]
+    return Observations(clean.frame, clean.track_id, clean.uv_px + slipped[:, None] * away_px[row][:, [0, 0, 1]])
+
+
+def while_in_image(seen: Observations, size_px: tuple[int, int]) -> Observations:
+    """End every track where it leaves the image."""
+    limit_px = np.array([size_px[0], size_px[0], size_px[1]]) - 1
+    outside = ((seen.uv_px < 0.0) | (seen.uv_px > limit_px)).any(axis=1)
+    track, row = np.unique(seen.track_id, return_inverse=True)
+    end = np.full(track.size, np.iinfo(np.int64).max)
+    np.minimum.at(end, row[outside], seen.frame[outside])
+    return seen.select(seen.frame < end[row])
+
+
 def measure_twist(
     odometer: Odometer, scale: float, t_ns: IntArray, T_world_imu: Array, rng: np.random.Generator
 ) -> MotionMeasurements:

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence
-from toolkit.simulation.sensors import with_track_noise
+from toolkit.sequence import Sequence
+from toolkit.simulation.sensors import with_slips, with_track_noise
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 _NONE = np.zeros(3)
@@ -38,14 +38,9 @@ def disparity_scale(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> S
 
 
 def persistent_mismatch(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
-    """Let a share of the tracks slip to another point, 5 to 30 px away, and follow that one to their end."""
-    rng, seen = np.random.default_rng(seed), sequence.observations
-    track, first, row, length = _tracks(seen)
-    slips = rng.uniform(size=track.size) < dose
-    at, angle = rng.uniform(size=track.size) * length, rng.uniform(0.0, 2.0 * np.pi, track.size)
-    away_px = (slips * rng.uniform(5.0, 30.0, track.size) * np.stack([np.cos(angle), np.sin(angle)])).T
-    slipped = seen.frame - seen.frame[first][row] > at[row]
-    return _with_pixels(sequence, seen.uv_px + slipped[:, None] * away_px[row][:, [0, 0, 1]])
+    """Let a share of the tracks slip to a point 5 to 30 px nearer to the middle, and follow that one to their end."""
+    slipped = with_slips(sequence.observations, dose, sequence.rig, np.random.default_rng(seed))
+    return replace(sequence, observations=slipped)
 
 
 def moving_objects(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequence:
@@ -60,7 +55,7 @@ def moving_objects(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequ
     poses = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns)] @ sequence.rig.T_imu_cam
     t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
     velocity = np.gradient(poses[:, :3, 3], t_s, axis=0)
-    track, first, row, _ = _tracks(seen)
+    track, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
     begin = seen.frame[first]
     vehicle = (t_s[begin] / _ONE_VEHICLE_S).astype(np.int64)
     speed = rng.uniform(0.3, 1.5, size=vehicle.max(initial=0) + 1)[vehicle] * (rng.uniform(size=track.size) < dose)
@@ -76,11 +71,6 @@ def moving_objects(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequ
 def _with_track_noise(sequence: Sequence, noise: TrackNoise, seed: int) -> Sequence:
     noisy = with_track_noise(sequence.observations, noise, np.random.default_rng(seed))
     return replace(sequence, observations=noisy)
-
-
-def _tracks(seen: Observations) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Return ids (T,), first rows (T,), the track of each row (N,), and lengths in sightings (T,)."""
-    return np.unique(seen.track_id, return_index=True, return_inverse=True, return_counts=True)
 
 
 def _with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:

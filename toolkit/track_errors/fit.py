@@ -22,6 +22,8 @@ from toolkit.track_noise import TrackNoise
 
 # With fewer tracks of three sightings a noise of seven parameters and its choice are not to be had.
 FEWEST_TRACKS = 100
+# Where poses take up a quarter of what tracks say, what is left tells of too few.
+LEAST_FREEDOM = 0.75
 # Rounds of poses and noise; they end earlier where a round gains less than this log-likelihood a track.
 _ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
 # Smallest white noise, walk and offset (px), white noise never being nothing: a coordinate is not finer than this.
@@ -93,6 +95,12 @@ def fit_track_noise(sequence: Sequence) -> Fit:
             break
         value = float(reached.each.mean())
         state = adjusted(state, model, sequence, _STEPS)
+        if state.freedom < LEAST_FREEDOM:
+            raise DataError(
+                f"{sequence.name}: {len(sequence.visible) / sequence.frame_count:.1f} visible tracks a frame are too "
+                "few: the camera's motion takes up what they say, and their noise cannot be fitted; state it with "
+                "noise.tracks=correlated, or leave it white"
+            )
     assert model is not None
     return _chosen(state, model, sequence)
 
