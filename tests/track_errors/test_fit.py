@@ -77,6 +77,14 @@ def test_tracklets_are_the_first_sightings_up_to_a_gap(exact: Sequence) -> None:
         assert not ((group.frames == 9).any(axis=1) & even).any()
 
 
+def test_of_long_recordings_stretches_are_used(exact: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("toolkit.track_errors.tracklets.MOST_FRAMES", 60)
+    monkeypatch.setattr("toolkit.track_errors.tracklets.STRETCH_FRAMES", 20)
+    begun = np.concatenate([group.first_frame for group in tracklets(exact)])
+    assert (begun % 40 < 20).all()
+    assert np.unique(begun // 40).size == 3
+
+
 def test_derivatives_are_those_of_the_residuals(exact: Sequence) -> None:
     rng = np.random.default_rng(0)
     group = tracklets(exact)[4].select(slice(0, 5))

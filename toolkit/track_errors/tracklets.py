@@ -21,6 +21,8 @@ FEWEST_SIGHTINGS = 3
 MOST_SIGHTINGS = 12
 # More tracks in a frame say nothing new about their noise; of more an even share is used.
 MOST_A_FRAME = 80
+# Of longer recordings stretches of so many frames, evenly spread, are used: an hour is fitted in seconds, too.
+MOST_FRAMES, STRETCH_FRAMES = 1200, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,9 @@ def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
     count = _unbroken(frame, track_id, first)
     # Selected by the first sighting: by all of them, noise of the later ones would decide who stays.
     usable = (cdv_px[first, 1] > LEAST_DISPARITY_PX) & (count >= FEWEST_SIGHTINGS)
-    usable &= _evenly(usable, float(np.minimum(count, MOST_SIGHTINGS)[usable].sum()) / max(sequence.frame_count, 1))
+    usable &= _in_stretches(frame[first], sequence.frame_count)
+    frames = min(sequence.frame_count, MOST_FRAMES)
+    usable &= _evenly(usable, float(np.minimum(count, MOST_SIGHTINGS)[usable].sum()) / max(frames, 1))
     groups = []
     for n in np.unique(count[usable]).tolist():
         begin = first[usable & (count == n)]
@@ -89,6 +93,14 @@ def _unbroken(frame: IntArray, track_id: IntArray, first: IntArray) -> IntArray:
     breaks = np.flatnonzero((np.diff(frame, prepend=-2) != 1) | (np.diff(track_id, prepend=-1) != 0))
     following = np.append(breaks, frame.size)[np.searchsorted(breaks, first, side="right")]
     return np.minimum(following - first, MOST_SIGHTINGS)
+
+
+def _in_stretches(frame: IntArray, frame_count: int) -> BoolArray:
+    """Say of frames (T,) whether they are in one of the stretches that are used."""
+    if frame_count <= MOST_FRAMES:
+        return np.ones(frame.size, dtype=bool)
+    period = frame_count * STRETCH_FRAMES // MOST_FRAMES
+    return np.asarray(frame % period < STRETCH_FRAMES)
 
 
 def _evenly(usable: BoolArray, a_frame: float) -> BoolArray:
