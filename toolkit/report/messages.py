@@ -12,7 +12,7 @@ from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
-from toolkit.settings import Window, outliers_in_words
+from toolkit.settings import Noise, Window, outliers_in_words
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
@@ -77,8 +77,18 @@ def rules_line(comparison: Comparison) -> str:
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
-        f"outliers: {outliers_in_words(settings.outliers)}"
+        f"outliers: {outliers_in_words(settings.outliers)}{_track_noise(settings.noise)}"
     )
+
+
+def _track_noise(noise: Noise) -> str:
+    """Say what the errors of a track are taken for, where they are not taken for white."""
+    if noise.tracks == "white":
+        return ""
+    if noise.tracks == "correlated":
+        return "; noise of tracks: correlated, as stated"
+    basis = "the whole recording" if noise.track_fit_s is None else f"the first {noise.track_fit_s:g} s"
+    return f"; noise of tracks: fitted to {basis}, which causal answers know too early"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:

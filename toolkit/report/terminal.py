@@ -33,7 +33,7 @@ def comparison_text(comparison: Comparison, columns: Columns = None, width: Widt
     lines += section("audit", finding_lines(comparison), width)
     lines += section("facts", comparison.sequence.provenance.facts, width)
     if comparison.card is not None:
-        lines += section("tracks", card_lines(comparison.card), width)
+        lines += section("card", card_lines(comparison.card), width)
     lines += section("pairs", paired_lines(comparison), width)
     lines += section("nees", consistency_lines(comparison), width)
     lines += section("notes", note_lines(comparison, columns), width)

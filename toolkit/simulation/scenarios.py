@@ -167,13 +167,18 @@ def _prior(scenario: Scenario, motion: Kinematics, rng: np.random.Generator) -> 
 
 def _provenance(scenario: Scenario, seed: int) -> Provenance:
     camera = scenario.camera
-    facts = (
+    facts: tuple[str, ...] = (
         "the seed draws trajectory, landmarks and errors"
         if scenario.varied
         else "the trajectory and the landmarks belong to the scenario; the seed draws the errors",
         f"noise scale {scenario.noise_scale:g}, outlier rate {camera.outlier_rate:g}",
         f"image coordinates rounded to {camera.step_px:g} px" if camera.step_px else "image coordinates not rounded",
     )
+    if scenario.track_noise is not None:
+        facts += (
+            "errors of a track hang together, which the stated noise does not say (docs/tracks.md), and "
+            f"{scenario.slip_share:.0%} of the tracks slip to another point",
+        )
     return Provenance("simulated", f"scenario {scenario.name}, {scenario.duration_s:g} s, seed {seed}", facts)
 
 
