@@ -88,7 +88,9 @@ def test_a_report_has_the_card_where_the_noise_was_fitted(walking: Sequence) -> 
     assert report.card == card_record(comparison.card)
     assert "## What its tracks are like" in report_text(comparison, {})
     assert all(line in comparison_text(comparison, width=None) for line in words)
-    assert "fitted to the whole recording, which causal answers know too early" in comparison_text(comparison)
+    assert "fitted to the whole recording, which causal answers know too early" in comparison_text(
+        comparison, width=None
+    )
     assert any("causal answers know it too early" in fact for fact in report.words.facts)
 
 

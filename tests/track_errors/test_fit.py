@@ -10,6 +10,7 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.sequence import Sequence
 from toolkit.settings import settings_of
+from toolkit.simulation.faults import few_tracks, identity_intrinsics
 from toolkit.track_errors import Fit, fit_track_noise, in_words
 from toolkit.track_errors.adjustment import adjusted, started
 from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood
@@ -60,6 +61,19 @@ def test_noise_that_comes_out_white_leaves_the_recordings_own(white: Sequence) -
 def test_too_few_tracks_are_refused_with_what_to_do(exact: Sequence) -> None:
     with pytest.raises(DataError, match=r"too few to fit their noise.*noise\.tracks=correlated"):
         fit_track_noise(exact.truncated(3))
+
+
+def test_a_calibration_that_suits_no_motion_is_refused_in_one_line(walking: Sequence) -> None:
+    with pytest.raises(DataError, match="no motion of the camera suits the tracks"):
+        fit_track_noise(identity_intrinsics(walking.truncated(50)))
+
+
+def test_so_few_tracks_a_frame_that_the_motion_takes_them_up_are_refused(
+    walking: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("toolkit.track_errors.fit.FEWEST_TRACKS", 30)
+    with pytest.raises(DataError, match="visible tracks a frame are too few"):
+        fit_track_noise(few_tracks(walking, 9))
 
 
 def test_withheld_tracks_are_not_looked_at(walking: Sequence) -> None:

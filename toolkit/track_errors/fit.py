@@ -17,7 +17,7 @@ from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
 from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood
 from toolkit.track_errors.linearised import linearised
-from toolkit.track_errors.tracklets import tracklets
+from toolkit.track_errors.tracklets import Tracklets, tracklets
 from toolkit.track_noise import TrackNoise
 
 # With fewer tracks of three sightings a noise of seven parameters and its choice are not to be had.
@@ -87,6 +87,16 @@ def fit_track_noise(sequence: Sequence) -> Fit:
             f"{sequence.name}: {count} visible tracks have three sightings or more, too few to fit their noise to "
             f"({FEWEST_TRACKS} are needed); state it with noise.tracks=correlated, or leave it white"
         )
+    try:
+        return _fitted(sequence, groups)
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f"{sequence.name}: no motion of the camera suits the tracks, so that their noise cannot be fitted; "
+            "vislam check-data may say what is wrong with them or with the calibration"
+        ) from error
+
+
+def _fitted(sequence: Sequence, groups: tuple[Tracklets, ...]) -> Fit:
     state, value = started(sequence, groups), -np.inf
     model: Tailed | None = None
     for _ in range(_ROUNDS):
