@@ -105,7 +105,7 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
 
     Raises DataError where no two of its poses meet the truth in time.
     """
-    matched = _matched(estimate, truth)
+    matched = matched_poses(estimate, truth)
     if len(matched) < 2:
         raise DataError(
             f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
@@ -134,7 +134,7 @@ def time_coverage_percent(t_ns: IntArray, truth_t_ns: IntArray, gap_s: float) ->
     return 100.0 * covered / max(end - begin, 1)
 
 
-def _matched(estimate: Poses, truth: Poses) -> Matched:
+def matched_poses(estimate: Poses, truth: Poses) -> Matched:
     """Return the pairs on the stamps of the sparser of the two, between whose neighbours the other is interpolated."""
     path_m = distance_along(truth.poses[:, :3, 3])
     truth_period_ns, period_ns = median_period_ns(truth.t_ns), median_period_ns(estimate.t_ns)

@@ -9,7 +9,7 @@ import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.evaluation import AgainstTruth
 from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors, rmse
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.resampling import NS_PER_S
@@ -49,7 +49,7 @@ class _Intervals(NamedTuple):
     last: IntArray
 
 
-def score(evaluation: Evaluation) -> Scores:
+def score(evaluation: AgainstTruth) -> Scores:
     """Score drift over one second and over 100 m."""
     return evaluate(
         {
@@ -66,7 +66,7 @@ def hundred_metres_percent(matched: Matched) -> float:
     return rmse(lengths(errors[:, :3, 3])) / INTERVAL_M * 100.0
 
 
-def _errors_of_a_second(evaluation: Evaluation) -> Array:
+def _errors_of_a_second(evaluation: AgainstTruth) -> Array:
     return relative_errors(evaluation.compared, *_one_second(evaluation.compared))
 
 

@@ -4,16 +4,20 @@ Which metrics have a column, under which heading and with how many decimals, is 
 :mod:`toolkit.metrics`; tabulate renders the cells.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
 from toolkit.errors import printable
-from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.report.prose import in_markdown
+
+if TYPE_CHECKING:
+    from toolkit.experiment.comparison import Comparison, Row
 
 MISSING = "-"
 _WIDEST_NUMBER = 5
