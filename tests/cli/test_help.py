@@ -12,7 +12,19 @@ import pytest
 
 from toolkit.cli import simulate
 
-COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "list", "simulate", "tracks")
+COMMANDS = (
+    "",
+    "compare",
+    "evaluate",
+    "report",
+    "export",
+    "check",
+    "baseline",
+    "check-data",
+    "list",
+    "simulate",
+    "tracks",
+)
 STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, at_least, epilog, names, positive_seconds
+from toolkit.cli.arguments import UsageError, add_workers_argument, at_least, epilog, names, positive_seconds
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def add_to(subcommands: Subcommands) -> None:
         type=Path,
         help="write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV",
     )
+    add_workers_argument(parser)
     parser.set_defaults(command=command)
 
 
@@ -97,6 +98,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.evaluation.gathering import gather
     from toolkit.evaluation.scoring import Terms
     from toolkit.evaluation.standings import evaluate
+    from toolkit.experiment.workers import usable_cpus
     from toolkit.progress import of_this_process
     from toolkit.report.evaluation_files import check_evaluation_directory, write_evaluation
 
@@ -108,7 +110,7 @@ def command(options: argparse.Namespace) -> int:
     terms = Terms(options.max_dt, options.offset, options.gap, options.imu, options.least_coverage)
     gathered = gather(options.truth, options.given, options.runs)
     with of_this_process()(f"{len(gathered.items)} trajectories") as progress:
-        found = evaluate(gathered, terms, ranked_by.key, progress)
+        found = evaluate(gathered, terms, ranked_by.key, progress, options.workers or usable_cpus())
     if options.out is not None:
         write_evaluation(found, options.out)
     _print(found, columns, options)

@@ -39,8 +39,8 @@ def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gather
     another has gets items without a file in their place, as many as it has runs elsewhere; and so does one that has
     fewer than ``runs`` of a sequence. Raises DataError where a word names nothing, or nothing that has a truth.
     """
-    found = _of_one_sequence(truth, given) if truth.is_file() else _of_folders(given)
     truths = {_name(truth): truth} if truth.is_file() else _truths_in(truth)
+    found = _of_one_sequence(truth, given) if truth.is_file() else _of_folders(given)
     known = {sequence for sequences in found.values() for sequence in sequences}
     scored = [sequence for sequence in truths if sequence in known]
     if not scored:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from toolkit.estimate import Status
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
+from toolkit.experiment.workers import Lost, results_of
 from toolkit.gate.paired import holm
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric
@@ -26,6 +28,8 @@ from toolkit.progress import SILENT, Progress
 METRIC_BY_KEY: Mapping[str, Metric] = {metric.key: metric for metric in METRICS}
 RANKED_BY = "ate_se3_m"
 FALSE_ALARM_RATE = 0.05
+# Processes take a second to start, in which so many files are scored.
+_WORTH_PROCESSES = 200
 # As many signs as are counted exactly; beyond it the smallest p-value is below 1e-300 anyway.
 _MOST_EXACT = 1000
 
@@ -230,19 +234,47 @@ def _cost(value: float, metric: Metric) -> float:
     return value
 
 
-def evaluate(gathered: Gathered, terms: Terms, ranked_by: str = RANKED_BY, progress: Progress = SILENT) -> Evaluation:
-    """Score every run. Raises DataError where a truth cannot be used, or not one of the runs can.
+def evaluate(
+    gathered: Gathered, terms: Terms, ranked_by: str = RANKED_BY, progress: Progress = SILENT, workers: int = 1
+) -> Evaluation:
+    """Score every run, in so many processes where they are many.
 
-    A run that cannot is failed, with the reason, as is one that covers too little of the truth's time.
+    Raises DataError where a truth cannot be used, or not one of the runs can. A run that cannot is failed, with the
+    reason, as is one that covers too little of the truth's time.
     """
     truths = {name: read_truth(name, path) for name, path in gathered.truths.items()}
-    runs: list[EvaluatedRun] = []
-    for i, item in enumerate(gathered.items):
-        progress.advance(i, len(gathered.items))
-        runs.append(evaluated(item, truths[item.sequence], terms))
+    by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
+    units = [_Unit(name, path, by_sequence[name], terms) for name, path in gathered.truths.items()]
+    scored: dict[Item, EvaluatedRun] = {}
+    processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
+    for place, found in results_of(units, processes, _evaluated, progress):
+        if isinstance(found, Lost):
+            scored |= {item: EvaluatedRun(item, "failed", {}, {}, (found.why,)) for item in units[place].items}
+        else:
+            scored |= {run.item: run for run in found}
+    runs = tuple(scored[item] for item in gathered.items)
     if not any(run.values for run in runs):
         raise DataError(next(run.log[0] for run in runs if run.log))
-    return Evaluation(truths, terms, tuple(runs), METRIC_BY_KEY[ranked_by], gathered.notes)
+    return Evaluation(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """All runs of a sequence, which share its truth: the work of one process."""
+
+    sequence: str
+    truth: Path
+    items: tuple[Item, ...]
+    terms: Terms
+
+
+def _evaluated(unit: _Unit, progress: Progress) -> tuple[EvaluatedRun, ...]:
+    truth = read_truth(unit.sequence, unit.truth)
+    runs = []
+    for i, item in enumerate(unit.items):
+        progress.advance(i, len(unit.items))
+        runs.append(evaluated(item, truth, unit.terms))
+    return tuple(runs)
 
 
 def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:

@@ -3,6 +3,7 @@
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -51,10 +52,11 @@ class _Intervals(NamedTuple):
 
 def score(evaluation: AgainstTruth) -> Scores:
     """Score drift over one second and over 100 m."""
+    errors_of_a_second = cache(lambda: _errors_of_a_second(evaluation))
     return evaluate(
         {
-            "rpe_1s_m": lambda: rmse(lengths(_errors_of_a_second(evaluation)[:, :3, 3])),
-            "rpe_1s_deg": lambda: rmse(angles_deg(_errors_of_a_second(evaluation)[:, :3, :3])),
+            "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
+            "rpe_1s_deg": lambda: rmse(angles_deg(errors_of_a_second()[:, :3, :3])),
             "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.compared),
         }
     )

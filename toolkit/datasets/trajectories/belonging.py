@@ -15,6 +15,8 @@ from toolkit.sequence import Sequence
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,
 # unexplained than under the file's own: slow turns correlate with unrelated ones by chance, 0.8 at times.
 _FITTING_CORRELATION, _UNEXPLAINED_SHARE = 0.5, 1.0 / 3.0
+# Rates that follow the gyro this closely are read rightly, and no other reading is tried.
+_SURE_CORRELATION = 0.95
 # Three angles are fitted to say that a body has other axes, and mounts are off by some degrees: more is asked for.
 _TURNED_CORRELATION, _OTHER_AXES_RAD = 0.8, 0.3
 # Rates are means over this long at least, over which even a jittery estimate has turned more than its noise.
@@ -134,6 +136,8 @@ def check_turns(
     measured = steps.mean_rates(reference.rates_t_ns, reference.rates_radps)
     given = R_world_imu[within]
     as_given = _correlation(steps.rates(given), measured)
+    if as_given > _SURE_CORRELATION:
+        return True
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
     if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):

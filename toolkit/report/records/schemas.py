@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 
 from toolkit.documents import schema
+from toolkit.evaluation.document import EvaluationRecord
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
@@ -22,6 +23,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "baseline-1": BaselineRecord,
     "trajectory-baseline-1": TrajectoryBaselineRecord,
     "check-2": CheckDocument,
+    "evaluation-1": EvaluationRecord,
 }
 
 
