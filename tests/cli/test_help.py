@@ -24,6 +24,7 @@ COMMANDS = (
     "list",
     "simulate",
     "tracks",
+    "verify",
 )
 STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")

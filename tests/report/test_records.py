@@ -32,6 +32,8 @@ CASES = {
     "baseline.json": "baseline-1",
     "trajectory-baseline.json": "trajectory-baseline-1",
     "check.json": "check-2",
+    "evaluation.json": "evaluation-1",
+    "verification.json": "verification-1",
 }
 
 

@@ -12,6 +12,7 @@ from toolkit.evaluation.document import EvaluationRecord
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
+from toolkit.report.verify_text import VerificationRecord
 
 # By the name of the schema's file, without its ending.
 RECORDS: Mapping[str, type[msgspec.Struct]] = {
@@ -24,6 +25,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "trajectory-baseline-1": TrajectoryBaselineRecord,
     "check-2": CheckDocument,
     "evaluation-1": EvaluationRecord,
+    "verification-1": VerificationRecord,
 }
 
 
