@@ -16,6 +16,7 @@ COMMANDS = (
     "",
     "compare",
     "evaluate",
+    "diff",
     "report",
     "export",
     "check",

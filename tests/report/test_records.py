@@ -34,6 +34,7 @@ CASES = {
     "check.json": "check-2",
     "evaluation.json": "evaluation-1",
     "verification.json": "verification-1",
+    "diff.json": "diff-1",
 }
 
 

@@ -16,6 +16,7 @@ from toolkit.cli import (
     check,
     check_data,
     compare,
+    diff,
     evaluate,
     export,
     list_parts,
@@ -39,6 +40,11 @@ _PATIENCE_S = 10.0
 # What writing fails with; of a file such an error is an OutputError already, so that here it is the output's.
 _NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
+# In the order of the help: what one does every day, then once in a while.
+_COMMANDS = (
+    *(compare, evaluate, diff, report, export),
+    *(check, baseline, check_data, verify, list_parts, simulate, tracks),
+)
 
 
 def parser() -> Parser:
@@ -50,19 +56,7 @@ def parser() -> Parser:
     )
     root.add_argument("--version", action=ShowVersion, help="print the version and exit")
     subcommands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in (
-        compare,
-        evaluate,
-        report,
-        export,
-        check,
-        baseline,
-        check_data,
-        list_parts,
-        simulate,
-        tracks,
-        verify,
-    ):
+    for module in _COMMANDS:
         module.add_to(subcommands)
     return root
 
