@@ -19,13 +19,16 @@ COMMANDS = (
     "diff",
     "report",
     "export",
+    "reproduce",
     "check",
     "baseline",
     "check-data",
     "list",
+    "cite",
     "simulate",
     "tracks",
     "verify",
+    "completion",
 )
 STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")

@@ -35,6 +35,7 @@ CASES = {
     "evaluation.json": "evaluation-1",
     "verification.json": "verification-1",
     "diff.json": "diff-1",
+    "bundle.json": "bundle-1",
 }
 
 

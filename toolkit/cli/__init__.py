@@ -15,12 +15,15 @@ from toolkit.cli import (
     baseline,
     check,
     check_data,
+    cite,
     compare,
+    completion,
     diff,
     evaluate,
     export,
     list_parts,
     report,
+    reproduce,
     simulate,
     tracks,
     verify,
@@ -42,8 +45,8 @@ _NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
-    *(compare, evaluate, diff, report, export),
-    *(check, baseline, check_data, verify, list_parts, simulate, tracks),
+    *(compare, evaluate, diff, report, export, reproduce),
+    *(check, baseline, check_data, verify, list_parts, cite, simulate, tracks, completion),
 )
 
 

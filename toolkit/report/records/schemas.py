@@ -11,6 +11,7 @@ from toolkit.documents import schema
 from toolkit.evaluation.document import EvaluationRecord
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
+from toolkit.report.bundle import BundleRecord
 from toolkit.report.diff_text import DiffRecord
 from toolkit.report.records import CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
 from toolkit.report.verify_text import VerificationRecord
@@ -28,6 +29,7 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "evaluation-1": EvaluationRecord,
     "verification-1": VerificationRecord,
     "diff-1": DiffRecord,
+    "bundle-1": BundleRecord,
 }
 
 
