@@ -1,6 +1,6 @@
 """A run directory as one file that others can check and repeat: settings, versions, hashes, trajectories, metrics.
 
-A bundle is a zip archive with bundle.json (``vislam.bundle/1``), requirements.txt (the release of every package that was
+A bundle is a zip archive with bundle.json (``vislam.bundle/1``), requirements.txt (the release of every package that is
 installed) and the run's files but for its figures. The same directory gives the same bytes.
 """
 
