@@ -49,8 +49,9 @@ def add_to(subcommands: Subcommands) -> None:
         "--columns", metavar="KEY,...", type=names, default=(), help="metrics of the table, or all (default: the usual)"
     )
     parser.add_argument("--format", choices=_FORMATS, default="text", help="of what is printed (default: text)")
-    parser.add_argument("--json", action="store_true", help="print evaluation.json, and nothing else")
-    parser.add_argument("--quiet", action="store_true", help="print nothing; the exit status and --out tell")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--json", action="store_true", help="print evaluation.json, and nothing else")
+    what.add_argument("--quiet", action="store_true", help="print nothing; the exit status and --out tell")
     parser.add_argument(
         "--out",
         metavar="DIR",
