@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
