@@ -105,6 +105,12 @@ def add_to(subcommands: Subcommands) -> None:
     )
     add_settings_arguments(parser)
     add_workers_argument(parser)
+    parser.add_argument(
+        "--figure-format",
+        choices=("png", "pdf", "svg"),
+        default="png",
+        help="of the figures; pdf and svg stay sharp in a paper (default: png)",
+    )
     printed = parser.add_mutually_exclusive_group()
     printed.add_argument(
         "--json", action="store_true", help="print what metrics.json or seeds.json holds, a line a SEQUENCE, no table"
@@ -131,7 +137,7 @@ def command(options: argparse.Namespace) -> int:
     columns = _columns(options.columns)
     asked = _configuration(options)
     plan, progress_for = _placed(_plan(asked), options), of_this_process()
-    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked), True
+    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked, options.figure_format), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
