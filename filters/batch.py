@@ -21,6 +21,7 @@ from toolkit.models.factors import L
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
+CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ the future; all relinearised to convergence, outliers cut after a schedule"
 IGNORES = {"window": "it keeps every state"}
 DEFAULT = True

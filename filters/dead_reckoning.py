@@ -6,6 +6,7 @@ from toolkit.estimator import Estimator, Setup
 from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
+CITES = ("kang_vislam",)
 RUNG, CHANGE = 0, "the measured motion alone"
 DEFAULT = True
 

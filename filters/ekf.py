@@ -16,6 +16,7 @@ from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE
 from toolkit.sequence import Packet
 
+CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, landmark noise in the innovation, biases; the pose before the map"
 DEFAULT = True
 

@@ -13,6 +13,7 @@ from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
+CITES = ("smith1990estimating", "huang2010observability")
 RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along inverse depth"
 
 

@@ -22,6 +22,7 @@ from toolkit.models.motion import state_cov
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
+CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
 
 

@@ -24,6 +24,7 @@ from toolkit.models.factors import L
 from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
+CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
 IGNORES = {"window": "it keeps every state"}
 

@@ -11,6 +11,8 @@ from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
+CITES = ("kang_vislam",)
+
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""

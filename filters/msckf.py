@@ -6,6 +6,7 @@ from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
+CITES = ("mourikis2007msckf",)
 RUNG, CHANGE = 60, "+ window of past poses, tracks used at their end; usual errors, one step a frame"
 
 

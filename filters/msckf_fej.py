@@ -6,6 +6,7 @@ from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
+CITES = ("mourikis2007msckf", "li2013high")
 RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 

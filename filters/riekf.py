@@ -20,6 +20,7 @@ from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
+CITES = ("barrau2015ekf", "barrau2017invariant")
 RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose"
 
 

@@ -24,6 +24,7 @@ from toolkit.sequence import Packet
 # Standing in for zero, which has no inverse: a bias of 1e-8 rad/s turns by 1e-6 rad in 100 s.
 _HELD_VARIANCE = 1e-16
 
+CITES = ("kang_vislam",)
 RUNG, CHANGE = 10, "+ vision, as the report has it: pose and map by turns, biases held, no gate"
 IGNORES = {"outliers": "the report's filter has neither gate nor loss"}
 

@@ -26,6 +26,7 @@ from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
+CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
 RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration, of several; none outlives the window"
 
 

@@ -4,6 +4,7 @@ An installed distribution announces, under an entry-point group such as ``toolki
 module directly in that package is one estimator, metric file or dataset. No list of names has to be edited.
 """
 
+import ast
 import importlib
 import importlib.machinery
 import importlib.util
@@ -39,6 +40,26 @@ class FoundModule:
         """Return the name a user reads: ``my_filter.py`` is ``my-filter``."""
         return self.module.rpartition(".")[2].replace("_", "-")
 
+    def tree(self) -> ast.Module:
+        """Return the module's syntax tree, without importing it."""
+        file = self.path.stat()
+        return _parsed(self.path, (file.st_mtime_ns, file.st_size))
+
+    def constants(self) -> dict[str, object]:
+        """Return the module's top-level assignments of literals, alone or in tuples, by name, without importing it."""
+        found: dict[str, object] = {}
+        for statement in self.tree().body:
+            if isinstance(statement, ast.Assign):
+                pairs = [pair for target in statement.targets for pair in _paired(target, statement.value)]
+            elif isinstance(statement, ast.AnnAssign) and statement.value is not None:
+                pairs = _paired(statement.target, statement.value)
+            else:
+                continue
+            for target, value in pairs:
+                with suppress(ValueError):  # not a literal, so nothing that is read here
+                    found |= {target.id: ast.literal_eval(value)} if isinstance(target, ast.Name) else {}
+        return found
+
     def load(self) -> ModuleType:
         """Import the module.
 
@@ -51,6 +72,19 @@ class FoundModule:
             if error.name is None or error.name.split(".")[0] in (self.module.split(".")[0], "toolkit"):
                 raise
             raise MissingDependency(error.name) from error
+
+
+@lru_cache(maxsize=64)
+def _parsed(path: Path, _state: tuple[int, int]) -> ast.Module:
+    """Return a module's syntax, which is read once in each state of the file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def _paired(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:
+    """Pair each name on the left of an assignment with its expression on the right."""
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
+        return list(zip(target.elts, value.elts, strict=True))
+    return [(target, value)]
 
 
 def modules_in(package: str, folders: Iterable[str]) -> list[FoundModule]:

@@ -5,15 +5,13 @@ estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first li
 summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
 ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
 where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``IGNORES`` names the common rules
-("outliers", "window") that it does not obey, each with the reason.
+("outliers", "window") that it does not obey, each with the reason; ``CITES`` is what ``vislam cite`` prints for it,
+keys of toolkit/report/references.bib or BibTeX itself.
 """
 
 import ast
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import lru_cache
-from pathlib import Path
 from typing import Protocol, cast
 
 from toolkit.discovery import FoundModule, MissingDependency, announced
@@ -69,30 +67,30 @@ class EstimatorEntry:
 
     def summary(self) -> str:
         """Return the first line of the module's docstring, without importing the module."""
-        return (ast.get_docstring(self._tree()) or "").partition("\n")[0]
+        return (ast.get_docstring(self.found.tree()) or "").partition("\n")[0]
 
     def rung(self) -> int | None:
         """Return the estimator's place on the ladder, or None; read without importing the module, as is all here."""
-        rung = self._constants().get("RUNG")
+        rung = self.found.constants().get("RUNG")
         return rung if isinstance(rung, int) else None
 
     def is_default(self) -> bool:
         """Say whether the estimator is compared where none is named: its module's constant ``DEFAULT``."""
-        return self._constants().get("DEFAULT") is True
+        return self.found.constants().get("DEFAULT") is True
 
     def change(self) -> str:
         """Return what the estimator changes against the rung before it; empty where the module does not say."""
-        change = self._constants().get("CHANGE")
+        change = self.found.constants().get("CHANGE")
         return change if isinstance(change, str) else ""
 
     def options(self) -> frozenset[str]:
         """Return the names of the settings that this estimator alone reads: its module's constant ``OPTIONS``."""
-        options = self._constants().get("OPTIONS", ())
+        options = self.found.constants().get("OPTIONS", ())
         return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
 
     def ignores(self) -> Mapping[str, str]:
         """Return the common rules that the estimator does not obey, and why: its module's constant ``IGNORES``."""
-        ignores = self._constants().get("IGNORES", {})
+        ignores = self.found.constants().get("IGNORES", {})
         return {str(k): str(v) for k, v in ignores.items()} if isinstance(ignores, dict) else {}
 
     def check_usable(self, settings: Settings) -> None:
@@ -102,25 +100,6 @@ class EstimatorEntry:
             if option not in self.options():
                 known = ", ".join(sorted(self.options())) or "none"
                 raise EstimatorError(f"estimator {self.name} has no option {option}; it has {known}")
-
-    def _tree(self) -> ast.Module:
-        file = self.found.path.stat()
-        return _parsed(self.found.path, (file.st_mtime_ns, file.st_size))
-
-    def _constants(self) -> dict[str, object]:
-        """Return the module's top-level assignments of literals, alone or in tuples, by name."""
-        found: dict[str, object] = {}
-        for statement in self._tree().body:
-            if isinstance(statement, ast.Assign):
-                pairs = [pair for target in statement.targets for pair in _paired(target, statement.value)]
-            elif isinstance(statement, ast.AnnAssign) and statement.value is not None:
-                pairs = _paired(statement.target, statement.value)
-            else:
-                continue
-            for target, value in pairs:
-                with suppress(ValueError):  # not a literal, so nothing that is read here
-                    found |= {target.id: ast.literal_eval(value)} if isinstance(target, ast.Name) else {}
-        return found
 
     def load(self) -> Build:
         """Import the estimator and return its ``build``.
@@ -141,19 +120,6 @@ def discover() -> dict[str, EstimatorEntry]:
     """Find every estimator of every announced package, by name, importing none of them."""
     found = {one.name: EstimatorEntry(one.name, one) for one in announced(ENTRY_POINT_GROUP, EstimatorError)}
     return dict(sorted(found.items()))
-
-
-@lru_cache(maxsize=64)
-def _parsed(path: Path, _state: tuple[int, int]) -> ast.Module:
-    """Return a module's syntax, which is read once in each state of the file."""
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def _paired(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr]]:
-    """Pair each name on the left of an assignment with its expression on the right."""
-    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
-        return list(zip(target.elts, value.elts, strict=True))
-    return [(target, value)]
 
 
 def ladder() -> tuple[EstimatorEntry, ...]:

@@ -12,7 +12,25 @@ import pytest
 
 from toolkit.cli import simulate
 
-COMMANDS = ("", "compare", "report", "export", "check", "baseline", "check-data", "card", "list", "simulate", "tracks")
+COMMANDS = (
+    "",
+    "compare",
+    "evaluate",
+    "diff",
+    "report",
+    "export",
+    "reproduce",
+    "check",
+    "baseline",
+    "check-data",
+    "card",
+    "list",
+    "cite",
+    "simulate",
+    "tracks",
+    "verify",
+    "completion",
+)
 STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 

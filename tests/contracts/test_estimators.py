@@ -1,28 +1,23 @@
 """What every estimator promises, whoever wrote it: a new file in an announced package is tested here unasked."""
 
-from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from toolkit import runner
 from toolkit.errors import DataError, EstimatorError
-from toolkit.estimate import Estimate, Finished, Run, Trajectory
-from toolkit.estimator import Build, Setup, discover, find
-from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.estimate import Run, Trajectory
+from toolkit.estimator import Build, discover, find
+from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models.stereo import triangulate_world
 from toolkit.progress import SILENT
 from toolkit.sequence import Packet, Sequence
-from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, noise_free, simulate
-
-
-def short(scenario: Scenario, duration_s: float) -> Scenario:
-    """Return forty frames of forty tracks: they come and go, and every estimator there will ever be is quick at it."""
-    return replace(scenario, duration_s=duration_s, camera=replace(scenario.camera, max_tracks=40))
-
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, noise_free, simulate
+from toolkit.verify import promises
+from toolkit.verify.trouble import short
+from toolkit.verify.watching import Watched, arrays_of, watch
 
 SCENARIOS = {"drive": short(DRIVE, 4.0), "drive-imu": short(DRIVE_IMU, 4.0), "flight": short(FLIGHT, 2.0)}
 SEED = 4
@@ -62,58 +57,15 @@ def exact_recording(scenario: str) -> Sequence:
     return simulate(noise_free(SCENARIOS[scenario]), SEED)
 
 
-def setup_of(sequence: Sequence) -> Setup:
-    assert sequence.prior is not None
-    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
-
-
 def run_on(name: str, build: Build, sequence: Sequence) -> Run:
     assert sequence.prior is not None
     return runner.run(name, build, sequence, sequence.prior, SILENT)
 
 
-class Watched(NamedTuple):
-    """One run over a recording: what went in and what came out, each with a copy made at that moment."""
-
-    given: tuple[object, ...]
-    given_copies: list[Array]
-    online: list[Estimate | None]
-    online_copies: list[list[Array]]
-    finished: Finished
-
-
 @cache
 def watched(build: Build, scenario: str) -> Watched:
     """Run an estimator once for all the tests that only look at what it said."""
-    sequence = recording(scenario)
-    setup, packets = setup_of(sequence), list(sequence.packets())
-    given = (setup, *packets)
-    given_copies = [array.copy() for array in arrays_of(given)]
-    estimator, online = build(setup), list[Estimate | None]()
-    online_copies: list[list[Array]] = []
-    for packet in packets:
-        online.append(estimator.step(packet))
-        online_copies.append([array.copy() for array in arrays_of(online[-1])])
-    return Watched(given, given_copies, online, online_copies, estimator.finish())
-
-
-def arrays_of(value: object) -> Iterator[Array]:
-    """Yield every array in a value of toolkit.estimate or toolkit.sequence."""
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, tuple):
-        for item in value:
-            yield from arrays_of(item)
-    elif hasattr(value, "__dataclass_fields__"):
-        for field in fields(value):
-            yield from arrays_of(getattr(value, field.name))
-
-
-def assert_bit_identical(one: object, other: object) -> None:
-    pairs = list(zip(arrays_of(one), arrays_of(other), strict=True))
-    assert pairs
-    for left, right in pairs:
-        np.testing.assert_array_equal(left, right)
+    return watch(build, recording(scenario))
 
 
 @cache
@@ -124,38 +76,23 @@ def exact_run(name: str, build: Build, scenario: str) -> Run:
 
 @every_scenario
 def test_it_is_causal_and_deterministic(build: Build, scenario: str) -> None:
-    """Withholding later packets leaves earlier answers bit-identical, and the same packets give the same to the end.
-
-    The first two packets come from a recording that ends with them, the others of the first half from one that ends
-    there: nothing of what comes later can be in them.
-    """
-    sequence, before = recording(scenario), watched(build, scenario)
-    counts = (2, len(before.online) // 2, len(before.online))
-    cut = [list(sequence.truncated(count).packets()) for count in counts]
-    packets = [packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:]]
-    again = build(setup_of(sequence))
-    for packet, said in zip(packets, before.online, strict=True):
-        now = again.step(packet)
-        assert (now is None) == (said is None)
-        if now is not None and said is not None:
-            assert_bit_identical(now, said)
-            np.testing.assert_equal(dict(now.info), dict(said.info))
-    assert_bit_identical(again.finish(), before.finished)
+    """Withholding later packets leaves earlier answers bit-identical, and the same packets give the same to the end."""
+    assert promises.other_when_repeated(build, watched(build, scenario)) == ""
 
 
 @every_scenario
 def test_an_answer_does_not_change_after_it_was_given(build: Build, scenario: str) -> None:
-    run = watched(build, scenario)
-    for said, copies in zip(run.online, run.online_copies, strict=True):
-        for array, copy in zip(arrays_of(said), copies, strict=True):
-            np.testing.assert_array_equal(array, copy)
+    assert promises.changed_later(watched(build, scenario)) == ""
 
 
 @every_scenario
 def test_packets_and_setup_stay_untouched(build: Build, scenario: str) -> None:
-    run = watched(build, scenario)
-    for array, copy in zip(arrays_of(run.given), run.given_copies, strict=True):
-        np.testing.assert_array_equal(array, copy)
+    assert promises.touched(watched(build, scenario)) == ""
+
+
+@every_scenario
+def test_what_it_says_is_finite(build: Build, scenario: str) -> None:
+    assert promises.not_finite(watched(build, scenario)) == ""
 
 
 def assert_close_to_truth(trajectory: Trajectory, sequence: Sequence) -> None:
@@ -191,47 +128,19 @@ def test_without_noise_its_landmarks_are_where_they_are(name: str, build: Build,
     assert np.abs(landmarks.points_world - expected).max(initial=0.0) < limit_m
 
 
-def assert_covariances(covs: Array) -> None:
-    np.testing.assert_array_equal(covs, np.swapaxes(covs, 1, 2))
-    # Units differ by orders of magnitude: what must be positive definite is the matrix of correlations.
-    sigmas = np.sqrt(np.diagonal(covs, axis1=1, axis2=2))
-    assert (sigmas > 0.0).all()
-    assert (np.linalg.eigvalsh(covs / (sigmas[:, :, None] * sigmas[:, None, :])) > 0.0).all()
-
-
 @every_scenario
 def test_covariances_are_symmetric_and_positive_definite_at_every_step(build: Build, scenario: str) -> None:
-    run = watched(build, scenario)
-    online, finished = run.online, run.finished
-    given = [e.cov for e in online if e is not None and e.cov is not None]
-    if finished.trajectory.cov is not None:
-        given.extend(finished.trajectory.cov)
-    for size in {len(cov) for cov in given}:
-        assert size in (6, 9, 15)
-        assert_covariances(np.stack([cov for cov in given if len(cov) == size]))
-    if finished.landmarks.cov is not None:
-        assert_covariances(finished.landmarks.cov)
+    assert promises.unsound_covariance(watched(build, scenario)) == ""
 
 
 @every_scenario
 def test_rotations_stay_rotations(build: Build, scenario: str) -> None:
-    run = watched(build, scenario)
-    online, finished = run.online, run.finished
-    poses = [finished.trajectory.T_world_imu, *(e.T_world_imu[None] for e in online if e is not None)]
-    rotations = np.concatenate(poses)[:, :3, :3]
-    # Rounding of some hundred products.
-    assert np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max() < 1e-12
+    assert promises.no_rotation(watched(build, scenario)) == ""
 
 
 @every_scenario
 def test_stamps_are_those_of_the_frames_and_the_end_covers_all_of_them(build: Build, scenario: str) -> None:
-    run = watched(build, scenario)
-    online, finished = run.online, run.finished
-    frames_t_ns = recording(scenario).frames_t_ns
-    assert len({e is None for e in online}) == 1, "it answers at every frame or only at the end"
-    assert [e.t_ns for e in online if e is not None] in ([], frames_t_ns.tolist())
-    np.testing.assert_array_equal(finished.trajectory.t_ns, frames_t_ns)
-    assert finished.trajectory.T_world_imu.shape == (frames_t_ns.size, 4, 4)
+    assert promises.wrong_stamps(watched(build, scenario)) == ""
 
 
 def without_vision(sequence: Sequence, frames: range) -> Sequence:

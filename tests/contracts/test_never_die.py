@@ -22,6 +22,7 @@ from toolkit.simulation.scenes import Scene
 from toolkit.simulation.sensors import Odometer
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline
 from toolkit.simulation.world import room
+from toolkit.verify.promises import gave_up
 
 HALT_AT_S, HALT_S, MOVING_S, RATE_HZ = 4.0, 30.0, 10.0, 3.0
 KNOT_S, MARGIN = 0.2, 4
@@ -168,15 +169,7 @@ every_case = pytest.mark.parametrize("case, kind", TOGETHER, ids=[" with ".join(
 @every_case
 @pytest.mark.parametrize("name", sorted(discover()))
 def test_it_goes_on_to_the_end(name, case, kind, answer):
-    run = answer(name, case, kind)
-    assert run.status in ("ok", "diverged"), run.log
-    assert run.status == "ok" or run.log
-    frames_t_ns = sequence_of(case, kind).frames_t_ns
-    for trajectory in (run.causal, run.final):
-        if trajectory is not None:
-            np.testing.assert_array_equal(trajectory.t_ns, frames_t_ns)
-            assert np.isfinite(trajectory.T_world_imu).all()
-    assert run.final is not None
+    assert gave_up(answer(name, case, kind), sequence_of(case, kind).frames_t_ns) == ""
 
 
 @every_case

@@ -34,6 +34,10 @@ CASES = {
     "trajectory-baseline.json": "trajectory-baseline-1",
     "check.json": "check-2",
     "card.json": "card-1",
+    "evaluation.json": "evaluation-1",
+    "verification.json": "verification-1",
+    "diff.json": "diff-1",
+    "bundle.json": "bundle-1",
 }
 
 

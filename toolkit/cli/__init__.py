@@ -11,7 +11,24 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from toolkit.cli import baseline, card, check, check_data, compare, export, list_parts, report, simulate, tracks
+from toolkit.cli import (
+    baseline,
+    card,
+    check,
+    check_data,
+    cite,
+    compare,
+    completion,
+    diff,
+    evaluate,
+    export,
+    list_parts,
+    report,
+    reproduce,
+    simulate,
+    tracks,
+    verify,
+)
 from toolkit.cli.arguments import Parser, ShowVersion, epilog
 from toolkit.errors import OutputError, VislamError, printable
 
@@ -27,6 +44,11 @@ _PATIENCE_S = 10.0
 # What writing fails with; of a file such an error is an OutputError already, so that here it is the output's.
 _NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
+# In the order of the help: what one does every day, then once in a while.
+_COMMANDS = (
+    *(compare, evaluate, diff, report, export, reproduce),
+    *(check, baseline, check_data, card, verify, list_parts, cite, simulate, tracks, completion),
+)
 
 
 def parser() -> Parser:
@@ -38,7 +60,7 @@ def parser() -> Parser:
     )
     root.add_argument("--version", action=ShowVersion, help="print the version and exit")
     subcommands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in (compare, report, export, check, baseline, check_data, card, list_parts, simulate, tracks):
+    for module in _COMMANDS:
         module.add_to(subcommands)
     return root
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
-    from toolkit.gate.trajectory_check import Truths
+    from toolkit.gate.trajectory_check import GivenRuns, Truths
     from toolkit.settings import Settings
 
 # Each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
@@ -114,7 +114,23 @@ def named_file(text: str) -> tuple[str, Path]:
     return name.strip(), Path(file)
 
 
-def truths_given(given: Iterable[str]) -> "Truths":
+def runs_given(place: Path, truths: Iterable[str]) -> "GivenRuns":
+    """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
+
+    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none.
+    """
+    from toolkit.gate.trajectory_check import FolderOfRuns
+
+    if place.is_dir() or place.suffix != ".json":
+        return FolderOfRuns(place, _truths_given(truths))
+    from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
+
+    if list(truths):
+        raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
+    return EvaluatedRuns(place, read_evaluation(place))
+
+
+def _truths_given(given: Iterable[str]) -> "Truths":
     """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
     from toolkit.gate.trajectory_check import Truths
 

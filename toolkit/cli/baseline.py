@@ -16,8 +16,8 @@ from toolkit.cli.arguments import (
     at_least,
     epilog,
     positive_seconds,
+    runs_given,
     settings_asked,
-    truths_given,
 )
 from toolkit.errors import printable
 
@@ -83,9 +83,10 @@ def _add_trajectories_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("baselines of another system's trajectories")
     group.add_argument(
         "--trajectories",
-        metavar="DIR",
+        metavar="DIR|FILE",
         type=Path,
-        help="run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against --truth",
+        help="run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against --truth; "
+        "or take the scores of an evaluation.json",
     )
     group.add_argument(
         "--align",
@@ -137,7 +138,7 @@ def _of_trajectories(options: argparse.Namespace) -> int:
     check_writable(out)
     scoring = Scoring(options.align or Scoring.align, options.gap or Scoring.gap_s)
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_trajectory_baseline(options.trajectories, truths_given(options.truth), scoring, made_by)
+    made = new_trajectory_baseline(runs_given(options.trajectories, options.truth), scoring, made_by)
     write_text(out, to_text(made))
     runs = sum(len(one.files) for one in made.sequences.values())
     print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))

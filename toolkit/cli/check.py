@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, add_workers_argument, epilog, truths_given
+from toolkit.cli.arguments import UsageError, add_workers_argument, epilog, runs_given
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -40,10 +40,10 @@ def add_to(subcommands: Subcommands) -> None:
         parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
     parser.add_argument(
         "--trajectories",
-        metavar="DIR",
+        metavar="DIR|FILE",
         type=Path,
-        help="run nothing; judge another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, against a baseline that "
-        "vislam baseline --trajectories wrote",
+        help="run nothing; judge another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
+        "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
     )
     parser.add_argument(
         "--truth",
@@ -115,6 +115,5 @@ def _of_trajectories(options: argparse.Namespace) -> Check:
 
     if options.speed_against:
         raise UsageError("--speed-against times estimators; with --trajectories nothing runs")
-    baseline, truths = load_trajectory_baseline(options.baseline), truths_given(options.truth)
-    accept = options.accept_better
-    return check_trajectories(baseline, str(options.baseline), options.trajectories, truths, accept_better=accept)
+    baseline, given = load_trajectory_baseline(options.baseline), runs_given(options.trajectories, options.truth)
+    return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)

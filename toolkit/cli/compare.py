@@ -106,6 +106,17 @@ def add_to(subcommands: Subcommands) -> None:
     add_settings_arguments(parser)
     add_workers_argument(parser)
     parser.add_argument(
+        "--figure-format",
+        choices=("png", "pdf", "svg"),
+        default="png",
+        help="of the figures; pdf and svg stay sharp in a paper (default: png)",
+    )
+    printed = parser.add_mutually_exclusive_group()
+    printed.add_argument(
+        "--json", action="store_true", help="print what metrics.json or seeds.json holds, a line a SEQUENCE, no table"
+    )
+    printed.add_argument("--quiet", action="store_true", help="print nothing; the run directory has everything")
+    parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
         help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
@@ -115,16 +126,18 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Compare, print and return 1 where an estimator diverged or failed."""
+    from toolkit.documents import to_line
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import MadeBy, directories_for, write_run
+    from toolkit.report.scores_json import scores_document
     from toolkit.report.terminal import comparison_text
 
     columns = _columns(options.columns)
     asked = _configuration(options)
     plan, progress_for = _placed(_plan(asked), options), of_this_process()
-    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked), True
+    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked, options.figure_format), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
@@ -132,10 +145,15 @@ def command(options: argparse.Namespace) -> int:
         open_files.enter_context(_told_where_to_go_on(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
-            print_above(comparison_text(comparison, columns, width_of_output()))
+            if not (options.json or options.quiet):
+                print_above(comparison_text(comparison, columns, width_of_output()))
             with progress_for(f"{comparison.name}: figures and report"):
                 write_run(comparison, directory, made_by)
-            print_above(f"\nresults: {printable(str(directory))}{_found(comparison, stores.get(directory))}\n")
+            found = _found(comparison, stores.get(directory))
+            if options.json:
+                print_above(to_line(scores_document(comparison)).rstrip())
+            elif not options.quiet:
+                print_above(f"\nresults: {printable(str(directory))}{found}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
 

@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from toolkit.discovery import MissingDependency, announced, modules_in
+from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
 from toolkit.frontend import ImageRecording
@@ -89,6 +89,11 @@ class _Found(NamedTuple):
 
     modules: Mapping[str, ModuleType]
     missing: Mapping[str, str]
+
+
+def modules() -> dict[str, FoundModule]:
+    """Return every module of this package and of the announced ones by name, importing none of them."""
+    return {one.name: one for one in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP, DataError))}
 
 
 @cache

@@ -15,6 +15,7 @@ from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig
 
+CITES = ("geiger2013kitti",)
 _NOT_SEEN = -1.0
 _REQUIRED = (
     "time_stamps",

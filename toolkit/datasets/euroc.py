@@ -40,6 +40,7 @@ from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation.world import Camera
 
+CITES = ("burri2016euroc",)
 REAL = "real IMU, stereo tracks from the images"
 SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"

@@ -16,6 +16,7 @@ from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.noise import pixel_covariance
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
 
+CITES = ("geiger2013kitti", "gtsam")
 # The first IMU sample is followed by a gap of 1.92 s, which covers frames 0 to 13.
 FIRST_FRAME = 14
 # Seconds of day of frame 0 and the camera's period, found by aligning the yaw rates of tracks and IMU (+-5 ms).

@@ -25,6 +25,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Provenance, Sequence, Truth
 from toolkit.settings import DEFAULTS, Frontend
 
+CITES = ("geiger2013kitti",)
 _SIDES = (("00", "01"), ("02", "03"))
 # Between slower packets a car's specific force is not what its samples say.
 _IMU_FROM_HZ = 50.0

@@ -26,6 +26,7 @@ from toolkit.inputs import read_input, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
+CITES = ("geneva2020openvins",)
 _CALIBRATION, _IMU, _FEATURES, _TRUTH = "calib.json", "imu.csv", "features.csv", "truth_cam.csv"
 _IMU_COLUMNS = ("timestamp", "ax", "ay", "az", "gx", "gy", "gz")
 _FEATURE_COLUMNS = ("timestamp", "frame", "feature_id", "uL", "vL", "uR", "vR", "in_left", "in_right")

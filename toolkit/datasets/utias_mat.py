@@ -23,6 +23,7 @@ from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 
+CITES = ("clement2015battle", "geiger2013kitti")
 _NOT_SEEN = -1.0
 _REQUIRED = (
     *("y_k_j", "v_vk_vk_i", "w_vk_vk_i", "t", "r_i_vk_i", "theta_vk_i"),

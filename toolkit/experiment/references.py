@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from toolkit.datasets.trajectories.belonging import (
+    Reference,
     check_clock,
     check_length_unit,
     check_turns,
@@ -49,12 +50,13 @@ def check_names(references: Mapping[str, Trajectory], files: Mapping[str, PosesF
 
 def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequence) -> Run:
     trajectory, what = _stamped(poses, recording, sequence), str(poses.path)
-    check_clock(what, recording, trajectory.t_ns)
-    check_length_unit(what, recording, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
+    reference = Reference.of_recording(recording)
+    check_clock(what, reference, trajectory.t_ns)
+    check_length_unit(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
     readings = [inverted(), of_the_camera(recording)]
     if poses.other_order is not None:
         readings.insert(0, in_other_order(poses.other_order))
-    confirmed = check_turns(what, recording, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)
+    confirmed = check_turns(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)
     if poses.other_order is not None and not confirmed:
         check_order(poses.path, trajectory.T_world_imu, poses.other_order)
     return _run(

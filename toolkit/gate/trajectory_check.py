@@ -4,7 +4,9 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -41,33 +43,70 @@ class Truths:
         return found[0]
 
 
-def new_trajectory_baseline(
-    folder: Path, truths: Truths, scoring: Scoring, made_by: Mapping[str, str]
-) -> TrajectoryBaseline:
-    """Score every trajectory in a folder; raises DataError for the first file that cannot be used."""
-    found = {}
-    for sequence, files in files_by_sequence(folder).items():
-        path = truths.of(sequence)
+class GivenRuns(Protocol):
+    """Runs of a system on sequences, from a folder or scored before."""
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are; raises DataError where there are none."""
+
+    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+        """Return the scores of a sequence; ``before`` is what the baseline has of it.
+
+        Raises DataError where there is no run, or one cannot be used.
+        """
+
+
+@dataclass(frozen=True)
+class FolderOfRuns:
+    """The trajectory files in a folder, with their truths."""
+
+    folder: Path
+    truths: Truths
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are files of; raises DataError where there are none."""
+        return tuple(self._files)
+
+    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+        """Score the files of a sequence; the truth is where it is given, or else where the baseline had it."""
+        files = self._files.get(sequence, ())
+        if not files:
+            raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files if before else ())}")
+        given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
+        path = self.truths.of(sequence) if before is None or given else _located(before.truth)
         truth = read_stamped(path)
-        names = tuple(str(file.relative_to(folder)) for file in files)
-        found[sequence] = Scored(path.as_posix(), truth.digest, names, _scores_of(files, truth, scoring))
+        names = tuple(str(file.relative_to(self.folder)) for file in files)
+        if before is not None and truth.digest != before.truth_hash:
+            return Scored(path.as_posix(), truth.digest, names, {})
+        return Scored(path.as_posix(), truth.digest, names, _scores_of(files, truth, scoring))
+
+    @cached_property
+    def _files(self) -> dict[str, tuple[Path, ...]]:
+        return files_by_sequence(self.folder)
+
+
+def new_trajectory_baseline(given: GivenRuns, scoring: Scoring, made_by: Mapping[str, str]) -> TrajectoryBaseline:
+    """Score every run there is; raises DataError for the first that cannot be used."""
+    found = {sequence: given.scored(sequence, scoring, None) for sequence in given.sequences}
     bounds = {key: BOUND_PERCENT for key in scoring.metrics if key != TIME_COVERAGE}
     return TrajectoryBaseline(found, scoring, bounds, made_by=made_by)
 
 
 def check_trajectories(
-    baseline: TrajectoryBaseline, name: str, folder: Path, truths: Truths, *, accept_better: bool = False
+    baseline: TrajectoryBaseline, name: str, given: GivenRuns, *, accept_better: bool = False
 ) -> Check:
-    """Score a folder's trajectories and judge them; a file that cannot be used is a verdict, not an error.
+    """Judge the runs of a system; one that cannot be used is a verdict, not an error.
 
-    Raises DataError where the folder has no trajectory at all.
+    Raises DataError where there is no run at all.
     """
-    began, there = time.monotonic(), files_by_sequence(folder)
+    began, there = time.monotonic(), given.sequences
     verdicts: list[Verdict] = []
     compared: list[_Compared] = []
     for sequence, before in baseline.sequences.items():
         try:
-            now = _now(sequence, before, there.get(sequence, ()), truths, baseline.scoring)
+            now = _now(sequence, before, given, baseline.scoring)
         except DataError as error:
             verdicts.append(Verdict(sequence, "", "", _SEQUENCE, "missing", printable(" ".join(str(error).split()))))
             continue
@@ -109,15 +148,12 @@ class _Compared:
         return float(np.log1p(self.criterion.percent / 100.0))
 
 
-def _now(sequence: str, before: Scored, files: tuple[Path, ...], truths: Truths, scoring: Scoring) -> dict[str, Values]:
-    """Return the scores of a sequence's files; raises DataError where one cannot be used, or the truth is another."""
-    if not files:
-        raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files)}")
-    given = truths.folder is not None or sequence in (truths.files or {})
-    truth = read_stamped(truths.of(sequence) if given else _located(before.truth))
-    if truth.digest != before.truth_hash:
-        raise DataError(f"{truth.path} is another truth than the baseline's; make a new baseline")
-    return _scores_of(files, truth, scoring)
+def _now(sequence: str, before: Scored, given: GivenRuns, scoring: Scoring) -> Mapping[str, Values]:
+    """Return the scores of a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
+    now = given.scored(sequence, scoring, before)
+    if now.truth_hash != before.truth_hash:
+        raise DataError(f"{now.truth} is another truth than the baseline's; make a new baseline")
+    return now.scores
 
 
 def _located(truth: str) -> Path:

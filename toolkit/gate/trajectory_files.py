@@ -68,7 +68,7 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
         raise DataError(f"{folder}: it is no folder; give one that has SEQUENCE.tum or SEQUENCE/RUN.tum")
     found: dict[str, tuple[Path, ...]] = {}
     for path in _entries(folder):
-        files = tuple(filter(_is_file, _entries(path))) if path.is_dir() else (path,) if _is_file(path) else ()
+        files = trajectory_files(path) if path.is_dir() else (path,) if _is_file(path) else ()
         name = printable(path.name if path.is_dir() else path.stem)
         if files and name in found:
             raise DataError(f"{folder}: {name} is there twice, as {found[name][0].name} and {path.name}; leave one")
@@ -77,6 +77,11 @@ def files_by_sequence(folder: Path) -> dict[str, tuple[Path, ...]]:
     if not found:
         raise DataError(f"{folder}: no SEQUENCE.tum and no SEQUENCE/RUN.tum in it ({', '.join(SUFFIXES)} are read)")
     return found
+
+
+def trajectory_files(folder: Path) -> tuple[Path, ...]:
+    """Return the trajectory files that are directly in a folder, by name; raises DataError where it cannot be read."""
+    return tuple(filter(_is_file, _entries(folder)))
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -105,7 +110,7 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
 
     Raises DataError where no two of its poses meet the truth in time.
     """
-    matched = _matched(estimate, truth)
+    matched = matched_poses(estimate, truth)
     if len(matched) < 2:
         raise DataError(
             f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
@@ -134,7 +139,7 @@ def time_coverage_percent(t_ns: IntArray, truth_t_ns: IntArray, gap_s: float) ->
     return 100.0 * covered / max(end - begin, 1)
 
 
-def _matched(estimate: Poses, truth: Poses) -> Matched:
+def matched_poses(estimate: Poses, truth: Poses) -> Matched:
     """Return the pairs on the stamps of the sparser of the two, between whose neighbours the other is interpolated."""
     path_m = distance_along(truth.poses[:, :3, 3])
     truth_period_ns, period_ns = median_period_ns(truth.t_ns), median_period_ns(estimate.t_ns)

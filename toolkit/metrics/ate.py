@@ -5,7 +5,7 @@ import numpy as np
 from toolkit.geometry import Array
 from toolkit.metrics._shared.alignment import Alignment, fit_sim3, fit_yaw
 from toolkit.metrics._shared.association import Matched
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.evaluation import AgainstTruth
 from toolkit.metrics._shared.residuals import angles_deg, lengths, rmse
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
@@ -59,7 +59,7 @@ _TILTED_DEG, _EXPLAINED = 1.0, 0.5
 _ON_A_LINE = "the positions lie on a line, so the rotation about it is not determined"
 
 
-def score(evaluation: Evaluation) -> Scores:
+def score(evaluation: AgainstTruth) -> Scores:
     """Score the four position errors and the rotation error."""
     scores = evaluate(
         {
@@ -75,10 +75,10 @@ def score(evaluation: Evaluation) -> Scores:
     return scores.remarked(["ate_none_m", "ate_yaw_m"], _tilt_remark(evaluation, scores))
 
 
-def _tilt_remark(evaluation: Evaluation, scores: Scores) -> str:
+def _tilt_remark(evaluation: AgainstTruth, scores: Scores) -> str:
     """Return a remark where the verticals disagree, an IMU measures them and that explains the error; else nothing."""
     se3_m, yaw_m = scores.values["ate_se3_m"], scores.values["ate_yaw_m"]
-    if evaluation.sequence.motion_kind != "imu" or se3_m is None or yaw_m is None:
+    if not evaluation.level or se3_m is None or yaw_m is None:
         return ""
     tilt_deg = float(np.degrees(np.arccos(np.clip(evaluation.se3_alignment.rotation[2, 2], -1.0, 1.0))))
     if tilt_deg < _TILTED_DEG or se3_m**2 > (1.0 - _EXPLAINED) * yaw_m**2:
@@ -89,7 +89,7 @@ def _tilt_remark(evaluation: Evaluation, scores: Scores) -> str:
     )
 
 
-def _positions(evaluation: Evaluation) -> tuple[Array, Array]:
+def _positions(evaluation: AgainstTruth) -> tuple[Array, Array]:
     return evaluation.compared.truth[:, :3, 3], evaluation.compared.estimate[:, :3, 3]
 
 

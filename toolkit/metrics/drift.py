@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.evaluation import AgainstTruth
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 40
@@ -17,12 +17,12 @@ METRICS = (
 )
 
 
-def score(evaluation: Evaluation) -> Scores:
+def score(evaluation: AgainstTruth) -> Scores:
     """Score the drift at the last matched pair."""
     return evaluate({"end_drift_percent": lambda: _end_drift_percent(evaluation)})
 
 
-def _end_drift_percent(evaluation: Evaluation) -> float:
+def _end_drift_percent(evaluation: AgainstTruth) -> float:
     matched = evaluation.compared
     length_m = float(matched.path_m[-1] - matched.path_m[0])
     if length_m == 0.0:

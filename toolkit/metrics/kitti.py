@@ -8,7 +8,7 @@ and their errors are divided by the nominal length; the mean is over all segment
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.evaluation import AgainstTruth
 from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 
@@ -34,13 +34,13 @@ SEGMENT_LENGTHS_M = np.arange(100.0, 801.0, 100.0)
 START_EVERY = 10
 
 
-def score(evaluation: Evaluation) -> Scores:
+def score(evaluation: AgainstTruth) -> Scores:
     """Score both figures of the benchmark."""
     t_per_m, r_deg_per_m = _errors_per_m(evaluation)
     return Scores({"kitti_t_percent": 100.0 * float(t_per_m.mean()), "kitti_r_deg_per_m": float(r_deg_per_m.mean())})
 
 
-def _errors_per_m(evaluation: Evaluation) -> tuple[Array, Array]:
+def _errors_per_m(evaluation: AgainstTruth) -> tuple[Array, Array]:
     """Return translation (s,) m/m and rotation (s,) deg/m of every segment."""
     matched = evaluation.compared
     starts = np.arange(0, len(matched), START_EVERY)

@@ -3,13 +3,14 @@
 Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (IROS 2012), eqs. 2-3.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, median_period_ns
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.evaluation import AgainstTruth
 from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors, rmse
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.resampling import NS_PER_S
@@ -49,12 +50,13 @@ class _Intervals(NamedTuple):
     last: IntArray
 
 
-def score(evaluation: Evaluation) -> Scores:
+def score(evaluation: AgainstTruth) -> Scores:
     """Score drift over one second and over 100 m."""
+    errors_of_a_second = cache(lambda: _errors_of_a_second(evaluation))
     return evaluate(
         {
-            "rpe_1s_m": lambda: rmse(lengths(_errors_of_a_second(evaluation)[:, :3, 3])),
-            "rpe_1s_deg": lambda: rmse(angles_deg(_errors_of_a_second(evaluation)[:, :3, :3])),
+            "rpe_1s_m": lambda: rmse(lengths(errors_of_a_second()[:, :3, 3])),
+            "rpe_1s_deg": lambda: rmse(angles_deg(errors_of_a_second()[:, :3, :3])),
             "rpe_100m_percent": lambda: hundred_metres_percent(evaluation.compared),
         }
     )
@@ -66,7 +68,7 @@ def hundred_metres_percent(matched: Matched) -> float:
     return rmse(lengths(errors[:, :3, 3])) / INTERVAL_M * 100.0
 
 
-def _errors_of_a_second(evaluation: Evaluation) -> Array:
+def _errors_of_a_second(evaluation: AgainstTruth) -> Array:
     return relative_errors(evaluation.compared, *_one_second(evaluation.compared))
 
 

@@ -18,7 +18,7 @@ from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.pipeline import Case
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
-from toolkit.report.figures import drawn, save
+from toolkit.report.figures import FigureFormat, drawn, save
 from toolkit.report.figures.alignment import truth_during
 from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest, read_manifest
@@ -117,10 +117,14 @@ def unique_names(names: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class MadeBy:
-    """The command line that made a comparison, and what it came to: what to compare, with which settings."""
+    """The command line that made a comparison, and what it came to: what to compare, with which settings.
+
+    ``figures`` is the kind of files that figures are written as.
+    """
 
     command: str
     asked: Configuration
+    figures: FigureFormat = "png"
 
 
 def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
@@ -141,7 +145,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
             _write_trajectories(comparison, directory)
         (directory / "figures").mkdir()
-        captions = save(drawn(comparison), directory / "figures")
+        captions = save(drawn(comparison), directory / "figures", made_by.figures)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.asked)
         _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))

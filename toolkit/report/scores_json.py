@@ -57,6 +57,11 @@ def seeds_document(over: Comparison) -> Seeds:
     )
 
 
+def scores_document(comparison: Comparison) -> Metrics | Seeds:
+    """Return the scores of a comparison, of one seed or over many."""
+    return seeds_document(comparison) if comparison.over_seeds else metrics_document(comparison)
+
+
 def path_length_m(sequence: Sequence) -> float | None:
     """Return the length of the true path while the camera ran, or None without truth or frames."""
     if sequence.truth is None or not sequence.frame_count:

@@ -4,16 +4,20 @@ Which metrics have a column, under which heading and with how many decimals, is 
 :mod:`toolkit.metrics`; tabulate renders the cells.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
 from toolkit.errors import printable
-from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.report.prose import in_markdown
+
+if TYPE_CHECKING:
+    from toolkit.experiment.comparison import Comparison, Row
 
 MISSING = "-"
 _WIDEST_NUMBER = 5
@@ -28,6 +32,12 @@ _PLAIN_TEXT = TableFormat(
     padding=0,
     with_header_hide=None,
 )
+_LATEX = {character: rf"\{character}" for character in "&%$#_{}"} | {
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+    "±": r"$\pm$",
+}
 # The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
 _BANDED = "nees_pose_mean"
 
@@ -39,7 +49,8 @@ class Table(NamedTuple):
     """Headings (one tuple of lines a column), rows of cells, and lines that belong under the table.
 
     The first ``labels`` columns are words, the others numbers. ``marks`` has a remark or nothing for each row, which
-    stands with its third cell, how the row's runs ended.
+    stands with its third cell, how the row's runs ended. ``best`` has row and column of each cell to set in bold where
+    the kind of text can.
     """
 
     headings: tuple[tuple[str, ...], ...]
@@ -47,6 +58,7 @@ class Table(NamedTuple):
     labels: int
     under: tuple[str, ...] = ()
     marks: tuple[str, ...] = ()
+    best: frozenset[tuple[int, int]] = frozenset()
 
 
 class _Column(NamedTuple):
@@ -208,9 +220,33 @@ def as_markdown(table: Table) -> str:
     heads = [_in_one_line(lines) for lines in table.headings]
     marks = table.marks or ("",) * len(table.rows)
     labelled = (_with_mark(row, mark) for row, mark in zip(table.rows, marks, strict=True))
-    rows = [(*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in labelled]
+    plain = [(*map(in_markdown, row[: table.labels]), *row[table.labels :]) for row in labelled]
+    rows = [
+        tuple(f"**{text}**" if (i, j) in table.best else text for j, text in enumerate(row))
+        for i, row in enumerate(plain)
+    ]
     text = tabulate(rows, heads, "pipe", colalign=_sides(table), disable_numparse=True)
     return "\n\n".join(filter(None, (text, "\n".join(f"- {in_markdown(line)}" for line in table.under))))
+
+
+def as_latex(table: Table) -> str:
+    """Return the table as LaTeX of the package booktabs; units stand in brackets, the best cells are bold."""
+    sides = "".join(side[0] for side in _sides(table))
+    heads = " & ".join(_in_latex(_in_one_line(lines)) for lines in table.headings)
+    rows = [" & ".join(_latex_cells(table, i)) for i in range(len(table.rows))]
+    lines = [rf"\begin{{tabular}}{{{sides}}}", r"\toprule", rf"{heads} \\", r"\midrule"]
+    return "\n".join([*lines, *(rf"{row} \\" for row in rows), r"\bottomrule", r"\end{tabular}"])
+
+
+def _latex_cells(table: Table, row: int) -> Iterator[str]:
+    for column, text in enumerate(table.rows[row]):
+        escaped = _in_latex(text)
+        yield rf"\textbf{{{escaped}}}" if (row, column) in table.best else escaped
+
+
+def _in_latex(text: str) -> str:
+    """Return a text that LaTeX prints as it is."""
+    return "".join(_LATEX.get(character, character) for character in printable(text))
 
 
 def _in_one_line(heading: tuple[str, ...]) -> str:

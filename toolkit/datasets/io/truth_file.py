@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from toolkit.datasets.trajectories import tum
-from toolkit.datasets.trajectories.belonging import check_clock, check_turns, in_other_order
+from toolkit.datasets.trajectories.belonging import Reference, check_clock, check_turns, in_other_order
 from toolkit.datasets.trajectories.poses import check_order
 from toolkit.sequence import Sequence, Truth
 
@@ -32,8 +32,9 @@ def with_truth(sequence: Sequence, truth: Truth) -> Sequence:
     Raises DataError where the two do not overlap in time (both ranges and the likely cause are named), or
     where the measured rates of rotation fit the truth only with its quaternions read w first.
     """
-    check_clock("the truth", sequence, truth.t_ns)
+    reference = Reference.of_recording(sequence)
+    check_clock("the truth", reference, truth.t_ns)
     # Only the order: the recording is not audited yet, and mixed axes of its own would look like a camera's.
     readings = (in_other_order(tum.W_FIRST),)
-    check_turns("the truth", sequence, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
+    check_turns("the truth", reference, truth.t_ns, truth.T_world_imu[:, :3, :3], readings)
     return replace(sequence, truth=truth)

@@ -1,4 +1,4 @@
-"""The checks that a trajectory belongs to a recording: one clock, one unit of time, rotation as the gyro has it."""
+"""The checks that a trajectory belongs to a recording, or to a truth alone: one clock, one unit, the same turns."""
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -15,6 +15,10 @@ from toolkit.sequence import Sequence
 # The rates of rotation decide where they follow another reading this closely and leave a third as much, or less,
 # unexplained than under the file's own: slow turns correlate with unrelated ones by chance, 0.8 at times.
 _FITTING_CORRELATION, _UNEXPLAINED_SHARE = 0.5, 1.0 / 3.0
+# Rates that follow the gyro this closely are read rightly, and no other reading is tried.
+_SURE_CORRELATION = 0.95
+# Three angles are fitted to say that a body has other axes, and mounts are off by some degrees: more is asked for.
+_TURNED_CORRELATION, _OTHER_AXES_RAD = 0.8, 0.3
 # Rates are means over this long at least, over which even a jittery estimate has turned more than its noise.
 _STEP_NS = NS_PER_S // 4
 # Stamps beyond this count from an epoch, stamps below it from the start of a recording or of a day.
@@ -27,6 +31,50 @@ _SCALES = (1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9)
 # A unit of length is named where the median ratio of speeds, over so many steps in motion, is within this factor of it.
 _LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 _WITHIN_FACTOR, _FEWEST_STEPS, _MOVING_MPS = 1.25, 20, 0.1
+
+
+class Reference(NamedTuple):
+    """What a trajectory is held against: stamps (K,), rates of rotation (S, 3) rad/s, and positions where known.
+
+    ``clock`` and ``turns`` are what has these stamps and these rates, in words. ``positions`` (P, 3) m are the truth's;
+    without them ``speeds_mps`` (S,) of the motion samples tell the unit of length, and may be NaN.
+    """
+
+    name: str
+    clock: str
+    turns: str
+    t_ns: IntArray
+    rates_t_ns: IntArray
+    rates_radps: Array
+    positions_t_ns: IntArray
+    positions: Array
+    speeds_mps: Array
+
+    @classmethod
+    def of_recording(cls, sequence: Sequence) -> "Reference":
+        """Return the frames, the gyro, and the truth or else the twists of a recording."""
+        motion, truth = sequence.motion, sequence.truth
+        usable = np.flatnonzero(np.isfinite(motion.values).all(axis=1))
+        samples = usable[np.argsort(motion.t_ns[usable], kind="stable")]
+        twists = isinstance(motion, TwistSamples)
+        speeds = np.linalg.norm(motion.values[samples, :3], axis=1) if twists else np.full(samples.size, np.nan)
+        return cls(
+            sequence.name, "the frames", "the gyro says", sequence.frames_t_ns,
+            motion.t_ns[samples], motion.values[samples, 3:],
+            np.empty(0, np.int64) if truth is None else truth.t_ns,
+            np.empty((0, 3)) if truth is None else truth.T_world_imu[:, :3, 3],
+            speeds,
+        )  # fmt: skip
+
+    @classmethod
+    def of_truth(cls, name: str, t_ns: IntArray, T_world_imu: Array) -> "Reference":
+        """Return a truth (N,), (N, 4, 4) whose recording is not there: its turns are in the place of a gyro's."""
+        turns = so3_log(np.swapaxes(T_world_imu[:-1, :3, :3], 1, 2) @ T_world_imu[1:, :3, :3])
+        rates: Array = turns / (np.diff(t_ns) / NS_PER_S)[:, None]
+        middle_ns = t_ns[:-1] + np.diff(t_ns) // 2
+        unknown = np.full(middle_ns.size, np.nan)
+        positions = T_world_imu[:, :3, 3]
+        return cls(name, "the truth", "the truth does", t_ns, middle_ns, rates, t_ns, positions, unknown)
 
 
 class Reading(NamedTuple):
@@ -55,12 +103,12 @@ def of_the_camera(sequence: Sequence) -> Reading:
     return Reading("taken as the camera's", remedy, lambda R_world_cam: R_world_cam @ R_cam_imu)
 
 
-def check_clock(what: str, sequence: Sequence, t_ns: IntArray) -> None:
-    """Raise DataError where stamps (N,) and frames do not overlap, or only in another unit of time.
+def check_clock(what: str, reference: Reference, t_ns: IntArray) -> None:
+    """Raise DataError where stamps (N,) and the reference's do not overlap, or only in another unit of time.
 
     Both ranges and the likely cause are named.
     """
-    frames_t_ns = sequence.frames_t_ns
+    frames_t_ns = reference.t_ns
     scale = _fitting_scale(frames_t_ns, t_ns)
     overlap = t_ns[-1] >= frames_t_ns[0] and t_ns[0] <= frames_t_ns[-1]
     if overlap and scale is None:
@@ -69,34 +117,58 @@ def check_clock(what: str, sequence: Sequence, t_ns: IntArray) -> None:
         mismatch, cause = "they do not overlap", _clock_difference(frames_t_ns, t_ns)
     else:
         mismatch, cause = "they fit only in another unit of time", f"multiply the stamps by {scale:g}"
-    ranges = f"{what} covers {range_s(t_ns)}, the frames {range_s(frames_t_ns)}"
-    raise DataError(f"{sequence.name}: {ranges}: {mismatch}; {cause}")
+    ranges = f"{what} covers {range_s(t_ns)}, {reference.clock} {range_s(frames_t_ns)}"
+    raise DataError(f"{reference.name}: {ranges}: {mismatch}; {cause}")
 
 
-def check_turns(what: str, sequence: Sequence, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]) -> bool:
+def check_turns(
+    what: str, reference: Reference, t_ns: IntArray, R_world_imu: Array, readings: Iterable[Reading]
+) -> bool:
     """Return whether rotations (N, 3, 3) agree with the gyro; False also where the recording is too short or straight.
 
     Raises DataError where they do so under one of the readings, and not as given: read wrongly, a trajectory turns
     the other way and about other axes.
     """
-    within, sample_t_ns, gyro_radps = _gyro_along(sequence, t_ns)
+    within = _within(t_ns, reference.rates_t_ns)
     steps = _Steps.of(t_ns[within])
     if steps.start.size < 2:
         return False
-    measured = steps.mean_rates(sample_t_ns, gyro_radps)
+    measured = steps.mean_rates(reference.rates_t_ns, reference.rates_radps)
     given = R_world_imu[within]
     as_given = _correlation(steps.rates(given), measured)
+    if as_given > _SURE_CORRELATION:
+        return True
     fits = {reading: _correlation(steps.rates(reading.reread(given)), measured) for reading in readings}
     best, fit = max(fits.items(), key=lambda item: item[1])
     if fit > _FITTING_CORRELATION and 1.0 - fit < _UNEXPLAINED_SHARE * (1.0 - as_given):
-        raise DataError(f"{sequence.name}: {what} turns as the gyro says only if {best.only_if}; {best.remedy}")
+        raise DataError(f"{reference.name}: {what} turns as {reference.turns} only if {best.only_if}; {best.remedy}")
     return as_given > _FITTING_CORRELATION and as_given >= fit
 
 
-def check_length_unit(what: str, sequence: Sequence, t_ns: IntArray, positions: Array) -> None:
+def turned_body(reference: Reference, t_ns: IntArray, R_world_body: Array) -> Array | None:
+    """Return R_reference_body (3, 3) where rotations (N, 3, 3) are those of a body with other axes, or None.
+
+    Found where the rates of rotation agree once they are turned as a whole (the best turn: Kabsch 1976), and not as
+    they are. A camera's poses beside an IMU's are the usual case.
+    """
+    within = _within(t_ns, reference.rates_t_ns)
+    steps = _Steps.of(t_ns[within])
+    if steps.start.size < _FEWEST_STEPS:
+        return None
+    measured, rates = (x - x.mean(axis=0) for x in (
+        steps.mean_rates(reference.rates_t_ns, reference.rates_radps), steps.rates(R_world_body[within])
+    ))  # fmt: skip
+    u, _, v_transposed = np.linalg.svd(measured.T @ rates)
+    turn = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v_transposed))]) @ v_transposed
+    as_given, turned = _correlation(rates, measured), _correlation(rates @ turn.T, measured)
+    is_other = turned > _TURNED_CORRELATION and 1.0 - turned < _UNEXPLAINED_SHARE * (1.0 - as_given)
+    return turn if is_other and np.linalg.norm(so3_log(turn)) > _OTHER_AXES_RAD else None
+
+
+def check_length_unit(what: str, reference: Reference, t_ns: IntArray, positions: Array) -> None:
     """Raise DataError where positions (N, 3) move as fast as the truth, or else the twists, only in another unit."""
     steps = _Steps.of(t_ns)
-    measured_mps = _speeds_along(sequence, steps)
+    measured_mps = _speeds_along(reference, steps)
     known = np.isfinite(measured_mps) & (measured_mps > _MOVING_MPS)
     if known.sum() < _FEWEST_STEPS:
         return
@@ -104,7 +176,7 @@ def check_length_unit(what: str, sequence: Sequence, t_ns: IntArray, positions: 
     for unit, factor in _LENGTHS.items():
         if factor / _WITHIN_FACTOR < ratio < factor * _WITHIN_FACTOR:
             found = f"{what} moves {ratio:.4g} times as fast as measured"
-            raise DataError(f"{sequence.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
+            raise DataError(f"{reference.name}: {found}; it is in {unit}: divide its positions by {factor:g}")
 
 
 def range_s(t_ns: IntArray) -> str:
@@ -129,29 +201,25 @@ def _fitting_scale(frames_t_ns: IntArray, t_ns: IntArray) -> float | None:
     return None
 
 
-def _gyro_along(sequence: Sequence, t_ns: IntArray) -> tuple[BoolArray, IntArray, Array]:
-    """Return which stamps (N,) the gyro reaches, and its samples in order: stamps (S,) and rates (S, 3) rad/s."""
-    motion = sequence.motion
-    usable = np.flatnonzero(np.isfinite(motion.values).all(axis=1))
-    samples = usable[np.argsort(motion.t_ns[usable], kind="stable")]
-    if samples.size < 2:
-        return np.zeros(t_ns.size, dtype=bool), np.empty(0, np.int64), np.empty((0, 3))
-    sample_t_ns = motion.t_ns[samples]
-    within = (t_ns >= sample_t_ns[0]) & (t_ns <= sample_t_ns[-1])
-    return within, sample_t_ns, motion.values[samples, 3:]
+def _within(t_ns: IntArray, sample_t_ns: IntArray) -> BoolArray:
+    """Say which stamps (N,) lie between the first and the last of samples (S,); none where there are fewer than two."""
+    if sample_t_ns.size < 2:
+        return np.zeros(t_ns.size, dtype=bool)
+    return np.asarray((t_ns >= sample_t_ns[0]) & (t_ns <= sample_t_ns[-1]))
 
 
-def _speeds_along(sequence: Sequence, steps: "_Steps") -> Array:
+def _speeds_along(reference: Reference, steps: "_Steps") -> Array:
     """Return the speeds (M,) m/s of the truth over steps, else of the twists; NaN where neither is known."""
-    truth, motion = sequence.truth, sequence.motion
-    if truth is not None and truth.t_ns.size > 1:
-        t_s, at_s = (truth.t_ns - truth.t_ns[0]) / NS_PER_S, (steps.t_ns - truth.t_ns[0]) / NS_PER_S
-        axes = truth.T_world_imu[:, :3, 3].T
+    t_ns = reference.positions_t_ns
+    if t_ns.size > 1:
+        t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (steps.t_ns - t_ns[0]) / NS_PER_S
+        axes = reference.positions.T
         return steps.speeds(np.stack([np.interp(at_s, t_s, x, np.nan, np.nan) for x in axes], axis=1))
-    if not isinstance(motion, TwistSamples) or motion.t_ns.size < 2:
+    t_ns = reference.rates_t_ns
+    if t_ns.size < 2:
         return np.full(steps.start.size, np.nan)
-    t_s, middle_s = (motion.t_ns - motion.t_ns[0]) / NS_PER_S, (steps.t_ns[steps.start] - motion.t_ns[0]) / NS_PER_S
-    return np.asarray(np.interp(middle_s, t_s, np.linalg.norm(motion.v_mps, axis=1), np.nan, np.nan))
+    t_s, middle_s = (t_ns - t_ns[0]) / NS_PER_S, (steps.t_ns[steps.start] - t_ns[0]) / NS_PER_S
+    return np.asarray(np.interp(middle_s, t_s, reference.speeds_mps, np.nan, np.nan))
 
 
 class _Steps(NamedTuple):

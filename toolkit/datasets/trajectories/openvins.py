@@ -2,8 +2,9 @@
 
 Between blanks, seconds and metres. The states' quaternion is JPL's q_GtoI, scalar last, of the rotation from the world
 to the IMU: the same four numbers as Hamilton's of the IMU to the world, which the recording has. Velocity, gyro and
-accelerometer bias follow in the states, then the calibration; the recording has two covariances without what couples
-them. What follows the pose is not read. Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
+accelerometer bias follow in the states, then the calibration; what follows the pose is not read. The recording has two
+covariances without what couples them, their upper triangles row by row: of the orientation, whose error is a small turn
+of the IMU frame, and of the position in the world. Geneva, Eckenhoff, Lee, Yang & Huang, "OpenVINS" (ICRA 2020).
 """
 
 from pathlib import Path
@@ -11,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import stamps_ns
-from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
+from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, StatedApart, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows, read_rows, stamp_text
 from toolkit.estimate import Trajectory
-from toolkit.geometry import quaternion_from_rotation
+from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.resampling import NS_PER_S
 
 COLUMNS = "t qx qy qz qw x y z vx vy vz bgx bgy bgz bax bay baz"
@@ -44,7 +45,13 @@ def parse(rows: Rows) -> PosesFile:
     stamps_ns(rows.path, "time", table[:, 0])  # names a wrong unit
     t_ns = rows.stamps(NS_PER_S)
     T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, pose])
-    return PosesFile(rows.path, "OpenVINS", t_ns, T_world_imu, W_FIRST)
+    stated = StatedApart(_symmetric(table[:, 8:14]), _symmetric(table[:, 14:20])) if recorded else None
+    return PosesFile(rows.path, "OpenVINS", t_ns, T_world_imu, W_FIRST, stated)
+
+
+def _symmetric(upper: Array) -> Array:
+    """Return the matrices (N, 3, 3) of upper triangles (N, 6) row by row."""
+    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def read(path: Path, kind: str) -> Trajectory:

@@ -36,10 +36,22 @@ class OtherOrder:
 
 
 @dataclass(frozen=True, eq=False)
+class StatedApart:
+    """Covariances (N, 3, 3) without what couples them: of orientations, rad^2 in the body frame, and of positions.
+
+    Those of positions are m^2 in the world frame.
+    """
+
+    orientation: Array
+    position: Array
+
+
+@dataclass(frozen=True, eq=False)
 class PosesFile:
     """The poses (N, 4, 4) of a trajectory file, their stamps (N,) ns, and how its quaternions might be misread.
 
-    Stamps are None where the format has none, and the order where it has no quaternions.
+    Stamps are None where the format has none, and the order where it has no quaternions. ``covariances`` are those of
+    the orientation and of the position, where the file has them.
     """
 
     path: Path
@@ -47,6 +59,7 @@ class PosesFile:
     t_ns: IntArray | None
     T_world_imu: Array
     other_order: OtherOrder | None
+    covariances: "StatedApart | None" = None
 
     def __len__(self) -> int:
         return len(self.T_world_imu)

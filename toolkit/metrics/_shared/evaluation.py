@@ -1,4 +1,4 @@
-"""One output of one run beside its sequence: association, alignments and poses of frames, each computed once."""
+"""An estimate beside the truth, each alignment computed once: any pairs of poses, or one output of one run."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +13,67 @@ from toolkit.metrics._shared.scores import Unavailable
 from toolkit.sequence import Sequence
 
 
+class AgainstTruth:
+    """Pairs of true and estimated poses, and how they are brought together; what trajectory metrics are made of.
+
+    The properties raise Unavailable where there is no truth, or too few pairs.
+    """
+
+    @property
+    def matched(self) -> Matched:
+        """The pairs of true and estimated poses that are scored; there may be none."""
+        raise NotImplementedError
+
+    @property
+    def level(self) -> bool:
+        """Whether the vertical is measured, as an IMU does, so that only heading and position are free."""
+        raise NotImplementedError
+
+    @cached_property
+    def compared(self) -> Matched:
+        """The matched pairs, of which there are at least two."""
+        if len(self.matched) < 2:
+            raise Unavailable(f"{len(self.matched)} pose(s) match the ground truth in time, a comparison needs 2")
+        return self.matched
+
+    @cached_property
+    def placed(self) -> Array:
+        """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
+
+        Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
+        and position of the first pose are aligned; without one, the whole first pose is.
+        """
+        place = place_yaw if self.level else place_pose
+        pairs = self.compared
+        return place(pairs.truth[0], pairs.estimate[0]).apply(pairs.estimate)
+
+    @cached_property
+    def se3_alignment(self) -> Alignment:
+        """The rigid motion that fits the estimated positions to the true ones."""
+        pairs = self.compared
+        return fit_se3(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+
+
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class PairsAgainstTruth(AgainstTruth):
+    """Pairs that were matched already, of a trajectory without its recording."""
+
+    pairs: Matched
+    is_level: bool = False
+
+    @property
+    def matched(self) -> Matched:
+        """The pairs."""
+        return self.pairs
+
+    @property
+    def level(self) -> bool:
+        """Whether the vertical is measured, as it was said."""
+        return self.is_level
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(AgainstTruth):
     """One output of a run and the sequence it was made from.
 
     The properties that need the truth, or a matched pair, raise Unavailable where there is none.
@@ -39,29 +98,10 @@ class Evaluation:
             raise Unavailable("the sequence has no ground truth")
         return associate(self.estimate, self.sequence.truth, median_period_ns(self.sequence.frames_t_ns))
 
-    @cached_property
-    def compared(self) -> Matched:
-        """The matched pairs, of which there are at least two."""
-        if len(self.matched) < 2:
-            raise Unavailable(f"{len(self.matched)} pose(s) match the ground truth in time, a comparison needs 2")
-        return self.matched
-
-    @cached_property
-    def placed(self) -> Array:
-        """The estimates (n, 4, 4) in the truth's world, brought there by the first pair alone.
-
-        Every estimator starts in a world frame of its own. With an IMU the vertical is measured, so only heading
-        and position of the first pose are aligned; without one, the whole first pose is.
-        """
-        place = place_yaw if self.sequence.motion_kind == "imu" else place_pose
-        pairs = self.compared
-        return place(pairs.truth[0], pairs.estimate[0]).apply(pairs.estimate)
-
-    @cached_property
-    def se3_alignment(self) -> Alignment:
-        """The rigid motion that fits the estimated positions to the true ones."""
-        pairs = self.compared
-        return fit_se3(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+    @property
+    def level(self) -> bool:
+        """Whether the recording has an IMU."""
+        return self.sequence.motion_kind == "imu"
 
     @cached_property
     def poses_of_frames(self) -> Array:

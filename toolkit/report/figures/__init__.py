@@ -1,9 +1,11 @@
-"""The figures of a comparison as PNG files, one module a figure; drawn without a display."""
+"""The figures of a comparison as files, PNG, PDF or SVG, one module a figure; drawn without a display."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.text import Text
@@ -13,6 +15,9 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.report.figures import against_bound, errors_over_time, frame_times, over_seeds, reprojection, top_view
 from toolkit.report.figures.style import NamedFigure
 
+FigureFormat = Literal["png", "pdf", "svg"]
+# What formats note of the time a figure was drawn, which differs where nothing else does.
+_DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
 _OF_ONE: tuple[_Drawing, ...] = (
     top_view.draw,
@@ -43,13 +48,14 @@ def _literal(drawn_one: NamedFigure) -> NamedFigure:
     return drawn_one
 
 
-def save(figures: Iterable[NamedFigure], directory: Path) -> dict[str, str]:
-    """Save figures as PNG files; return file name -> caption, in order."""
+def save(figures: Iterable[NamedFigure], directory: Path, kind: FigureFormat = "png") -> dict[str, str]:
+    """Save figures as files of a kind; return file name -> caption, in order. The same figures give the same bytes."""
     captions: dict[str, str] = {}
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), rc_context({"svg.hashsalt": "vislam", "svg.fonttype": "none"}):
         # A letter that the font lacks is drawn as a box; of that nothing is to be told.
         warnings.filterwarnings("ignore", "Glyph")
         for name, caption, figure in figures:
-            figure.savefig(directory / f"{name}.png", bbox_inches="tight", pad_inches=0.15)
-            captions[f"{name}.png"] = caption
+            undated = {_DATE_OF[kind]: None} if kind in _DATE_OF else {}
+            figure.savefig(directory / f"{name}.{kind}", bbox_inches="tight", pad_inches=0.15, metadata=undated)
+            captions[f"{name}.{kind}"] = caption
     return captions

@@ -10,7 +10,15 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable
 from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.figures.style import TRUTH_COLOUR, NamedFigure, colour_of, line_of, new_figure, quiet
+from toolkit.report.figures.style import (
+    TRUTH_COLOUR,
+    NamedFigure,
+    colour_of,
+    line_of,
+    line_of_estimator,
+    new_figure,
+    quiet,
+)
 from toolkit.resampling import NS_PER_S
 
 _CAPTION = (
@@ -53,7 +61,11 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
 def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
-    colour, line, t_s = colour_of(comparison, row.estimator), line_of(row.output), _seconds(comparison, one)
+    colour, line, t_s = (
+        colour_of(comparison, row.estimator),
+        line_of_estimator(comparison, row.estimator, row.output),
+        _seconds(comparison, one),
+    )
     label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)

@@ -10,7 +10,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics._shared.alignment import Alignment
 from toolkit.report.figures.alignment import NOT_ALIGNED, Errors, alignment_words, errors_to, onto_truth, truth_during
-from toolkit.report.figures.style import NamedFigure, colour_of, line_of, new_figure, quiet, width_of
+from toolkit.report.figures.style import NamedFigure, colour_of, line_of_estimator, new_figure, quiet, width_of
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
 
@@ -99,7 +99,10 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     start_ns = int(comparison.sequence.frames_t_ns[0])
     for row, errors in curves.of_rows:
         t_s = (errors.t_ns - start_ns) / NS_PER_S
-        look = {"color": colour_of(comparison, row.estimator), "linestyle": line_of(row.output)}
+        look = {
+            "color": colour_of(comparison, row.estimator),
+            "linestyle": line_of_estimator(comparison, row.estimator, row.output),
+        }
         width = width_of(comparison, row.estimator)
         label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
         position.plot(t_s, errors.position_m, linewidth=width, label=label, **look)

@@ -12,9 +12,13 @@ DPI = 110
 TRUTH_COLOUR = "#1a1a1a"
 LANDMARK_COLOUR = "#8a949f"
 
-# Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it.
+# Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it, in other dashes.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
-_LINE_OF: dict[Output, str] = {"causal": "--", "final": "-"}
+_Dashes = str | tuple[int, tuple[float, ...]]
+_LINE_OF: dict[Output, tuple[_Dashes, ...]] = {
+    "causal": ("--", ":"),
+    "final": ("-", (0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5))),
+}
 _WIDEST, _THINNEST = 2.8, 1.2
 
 
@@ -32,9 +36,19 @@ def colour_of(comparison: Comparison, estimator: str) -> str:
     return _COLOURS[order.index(estimator) % len(_COLOURS)]
 
 
-def line_of(output: Output) -> str:
+def line_of(output: Output) -> _Dashes:
     """Return the line style of a kind of output: dashed while it knew the past only, solid at the end."""
-    return _LINE_OF[output]
+    return _LINE_OF[output][0]
+
+
+def line_of_estimator(comparison: Comparison, estimator: str, output: Output) -> _Dashes:
+    """Return the line style of one kind of output of an estimator: other dashes where its colour is had already.
+
+    Both outputs keep the estimator's colour, so that twice as many estimators as there are colours are told apart.
+    """
+    order = [run.estimator for run in comparison.runs]
+    styles = _LINE_OF[output]
+    return styles[order.index(estimator) // len(_COLOURS) % len(styles)]
 
 
 def width_of(comparison: Comparison, estimator: str) -> float:

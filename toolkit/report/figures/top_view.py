@@ -15,7 +15,7 @@ from toolkit.report.figures.style import (
     TRUTH_COLOUR,
     NamedFigure,
     colour_of,
-    line_of,
+    line_of_estimator,
     new_figure,
     quiet,
     width_of,
@@ -100,7 +100,8 @@ def _draw_run(axes: Axes, comparison: Comparison, run: Run, width: float) -> Arr
     assert trajectory is not None, "only runs with a trajectory are drawn"
     positions = _from_above(comparison, run, trajectory.positions)
     colour, label = colour_of(comparison, run.estimator), f"{run.estimator} {output}{_trouble(run)}"
-    axes.plot(*positions.T, color=colour, linewidth=width, linestyle=line_of(output), label=label, zorder=3)
+    line = line_of_estimator(comparison, run.estimator, output)
+    axes.plot(*positions.T, color=colour, linewidth=width, linestyle=line, label=label, zorder=3)
     axes.plot(*positions[:1].T, "o", color=colour, markersize=7, markeredgecolor="white", zorder=4)
     return positions
 

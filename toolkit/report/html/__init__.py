@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from toolkit.files import replaced_file
-from toolkit.report.html.page import page_text
-from toolkit.report.html.payload import payload_of
-from toolkit.report.html.run_files import read_run
 
 __all__ = ["write_html"]
 
@@ -21,6 +18,11 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     Raises DataError for a directory that cannot be read as one, OutputError where ``target`` cannot be written;
     nothing is left behind then.
     """
+    # Here, because pages of other systems' trajectories are made without what reads a run directory.
+    from toolkit.report.html.page import page_text
+    from toolkit.report.html.payload import payload_of
+    from toolkit.report.html.run_files import read_run
+
     runs = [read_run(directory) for directory in directories]
     text = page_text(payload_of(runs))
     with replaced_file(target) as partial:

@@ -8,9 +8,13 @@ from pathlib import Path
 import msgspec
 
 from toolkit.documents import schema
+from toolkit.evaluation.document import EvaluationRecord
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
+from toolkit.report.bundle import BundleRecord
+from toolkit.report.diff_text import DiffRecord
 from toolkit.report.records import CardRecord, CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
+from toolkit.report.verify_text import VerificationRecord
 
 # By the name of the schema's file, without its ending.
 RECORDS: Mapping[str, type[msgspec.Struct]] = {
@@ -23,6 +27,10 @@ RECORDS: Mapping[str, type[msgspec.Struct]] = {
     "trajectory-baseline-1": TrajectoryBaselineRecord,
     "check-2": CheckDocument,
     "card-1": CardRecord,
+    "evaluation-1": EvaluationRecord,
+    "verification-1": VerificationRecord,
+    "diff-1": DiffRecord,
+    "bundle-1": BundleRecord,
 }
 
 

@@ -1,0 +1,80 @@
+"""``vislam cite`` prints BibTeX for what an estimator's or a format's own module says it rests on."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from toolkit.cli import main
+from toolkit.datasets import formats
+from toolkit.estimator import discover
+from toolkit.report.citations import bibtex, citations, references
+
+MINE = '''"""A filter of somebody's own, in one file."""
+
+CITES = ("li2013high", """@misc{mine2026,
+  author = {Somebody},
+  title = {A {Filter}}
+}""")
+
+
+def build(setup):
+    raise NotImplementedError
+'''
+
+
+def cited(name: str) -> list[str]:
+    return [key for one in citations([name]) for key in one.entries]
+
+
+@pytest.mark.parametrize("name", sorted(discover()))
+def test_every_estimator_says_what_to_cite(name: str) -> None:
+    assert cited(name)
+
+
+def test_every_format_of_recorded_data_says_what_to_cite() -> None:
+    own = {"vislam-recording"}
+    assert not [name for name in formats() if not cited(name) and name not in own]
+
+
+def test_every_reference_is_used_and_whole() -> None:
+    used = {key for one in citations([]) for key in one.entries}
+    assert used == references().keys()
+    for key, text in references().items():
+        assert text.count("{") == text.count("}"), key
+        assert re.search(r"^  title = ", text, re.MULTILINE), key
+
+
+def test_an_estimator_stays_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "my_filter.py"
+    path.write_text(MINE)
+    text = bibtex(citations([str(path)]))
+    assert "% my-filter\n@article{li2013high" in text
+    assert "% my-filter\n@misc{mine2026" in text
+
+
+def test_an_entry_that_several_rest_on_stands_once() -> None:
+    text = bibtex(citations(["msckf", "msckf-fej"]))
+    assert text.count("mourikis2007msckf") == 1
+    assert "% msckf, msckf-fej\n@inproceedings{mourikis2007msckf" in text
+    assert "% the toolkit\n@software{vislam_toolkit" in text
+
+
+def test_a_run_directory_stands_for_what_it_compared(tmp_path: Path) -> None:
+    documents = Path(__file__).parents[1] / "report" / "documents"
+    (tmp_path / "manifest.json").write_text((documents / "manifest.json").read_text())
+    assert [one.name for one in citations([str(tmp_path)])][:2] == ["dead-reckoning", "ekf"]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [(None, "no estimator or format is called mscf"), ('CITES = ("li2013hihg",)', "did you mean li2013high?")],
+)
+def test_what_is_unknown_is_told_in_one_line(tmp_path, monkeypatch, capsys, text, told) -> None:
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        Path("mine.py").write_text(text)
+    assert main(["cite", "mscf" if text is None else "mine.py"]) == 1
+    said = capsys.readouterr().err
+    assert told in said
+    assert said.count("\n") == 1

@@ -1,0 +1,325 @@
+"""``vislam evaluate``: which files are found, what is said of bad ones, and that nothing which failed is dropped."""
+
+import csv
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from toolkit.datasets.trajectories import euroc, tum
+from toolkit.documents import schema
+from toolkit.estimate import Trajectory
+from toolkit.evaluation.document import EvaluationRecord, read_evaluation
+from toolkit.geometry import quaternion_from_rotation, se3, se3_inverse, so3_exp
+
+S = 10**9
+CAMERA = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.1, 0.2]))
+
+
+def document(folder: str = "out") -> dict:
+    return json.loads(Path(folder, "evaluation.json").read_text())
+
+
+def standing(found: dict, system: str) -> dict:
+    return next(one for one in found["leaderboard"] if one["estimator"] == system)
+
+
+def test_one_file_is_scored_without_gtsam_or_a_recording(scene, vislam, tmp_path) -> None:
+    scene.write("other.tum", scene.stamps(10.0), scene.estimated(scene.stamps(10.0), 0.1))
+    program = (
+        "import sys; from toolkit.cli import main\n"
+        "status = main(['evaluate', 'truth.tum', 'mine=other.tum', '--out', 'out'])\n"
+        "print(sorted(sys.modules.keys() & {'gtsam', 'cv2', 'matplotlib', 'filters', 'toolkit.runner'}), status)"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert told.stdout.splitlines()[-1] == "[] 0"
+    (run,) = document()["runs"]
+    # 600 poses with independent errors of 0.1 m an axis.
+    assert run["metrics"]["ate_se3_m"] == pytest.approx(0.1 * np.sqrt(3.0), rel=0.05)
+    assert run["metrics"]["time_coverage_percent"] == pytest.approx(100.0, abs=0.2)
+
+
+def test_the_document_keeps_its_contract(tree) -> None:
+    Path("results/poor/S3/1.tum").write_text("")
+    assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 1
+    jsonschema.validate(document(), schema(EvaluationRecord))
+    assert len(read_evaluation(Path("out/evaluation.json")).runs) == 42
+
+
+def test_failures_are_counted_and_never_dropped(tree, capsys) -> None:
+    Path("results/good/S0/0.tum").write_text("")
+    Path("results/good/S0/1.tum").write_text("1 2 3\n")
+    for run in range(3):
+        Path(f"results/good/S1/{run}.tum").unlink()
+    Path("results/good/S1").rmdir()
+    assert tree("evaluate", "truths", "results", "--out", "out") == 1
+    found = document()
+    good = standing(found, "good")
+    assert (good["runs"], good["ok"], good["solved"], good["wins"]) == (21, 16, 5, 5)
+    over = {(one["estimator"], one["sequence"]): one for one in found["over_runs"]}
+    assert over["good", "S0"]["metrics"]["ate_se3_m"]["median"] is None
+    (paired,) = found["paired"]
+    assert (paired["better"], paired["worse"]) == (5, 2)
+    told = capsys.readouterr().out
+    assert "2 of 3 failed" in told
+    assert "good, S0, 1: results/good/S0/1.tum: 3 columns" in told
+    assert "there is no trajectory" in told
+
+
+def test_the_better_system_is_ahead_and_seven_sequences_tell(tree) -> None:
+    assert tree("evaluate", "truths", "poor=results/poor", "good=results/good", "--out", "out", "--quiet") == 0
+    found = document()
+    assert [one["estimator"] for one in found["leaderboard"]] == ["good", "poor"]
+    assert standing(found, "good")["mean_rank"] == 1.0
+    (paired,) = found["paired"]
+    # All seven signs agree: two of 2^7 ways.
+    assert paired["p"] == pytest.approx(2.0 / 128.0)
+    assert paired["median_ratio"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_run_over_a_tenth_of_the_path_does_not_win(scene, vislam, capsys) -> None:
+    scene.write("short.tum", scene.stamps(20.0, 0.0, 6.0), scene.estimated(scene.stamps(20.0, 0.0, 6.0), 0.001))
+    scene.write("whole.tum", scene.stamps(20.0), scene.estimated(scene.stamps(20.0), 0.1))
+    assert vislam("evaluate", "truth.tum", "short.tum", "whole.tum", "--out", "out") == 1
+    found = document()
+    assert [one["estimator"] for one in found["leaderboard"]] == ["whole", "short"]
+    short = next(run for run in found["runs"] if run["estimator"] == "short")
+    assert short["status"] == "failed"
+    assert short["metrics"]["ate_se3_m"] < 0.01
+    assert "covers 9.9 % of the truth's time, and 50 % is asked for" in capsys.readouterr().out
+    assert vislam("evaluate", "truth.tum", "short.tum", "--least-coverage", "5", "--quiet") == 0
+
+
+def test_runs_that_ought_to_be_there_are_missed(tree) -> None:
+    assert tree("evaluate", "truths", "results", "--runs", "4", "--out", "out", "--quiet") == 1
+    assert standing(document(), "good")["runs"] == 28
+    assert standing(document(), "good")["ok"] == 21
+
+
+def test_repeated_runs_of_one_sequence_have_median_and_quartiles(tree, capsys) -> None:
+    words = ("evaluate", "truths/S0.tum", "a=results/good/S0", "b=results/poor/S0/0.tum", "b=results/poor/S0/1.tum")
+    assert tree(*words, "--out", "out") == 0
+    found = document()
+    values = [run["metrics"]["ate_se3_m"] for run in found["runs"] if run["estimator"] == "a"]
+    over = found["over_runs"][0]
+    assert over["runs"] == 3
+    quartiles = [over["metrics"]["ate_se3_m"][key] for key in ("lower_quartile", "median", "upper_quartile")]
+    np.testing.assert_allclose(quartiles, np.percentile(values, [25, 50, 75]))
+    assert found["paired"] == []
+    assert "2 of 2" in capsys.readouterr().out
+
+
+def camera_poses(scene):
+    t_ns = scene.stamps(10.0)
+    return t_ns, se3_inverse(CAMERA) @ scene.poses_at(t_ns) @ CAMERA
+
+
+def test_poses_of_a_camera_are_named_and_only_positions_scored(scene, vislam) -> None:
+    scene.write("camera.tum", *camera_poses(scene))
+    assert vislam("evaluate", "truth.tum", "camera.tum", "--out", "out") == 0
+    (run,) = document()["runs"]
+    assert "its x, y and z point along the truth's -y, -z and x" in run["notes"]["ate_se3_deg"]
+    assert run["metrics"]["ate_se3_deg"] is run["metrics"]["rpe_1s_m"] is None
+    # The camera is 0.37 m from the body, so its path is another one.
+    assert 0.0 < run["metrics"]["ate_se3_m"] < 0.4
+
+
+def bad_text(scene, kind: str) -> str:
+    t_ns = scene.stamps(10.0)
+    poses = scene.poses_at(t_ns)
+    rotations, positions = poses[:, :3, :3], poses[:, :3, 3]
+    text = tum.text(Trajectory(t_ns, poses))
+    w_first = np.hstack([positions, np.roll(quaternion_from_rotation(rotations), 1, axis=1)])
+    texts = {
+        "nanoseconds": "\n".join(f"{t} 1 2 3 0 0 0 1" for t in t_ns),
+        "milliseconds from zero": "\n".join(f"{(t - t_ns[0]) / 1e6:.3f} 1 2 3 0 0 0 1" for t in t_ns),
+        "w first": "\n".join(
+            f"{t / S:.9f} {' '.join(map(repr, row))}" for t, row in zip(t_ns, w_first.tolist(), strict=True)
+        ),
+        "inverted": tum.text(Trajectory(t_ns, se3(np.swapaxes(rotations, 1, 2), positions))),
+        "millimetres": tum.text(Trajectory(t_ns, se3(rotations, 1000.0 * positions))),
+        "own clock": tum.text(Trajectory(t_ns - t_ns[0], poses)),
+        "not a number": text.replace(text.splitlines()[5].split()[1], "nan", 1),
+        "empty": "",
+        "words": "hello world\n",
+        "cut off": text[:-20],
+    }
+    return texts[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("nanoseconds", "nanoseconds: divide by 1e9"),
+        ("milliseconds from zero", "time must be in seconds"),
+        ("w first", "turns as the truth does only if read w first"),
+        ("inverted", "turns as the truth does only if inverted"),
+        ("millimetres", "it is in millimetres"),
+        ("own clock", "one counts from its own start: add 1700000000.000 s"),
+        ("not a number", "line 6 holds a value that is not finite"),
+        ("empty", "the file holds no poses"),
+        ("words", "no format that is known"),
+        ("cut off", "columns"),
+    ],
+)
+def test_a_bad_file_is_told_in_one_line_and_beside_a_good_one_counted(scene, vislam, capsys, kind, told) -> None:
+    Path("bad.tum").write_text(bad_text(scene, kind))
+    assert vislam("evaluate", "truth.tum", "bad.tum", "--out", "out") == 3
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert told in said
+    assert not Path("out").exists()
+    scene.write("fine.tum", scene.stamps(10.0), scene.estimated(scene.stamps(10.0), 0.1))
+    assert vislam("evaluate", "truth.tum", "bad.tum", "fine.tum", "--out", "out") == 1
+    assert [run["status"] for run in document()["runs"]] == ["failed", "ok"]
+    assert told in document()["runs"][0]["log"][0]
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (("truth.tum", "nowhere.tum"), 3, "nowhere.tum: there is no such file"),
+        (("nowhere", "truth.tum"), 3, "nowhere: there is no such truth"),
+        (("truths", "results/good/S0/0.tum"), 3, "it is no folder; where the truth is a folder"),
+        (("truths/S0.tum", "results"), 3, "needs its name, NAME=results"),
+        (("truths", "a=results/good", "a=results/poor"), 3, "a is given twice"),
+        (("truth.tum", "truth.tum", "--metric", "ate_se_m"), 2, "did you mean ate_se3_m?"),
+        (("truth.tum", "truth.tum", "--least-coverage", "101"), 2, "expected 0 to 100 percent"),
+        (("results/good", "results"), 3, "it has 3 truths for S0"),
+        (("truth.tum", "truth.tum", "--out", "results"), 4, "results"),
+    ],
+)
+def test_trouble_is_told_in_one_line(tree, capsys, words, status, told) -> None:
+    try:
+        assert tree("evaluate", *words) == status
+    except SystemExit as left:
+        assert left.code == status
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert told in said
+
+
+def test_formats_say_the_same(tree, capsys) -> None:
+    Path("results/poor/S3/1.tum").write_text("")
+    assert tree("evaluate", "truths", "results", "--json") == 1
+    found = json.loads(capsys.readouterr().out)
+    tree("evaluate", "truths", "results", "--format", "csv")
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [row["ate_se3_m"] for row in rows] == [
+        "" if run["metrics"]["ate_se3_m"] is None else repr(run["metrics"]["ate_se3_m"]) for run in found["runs"]
+    ]
+    assert sum(row["status"] == "failed" for row in rows) == 1
+    tree("evaluate", "truths", "results", "--format", "latex")
+    latex = capsys.readouterr().out
+    assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 2
+    assert r"\textbf{0.17}" in latex
+    assert r"[\%]" in latex
+    tree("evaluate", "truths", "results", "--format", "markdown")
+    assert "**0.17**" in capsys.readouterr().out
+    tree("evaluate", "truths", "results", "--quiet")
+    assert capsys.readouterr().out == ""
+
+
+def test_the_page_is_whole_and_no_name_is_markup(tree) -> None:
+    Path("results/poor").rename("results/<b>poor&")
+    assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
+    page = Path("out/leaderboard.html").read_text()
+    assert "<b>poor" not in page
+    assert "&lt;b&gt;poor&amp;" in page
+    assert page.count("<circle") == 42
+    assert "http" not in page.replace("http-equiv", "")
+    assert page.count("<section") == page.count("</section>") >= 4
+
+
+@pytest.mark.parametrize(("error", "status"), [(0.1, 0), (0.13, 1)])
+def test_the_gate_takes_an_evaluation_in_the_place_of_a_folder(tree, scene, error, status) -> None:
+    good = ("evaluate", "truths", "good=results/good")
+    assert tree(*good, "--out", "before", "--quiet") == 0
+    assert tree("baseline", "--trajectories", "before/evaluation.json", "--out", "base.json") == 0
+    assert tree("check", "--trajectories", "results/good", "--baseline", "base.json") == 0
+    t_ns = scene.stamps(10.0, end_s=10.0)
+    for sequence in range(7):
+        for run in range(3):
+            path = f"results/good/S{sequence}/{run}.tum"
+            scene.write(path, t_ns, scene.estimated(t_ns, error, 1000 + 100 * sequence + run))
+    assert tree(*good, "--out", "after", "--quiet") == 0
+    assert tree("check", "--trajectories", "after/evaluation.json", "--baseline", "base.json") == status
+
+
+def test_the_gate_refuses_an_evaluation_on_other_terms(tree, capsys) -> None:
+    one = ("evaluate", "truths/S0.tum", "good=results/good/S0/0.tum", "poor=results/poor/S0/0.tum", "--quiet")
+    assert tree(*one, "--out", "before") == 0
+    assert tree("baseline", "--trajectories", "before/evaluation.json", "--out", "base.json") == 0
+    named = [entry["sequence"] for entry in json.loads(Path("base.json").read_text())["sequences"]]
+    assert named == ["good/S0", "poor/S0"]
+    for words, told in ((("--max-dt", "0.01"), "without --max-dt"), (("--gap", "3"), "again with --gap 5")):
+        assert tree(*one, *words, "--out", "after") == 0
+        assert tree("check", "--trajectories", "after/evaluation.json", "--baseline", "base.json") == 1
+        assert told in " ".join(capsys.readouterr().out.split())
+
+
+def openvins_text(t_ns, poses, cov_orientation, cov_position) -> str:
+    upper = np.triu_indices(3)
+    q = quaternion_from_rotation(poses[:, :3, :3])
+    values = np.hstack([poses[:, :3, 3], q, cov_orientation[:, *upper], cov_position[:, *upper]])
+    lines = [f"{t / S:.9f} {' '.join(map(repr, row))}" for t, row in zip(t_ns.tolist(), values.tolist(), strict=True)]
+    return "# timestamp(s) tx ty tz qx qy qz qw Pr11 Pr12 Pr13 Pr22 Pr23 Pr33 Pt11 ...\n" + "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("own_world", [False, True])
+def test_covariances_of_openvins_give_nees(scene, vislam, own_world: bool) -> None:
+    """Errors drawn from the covariances, a turn of the body and a shift in the estimate's world, have a NEES of 1."""
+    rng, t_ns = np.random.default_rng(5), scene.stamps(20.0)
+    factors = rng.standard_normal((2, t_ns.size, 3, 3)) * np.array([0.01, 0.1]).reshape(2, 1, 1, 1)
+    covs = factors @ np.swapaxes(factors, 2, 3) + np.array([1e-6, 1e-4]).reshape(2, 1, 1, 1) * np.eye(3)
+    turn, shift = ((np.linalg.cholesky(cov) @ rng.standard_normal((t_ns.size, 3, 1)))[..., 0] for cov in covs)
+    turn[0] = shift[0] = 0.0  # the first pose is placed where the world is another
+    world = scene.own_world if own_world else np.eye(4)
+    true = world @ scene.poses_at(t_ns)
+    poses = se3(true[:, :3, :3] @ so3_exp(-turn), true[:, :3, 3] - shift)
+    Path("ov.txt").write_text(openvins_text(t_ns, poses, *covs))
+    assert vislam("evaluate", "truth.tum", "ov.txt", "--imu", "--out", "out", "--quiet") == 0
+    (run,) = document()["runs"]
+    # The mean of 1200 of chi-square over 3 has a standard deviation of sqrt(2 / 3600) = 0.024.
+    assert run["metrics"]["nees_ori_mean"] == pytest.approx(1.0, abs=0.1)
+    assert run["metrics"]["nees_pos_mean"] == pytest.approx(1.0, abs=0.1)
+    assert ("nees_pos_mean" in run["notes"]) is own_world
+
+
+def test_a_covariance_that_is_none_has_no_nees(scene, vislam) -> None:
+    t_ns = scene.stamps(20.0)
+    Path("ov.txt").write_text(openvins_text(t_ns, scene.poses_at(t_ns), *np.zeros((2, t_ns.size, 3, 3))))
+    assert vislam("evaluate", "truth.tum", "ov.txt", "--out", "out", "--quiet") == 0
+    (run,) = document()["runs"]
+    assert run["metrics"]["nees_ori_mean"] is None
+    assert "2400 of 2400 covariances are not positive definite" in run["notes"]["nees_ori_mean"]
+
+
+def test_time_coverage_of_keyframes_counts_gaps(scene, vislam) -> None:
+    t_ns = np.concatenate([scene.stamps(0.5, 4.0, 20.0), scene.stamps(0.5, 30.0, 50.1)])
+    scene.write("keyframes.tum", t_ns, scene.estimated(t_ns, 0.1))
+    assert vislam("evaluate", "truth.tum", "keyframes.tum", "--out", "out", "--quiet") == 0
+    assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 34.0 / 59.95)
+    assert vislam("evaluate", "truth.tum", "keyframes.tum", "--gap", "12", "--out", "out", "--quiet") == 0
+    assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 46.0 / 59.95)
+
+
+def test_an_offset_brings_clocks_together(scene, vislam, capsys) -> None:
+    t_ns = scene.stamps(10.0)
+    scene.write("late.tum", t_ns + 100 * S, scene.estimated(t_ns, 0.1))
+    assert vislam("evaluate", "truth.tum", "late.tum") == 3
+    assert vislam("evaluate", "truth.tum", "late.tum", "--offset", "-100") == 0
+    assert "-100 s added to the stamps" in capsys.readouterr().out
+
+
+def test_euroc_files_need_no_conversion(scene, vislam: Callable[..., int]) -> None:
+    t_ns = scene.stamps(20.0)
+    Path("data.csv").write_text(euroc.text(Trajectory(t_ns, scene.poses_at(t_ns))))
+    scene.write("other.tum", t_ns, scene.estimated(t_ns, 0.1))
+    assert vislam("evaluate", "data.csv", "other.tum", "--quiet") == 0

@@ -1,0 +1,154 @@
+"""A bundle holds what repeats a run; reproducing it says what differs, and a damaged one is told in one line."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from toolkit.cli import main
+from toolkit.report.bundle import BundleRecord, installed_packages, unpack_bundle
+
+COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "8", "--workers", "1", "--seed", "3")
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_once) -> Path:
+    root = tmp_path_factory.mktemp("bundle")
+    with without_pixels():
+        assert main([*COMPARE, "--set", "noise.motion_scale=1.25", "--out", str(root / "run")]) == 0
+    assert main(["export", str(root / "run"), "--bundle", str(root / "run.zip")]) == 0
+    return root / "run.zip"
+
+
+@pytest.fixture
+def reproduce(tmp_path: Path, monkeypatch, capsys, without_pixels, audited_once) -> Callable[..., tuple[int, str, str]]:
+    """Reproduce a bundle in an empty folder; return the exit status and what was said."""
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+
+    def run(*words: str) -> tuple[int, str, str]:
+        with without_pixels():
+            status = main(["reproduce", *words, "--workers", "1"])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def edited(bundle: Path, target: Path, edit: Callable[[dict[str, bytes]], None]) -> Path:
+    """Write a bundle with other contents."""
+    with zipfile.ZipFile(bundle) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    edit(contents)
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    return target
+
+
+def with_hashes(contents: dict[str, bytes]) -> None:
+    """Have bundle.json agree with the contents again."""
+    import hashlib
+
+    record = json.loads(contents["bundle.json"])
+    record["files"] = {name: hashlib.sha256(contents[name]).hexdigest() for name in record["files"]}
+    contents["bundle.json"] = json.dumps(record).encode()
+
+
+def test_it_holds_settings_versions_hashes_trajectories_and_metrics(bundle: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(bundle) as archive:
+        names = set(archive.namelist())
+        lock = archive.read("requirements.txt").decode()
+    assert {"bundle.json", "manifest.json", "metrics.json", "trajectories/dead-reckoning_causal.tum"} <= names
+    assert not any(name.startswith("figures/") for name in names)
+    record = unpack_bundle(bundle, tmp_path)
+    assert record.packages == installed_packages()
+    assert f"numpy=={record.packages['numpy']}\n" in lock
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert record.hashes == (metrics["sequence"]["hash"],)
+    assert json.loads((tmp_path / "manifest.json").read_text())["settings"]["noise"]["motion_scale"] == 1.25
+
+
+def test_the_same_run_gives_the_same_bytes(bundle: Path, tmp_path: Path) -> None:
+    assert main(["export", str(bundle.with_suffix("")), "--bundle", str(tmp_path / "again.zip")]) == 0
+    assert (tmp_path / "again.zip").read_bytes() == bundle.read_bytes()
+
+
+def test_a_bundle_is_reproduced_anywhere(bundle: Path, reproduce) -> None:
+    status, told, _ = reproduce(str(bundle), "--out", "here")
+    assert status == 0
+    assert "run.zip: reproduced" in told
+    assert Path("here/metrics.json").is_file()
+
+
+def test_a_result_that_is_another_one_is_told(bundle: Path, reproduce, tmp_path: Path) -> None:
+    def change(contents: dict[str, bytes]) -> None:
+        metrics = json.loads(contents["metrics.json"])
+        metrics["runs"][0]["metrics"]["ate_se3_m"] *= 1.01
+        metrics["sequence"]["hash"] = "0" * 64
+        manifest = json.loads(contents["manifest.json"])
+        manifest["versions"]["numpy"] = "1.0"
+        manifest["sequence"]["hash"] = "0" * 64
+        contents["metrics.json"], contents["manifest.json"] = (json.dumps(d).encode() for d in (metrics, manifest))
+        with_hashes(contents)
+
+    status, told, _ = reproduce(str(edited(bundle, tmp_path / "other.zip", change)))
+    assert status == 1
+    for word in ("versions.numpy", "sequence.hash", "ate_se3_m", "not reproduced"):
+        assert word in told
+    assert not list(tmp_path.glob("runs*"))
+
+
+@pytest.mark.parametrize(
+    ("edit", "told"),
+    [
+        (lambda c: c.update({"metrics.json": b"{}"}), "metrics.json is not as it was when the bundle was made"),
+        (lambda c: c.pop("metrics.json"), "metrics.json is missing"),
+        (lambda c: c.pop("bundle.json"), "a zip archive without bundle.json"),
+        (lambda c: c.update({"bundle.json": b"[]"}), "has not the schema vislam.bundle/1"),
+        (
+            lambda c: c.update({"bundle.json": c["bundle.json"].replace(b'"metrics.json"', b'"../metrics.json"')}),
+            "no path inside a run directory",
+        ),
+    ],
+)
+def test_a_damaged_bundle_is_told_in_one_line(bundle: Path, reproduce, tmp_path: Path, edit, told: str) -> None:
+    status, _, said = reproduce(str(edited(bundle, tmp_path / "bad.zip", edit)))
+    assert status == 3
+    assert told in said
+    assert said.count("\n") == 1
+
+
+def test_what_is_no_bundle_is_told_in_one_line(bundle: Path, reproduce, tmp_path: Path) -> None:
+    (tmp_path / "cut.zip").write_bytes(bundle.read_bytes()[:-200])
+    (tmp_path / "text.zip").write_text("hello")
+    for name in ("cut.zip", "text.zip", "nowhere.zip"):
+        status, _, said = reproduce(name)
+        assert status == 3
+        assert name in said
+        assert said.count("\n") == 1
+
+
+def test_every_byte_that_is_flipped_is_found_or_harmless(bundle: Path, tmp_path: Path) -> None:
+    from toolkit.errors import DataError
+
+    content = bundle.read_bytes()
+    whole = unpack_bundle(bundle, tmp_path / "whole")
+    for i, place in enumerate(range(0, len(content), len(content) // 60)):
+        (tmp_path / "flipped.zip").write_bytes(content[:place] + bytes([content[place] ^ 0x55]) + content[place + 1 :])
+        try:
+            record: BundleRecord = unpack_bundle(tmp_path / "flipped.zip", tmp_path / str(i))
+        except DataError as error:
+            assert "\n" not in str(error)
+        else:
+            assert record == whole
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--bundle", "x.zip", "--format", "tum"), (), ("--format", "tum"), ("--bundle", "x.zip", "--output", "final")],
+)
+def test_export_says_what_goes_together(bundle: Path, capsys, words: tuple[str, ...]) -> None:
+    assert main(["export", str(bundle.with_suffix("")), *words]) == 2
+    assert "--bundle" in capsys.readouterr().err

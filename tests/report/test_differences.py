@@ -1,0 +1,133 @@
+"""``vislam diff``: what differs between two run directories is named, and chance is told from a change."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from toolkit.cli import main
+from toolkit.documents import schema
+from toolkit.report.diff_text import DiffRecord
+
+DOCUMENTS = Path(__file__).parent / "documents"
+
+
+def write_run(directory: Path, edit: Callable[[dict, dict], None] = lambda seeds, manifest: None) -> None:
+    """Write the directory of a comparison over three seeds, with its scores and manifest edited."""
+    directory.mkdir()
+    seeds, manifest = (
+        json.loads((DOCUMENTS / f"{name}.json").read_text()) for name in ("seeds", "manifest-over-seeds")
+    )
+    edit(seeds, manifest)
+    (directory / "seeds.json").write_text(json.dumps(seeds))
+    (directory / "manifest.json").write_text(json.dumps(manifest))
+    (directory / "report.json").write_text((DOCUMENTS / "report-over-seeds.json").read_text())
+
+
+def noise_stated(seeds: dict, manifest: dict) -> None:
+    """The motion is stated to be noisier: the NEES falls by as good as the same factor, the ATE by chance."""
+    manifest["settings"] = {"noise": {"motion_scale": 1.5}}
+    manifest["versions"]["numpy"] = "9.9"
+    for run in seeds["runs"]:
+        metrics = run["metrics"]
+        metrics["nees_pose_mean"]["values"] = [
+            value * factor
+            for value, factor in zip(metrics["nees_pose_mean"]["values"], (0.5, 0.50001, 0.49999), strict=True)
+        ]
+        metrics["ate_se3_m"]["values"] = [
+            value * factor for value, factor in zip(metrics["ate_se3_m"]["values"], (1.3, 0.8, 0.9), strict=True)
+        ]
+
+
+def other_recordings(seeds: dict, manifest: dict) -> None:
+    """Every value is one of another recording, and one run has failed."""
+    seeds["hashes"] = ["0" * 64] * 3
+    for run in seeds["runs"]:
+        for metric in run["metrics"].values():
+            metric["values"] = metric["values"][::-1]
+    seeds["runs"][2]["status"][0] = seeds["runs"][3]["status"][0] = "failed"
+    for run in seeds["runs"][2:]:
+        run["counts"] = {"ok": 2, "diverged": 0, "failed": 1}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_once) -> Path:
+    """Three comparisons over the same three seeds, and one of one seed."""
+    root = tmp_path_factory.mktemp("runs")
+    write_run(root / "seeds")
+    write_run(root / "louder", noise_stated)
+    write_run(root / "others", other_recordings)
+    with without_pixels():
+        words = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "6", "--workers", "1")
+        assert main([*words, "--out", str(root / "one")]) == 0
+    return root
+
+
+@pytest.fixture
+def told(runs: Path, capsys) -> Callable[..., dict]:
+    def tell(before: str, after: str) -> dict:
+        assert main(["diff", str(runs / before), str(runs / after), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        jsonschema.validate(found, schema(DiffRecord))
+        return found
+
+    return tell
+
+
+def by_metric(found: dict) -> dict[str, dict]:
+    return {one["metric"]: one for one in found["metrics"] if one["output"] == "causal"}
+
+
+@pytest.mark.parametrize("name", ["one", "seeds"])
+def test_a_run_does_not_differ_from_itself(told, runs, name: str, capsys) -> None:
+    found = told(name, name)
+    assert found["same_results"]
+    assert not any(one["moved"] for one in found["metrics"])
+    assert found["settings"] == found["data"] == found["environment"] == found["ends"] == []
+    assert main(["diff", str(runs / name), str(runs / name)]) == 0
+    assert "the results are the same, to a millionth" in capsys.readouterr().out
+
+
+def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(told, runs, capsys) -> None:
+    found = told("seeds", "louder")
+    assert "settings.noise.motion_scale" in {one["name"] for one in found["settings"]}
+    assert "versions.numpy" in {one["name"] for one in found["environment"]}
+    metrics = by_metric(found)
+    assert metrics["nees_pose_mean"]["change_percent"] == pytest.approx(-50.0, abs=0.1)
+    assert metrics["nees_pose_mean"]["beyond_chance"]
+    assert metrics["ate_se3_m"]["moved"]
+    assert metrics["ate_se3_m"]["beyond_chance"] is False
+    assert not metrics["ate_yaw_m"]["moved"]
+    assert metrics["total_s"]["p"] is None
+    assert not found["same_results"]
+    assert main(["diff", str(runs / "seeds"), str(runs / "louder")]) == 0
+    told_in_words = capsys.readouterr().out
+    assert "beyond chance" in told_in_words
+    assert "paired by seed" in told_in_words
+
+
+def test_other_recordings_are_independent_draws_and_may_be_chance(told) -> None:
+    found = told("seeds", "others")
+    assert not found["paired"]
+    assert {"name": "ekf causal", "before": "3 of 3 ok", "after": "2 of 3 ok"} in found["ends"]
+    tested = [one for one in found["metrics"] if one["p"] is not None]
+    assert tested
+    assert not any(one["beyond_chance"] for one in tested)
+
+
+def test_one_run_tells_nothing_of_chance(told) -> None:
+    found = told("one", "seeds")
+    assert all(one["p"] is None for one in found["metrics"])
+    assert {"name": "dead-reckoning causal", "before": "ok", "after": "3 of 3 ok"} in found["ends"]
+    assert {one["output"] for one in found["metrics"]} == {"causal"}  # the final answer repeats it
+
+
+def test_what_is_no_run_is_told_in_one_line(runs, capsys) -> None:
+    assert main(["diff", str(runs / "one"), str(runs)]) == 3
+    assert main(["diff", str(runs / "one"), str(runs / "one"), "--columns", "ate_se_m"]) == 2
+    said = capsys.readouterr().err
+    assert "is not a run directory" in said
+    assert "did you mean ate_se3_m?" in said
+    assert said.count("\n") == 2

@@ -1,0 +1,214 @@
+"""``vislam verify`` names what is wrong with a newcomer's estimator, and what is right about a sound one."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from toolkit.cli import main
+from toolkit.estimate import Estimate
+from toolkit.verify import trouble, verification
+from toolkit.verify.promises import COV_SIZES, covariance_fault, dishonest
+
+# An estimator of some thirty lines, as somebody writes who has read docs/extending.md and nothing else.
+NEWCOMER = '''
+"""Integrates what is measured and says how sure it is."""
+
+import numpy as np
+
+from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
+from toolkit.models.motion import motion_model, predicted
+
+SEEN = []
+
+
+def build(setup):
+    return Newcomer(setup)
+
+
+class Newcomer:
+    def __init__(self, setup):
+        self.model = motion_model(setup.noise, setup.gravity_world)
+        self.belief = self.model.initial_belief(setup.prior)
+        self.said = []
+        self.pose = np.eye(4)
+
+    def step(self, packet):
+        self.belief = predicted(self.belief, self.model, packet.motion)
+        k = packet.index
+        T, cov = self.belief.T_world_imu.copy(), self.belief.cov.copy()
+        # PLANT
+        self.said.append(Estimate(packet.frame.t_ns, T, cov))
+        return self.said[-1]
+
+    def finish(self):
+        return Finished(Trajectory.of(self.said), Landmarks.none())
+'''
+FINITE, ROTATIONS, STAMPS, CAUSAL, SAME, LATER, UNTOUCHED = (name for name, _, _ in verification._OF_A_RUN)
+COVARIANCES, HONEST, RUNS = verification._COVARIANCE, verification._NEES, "it runs to the end"
+PLANTS = {
+    "look-ahead through the base of an array": (
+        "later = packet.frame.uvs_px.base; T[:3, 3] += 0.0 if later is None else 1e-6 * len(later)",
+        CAUSAL,
+        "its answer to frame 0 is another one where the packets from frame 2 on are withheld",
+    ),
+    "look-ahead through what another run left": (
+        "SEEN.append(packet.frame.t_ns); T[0, 3] += 1e-6 * (max(SEEN) - packet.frame.t_ns)",
+        CAUSAL,
+        "another one where the packets",
+    ),
+    "covariance not positive definite": (
+        "cov[0, 1] = cov[1, 0] = 2.0 * np.sqrt(cov[0, 0] * cov[1, 1]) * (k == 7)",
+        COVARIANCES,
+        "the covariance of its answer to frame 7 is not positive definite",
+    ),
+    "covariance not symmetric": ("cov[0, 3] += 1e-9", COVARIANCES, "frame 0 is not symmetric"),
+    "variance of zero": ("cov[4] = cov[:, 4] = 0.0", COVARIANCES, "has the variance 0 in row 4"),
+    "covariance of another size": ("cov = cov[:5, :5]", COVARIANCES, "has the shape (5, 5); expected 6 x 6 or 9 x 9"),
+    "NaN in a pose": ("T[1, 3] = np.nan if k == 12 else T[1, 3]", FINITE, "T_world_imu of its answer to frame 12"),
+    "NaN in a covariance": ("cov[2, 2] = np.nan if k == 12 else 1.0", COVARIANCES, "frame 12 is not finite"),
+    "another random number each run": (
+        "T[0, 3] += 1e-9 * np.random.default_rng().standard_normal()",
+        SAME,
+        "a second run answers otherwise to frame 0",
+    ),
+    "the same array every time": (
+        "self.pose[:] = T; T = self.pose",
+        LATER,
+        "its answer to frame 0 changed after it was given",
+    ),
+    "a scaled rotation": ("T[:3, :3] *= 1.001", ROTATIONS, "rotations are none"),
+    "no answer now and then": ("return None if k % 5 == 4 else Estimate(packet.frame.t_ns, T)", STAMPS, "answers at"),
+    "it raises": ("1 / (k - 9)", RUNS, "drive: ZeroDivisionError in line 27 of step: division by zero"),
+}
+
+
+@pytest.fixture
+def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Return a function that writes the estimator with a line planted."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(plant: str) -> Path:
+        Path("my_filter.py").write_text(NEWCOMER.replace("# PLANT", plant))
+        return Path("my_filter.py")
+
+    return write
+
+
+@pytest.fixture
+def only_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out what takes seconds: seeds, threads and faults."""
+    passed = verification.Check("left out", "passed")
+    for name in ("_honest", "_threads", "_trouble"):
+        monkeypatch.setattr(verification, name, lambda *_: passed)
+
+
+def failed(capsys) -> dict[str, dict[str, str]]:
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    return {check["name"]: check for check in checks if check["result"] == "failed"}
+
+
+@pytest.mark.usefixtures("only_runs")
+@pytest.mark.parametrize("kind", PLANTS)
+def test_what_is_planted_is_named_with_what_to_do(newcomer, capsys, kind: str) -> None:
+    plant, promise, told = PLANTS[kind]
+    assert main(["verify", str(newcomer(plant)), "--json"]) == 1
+    found = failed(capsys)
+    assert told in found[promise]["found"]
+    assert found[promise]["remedy"]
+
+
+@pytest.mark.usefixtures("only_runs")
+@pytest.mark.parametrize("kind", ["covariance not positive definite", "NaN in a covariance", "a scaled rotation"])
+def test_nothing_else_is_called_broken(newcomer, capsys, kind: str) -> None:
+    main(["verify", str(newcomer(PLANTS[kind][0])), "--json"])
+    assert list(failed(capsys)) == [PLANTS[kind][1]]
+
+
+def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
+    some = ("2 s without sight", "0.25 s that is not a number")
+    monkeypatch.setattr(trouble, "TROUBLE", {name: trouble.TROUBLE[name] for name in some})
+    monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
+    assert main(["verify", str(newcomer("pass"))]) == 0
+    told = capsys.readouterr().out
+    assert "my-filter keeps every promise" in told
+    assert told.count("  passed") == 12
+
+
+@pytest.mark.usefixtures("only_runs")
+def test_one_without_a_covariance_is_fine(newcomer, capsys) -> None:
+    assert main(["verify", str(newcomer("cov = None")), "--json"]) == 0
+    checks = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks[COVARIANCES]["result"] == "not applicable"
+    assert checks[COVARIANCES]["found"] == "it states no covariance"
+
+
+def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) -> None:
+    newcomer("cov[0, 3] += 1e-9")
+    Path("others").mkdir()
+    Path("others/__init__.py").touch()
+    Path("my_filter.py").rename("others/other_filter.py")
+    monkeypatch.syspath_prepend(".")
+    for name in ("_honest", "_threads", "_trouble"):
+        monkeypatch.setattr(verification, name, lambda *_: verification.Check("left out", "passed"))
+    assert main(["verify", "others.other_filter", "--json"]) == 1
+    assert list(failed(capsys)) == [COVARIANCES]
+
+
+def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
+    some = ("2 s without sight", "a camera 20 ms late")
+    monkeypatch.setattr(trouble, "TROUBLE", {name: trouble.TROUBLE[name] for name in some})
+    path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
+    from toolkit.verify.subject import subject_of
+
+    found = trouble.deaths("my-filter", subject_of(str(path)).load())
+    assert set(found) == {"2 s without sight (drive)", "2 s without sight (flight)"}
+    assert "AssertionError: no sightings" in found["2 s without sight (drive)"]
+
+
+def test_too_sure_and_too_timid_are_told_apart_from_honest() -> None:
+    rng = np.random.default_rng(0)
+    # Poses of a run share one error in the worst case: a chi-square of 6 over 6 each, over eight runs.
+    alarms = sum(bool(dishonest((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
+    assert alarms <= 8  # of 2000 at 0.1 % two are expected; a Poisson of 2 exceeds 8 once in four thousand
+    assert "too sure of itself" in dishonest([2.5] * 8)
+    assert "less sure" in dishonest([0.3] * 8)
+
+
+def test_a_covariance_with_units_far_apart_is_sound() -> None:
+    cov = np.diag([1e-12, 1e-12, 1e-12, 1e6, 1e6, 1e6])
+    assert covariance_fault(cov, COV_SIZES) == ""
+    cov[0, 3] = cov[3, 0] = 1.1e-3  # more than the geometric mean of their variances
+    assert "not positive definite" in covariance_fault(cov, COV_SIZES)
+
+
+@pytest.mark.parametrize(
+    ("word", "text", "told"),
+    [
+        ("nowhere.py", None, "nowhere.py: there is no such file"),
+        ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported (SyntaxError"),
+        ("mine.py", "import nothing_of_the_kind\n", "No module named 'nothing_of_the_kind'"),
+        ("mine.py", "x = 1\n", "mine.py: it defines no function build(setup)"),
+        ("ekff", None, "no estimator is called ekff (did you mean ekf?)"),
+    ],
+)
+def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path, monkeypatch, capsys, word, text, told) -> None:
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        Path(word).write_text(text)
+    assert main(["verify", word]) == 5
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert told in said
+
+
+def test_an_answer_of_another_kind_is_named() -> None:
+    from toolkit.verify.promises import difference
+
+    one = Estimate(0, np.eye(4), info={"nis": 1.0})
+    assert difference(one, Estimate(0, np.eye(4), info={"nis": 1.0})) == ""
+    assert difference(one, Estimate(0, np.eye(4), info={"nis": 2.0})) == "its diagnostics (info) differ"
+    assert difference(one, None) == "one run answers and the other does not"
+    assert difference(one, Estimate(0, np.eye(4), np.eye(6))) == "other fields or shapes"

@@ -1,0 +1,129 @@
+"""``vislam completion``: what a shell needs to complete commands, options and their choices."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, NamedTuple
+
+from toolkit.cli.arguments import epilog
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from toolkit.cli.arguments import Subcommands
+
+_SHELLS = ("bash", "zsh", "fish")
+
+
+class _Option(NamedTuple):
+    """The words of an option, what it is for, what may follow it, and whether a value does."""
+
+    words: tuple[str, ...]
+    help: str
+    choices: tuple[str, ...]
+    takes_value: bool
+
+
+class _Command(NamedTuple):
+    """A subcommand, what it is for, and its options."""
+
+    name: str
+    help: str
+    options: tuple[_Option, ...]
+
+
+def add_to(subcommands: Subcommands) -> None:
+    """Add the subcommand."""
+    parser = subcommands.add_parser(
+        "completion",
+        help="print what a shell needs to complete vislam's words",
+        description="Print a script that completes commands, options and their choices. bash and zsh: put "
+        'eval "$(vislam completion bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as '
+        "~/.config/fish/completions/vislam.fish.",
+        epilog=epilog("vislam completion bash"),
+    )
+    parser.add_argument("shell", choices=_SHELLS, help="which shell")
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Print the script."""
+    from toolkit.cli import parser
+
+    commands = list(_commands(parser()))
+    print({"bash": _bash, "zsh": _zsh, "fish": _fish}[options.shell](commands), end="")
+    return 0
+
+
+def _commands(root: argparse.ArgumentParser) -> Iterator[_Command]:
+    for action in root._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            helps = {one.dest: one.help or "" for one in action._choices_actions}
+            for name, parser in action.choices.items():
+                yield _Command(name, helps.get(name, ""), tuple(_options(parser)))
+
+
+def _options(parser: argparse.ArgumentParser) -> Iterator[_Option]:
+    for action in parser._actions:
+        choices = tuple(map(str, action.choices or ()))
+        # Positional choices are offered where no option is under way.
+        yield _Option(tuple(action.option_strings), action.help or "", choices, action.nargs != 0)
+
+
+def _bash(commands: list[_Command]) -> str:
+    cases = "".join(f"    {one.name}) {_case(one)} ;;\n" for one in commands)
+    names = " ".join(one.name for one in commands)
+    return f"""# Completion of vislam for bash. Load it with: eval "$(vislam completion bash)"
+_vislam() {{
+  local word="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}" words="" chosen=""
+  if [ "$COMP_CWORD" -eq 1 ]; then
+    COMPREPLY=($(compgen -W "{names} --help --version" -- "$word"))
+    return
+  fi
+  case "${{COMP_WORDS[1]}}" in
+{cases}  esac
+  if [ -n "$chosen" ]; then
+    COMPREPLY=($(compgen -W "$chosen" -- "$word"))
+  else
+    COMPREPLY=($(compgen -W "$words" -- "$word"))
+  fi
+}}
+complete -o default -F _vislam vislam
+"""
+
+
+def _case(one: _Command) -> str:
+    words = " ".join(word for option in one.options for word in (option.words or option.choices))
+    chosen = " ".join(
+        f'{"|".join(option.words)}) chosen="{" ".join(option.choices)}" ;;'
+        for option in one.options
+        if option.words and option.choices
+    )
+    return f'words="{words}"' + (f'; case "$before" in {chosen} esac' if chosen else "")
+
+
+def _zsh(commands: list[_Command]) -> str:
+    script = _bash(commands).split("\n", 1)[1]
+    head = '# Completion of vislam for zsh. Load it with: eval "$(vislam completion zsh)"\n'
+    return f"{head}autoload -U +X compinit && compinit -u\nautoload -U +X bashcompinit && bashcompinit\n{script}"
+
+
+def _fish(commands: list[_Command]) -> str:
+    lines = ["# Completion of vislam for fish: save as ~/.config/fish/completions/vislam.fish"]
+    lines.append("complete -c vislam -n __fish_use_subcommand -l help -l version")
+    for one in commands:
+        lines.append(f"complete -c vislam -n __fish_use_subcommand -a {one.name} -d {_quoted(one.help)}")
+        under = f"complete -c vislam -n '__fish_seen_subcommand_from {one.name}'"
+        for option in one.options:
+            if not option.words:
+                lines += [f"{under} -a {_quoted(' '.join(option.choices))}"] if option.choices else []
+                continue
+            words = " ".join(f"-l {w[2:]}" if w.startswith("--") else f"-s {w[1:]}" for w in option.words)
+            values = f" -x -a {_quoted(' '.join(option.choices))}" if option.choices else " -r" * option.takes_value
+            lines.append(f"{under} {words}{values} -d {_quoted(option.help)}")
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("%%", "%").replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"

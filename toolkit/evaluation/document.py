@@ -1,0 +1,271 @@
+"""``evaluation.json``, the contract ``vislam.evaluation/1``: scores of trajectory files (docs/evaluate.md).
+
+An entry of ``runs`` is one of ``metrics.json`` with the sequence and the file it is of. The gate takes the document in
+the place of a folder of trajectories.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from toolkit import documents
+from toolkit.errors import DataError
+from toolkit.estimate import Status
+from toolkit.evaluation.scoring import METRICS, Terms
+from toolkit.evaluation.standings import Cell, EvaluatedRun, Evaluation, PairedTest, Standing
+from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.gate.baseline import Values
+from toolkit.gate.trajectory_baseline import Scored
+from toolkit.gate.trajectory_files import Scoring
+from toolkit.metrics import Metric
+
+Value = int | float | None
+Count = Annotated[int, Meta(ge=0)]
+_REMEDY = "make it with vislam evaluate --out"
+
+
+class TermsRecord(Struct, frozen=True, kw_only=True):
+    """How trajectories were scored."""
+
+    max_dt_s: Annotated[float | None, Meta(description="nearest poses no farther apart in time; null: interpolated")]
+    offset_s: Annotated[float, Meta(description="added to the stamps of the trajectories")]
+    gap_s: Annotated[float, Meta(description="the longest time between two poses that counts as covered", gt=0)]
+    level: Annotated[bool, Meta(description="whether the vertical is measured: first poses turn about it alone")]
+    least_coverage_percent: Annotated[float, Meta(description="of the time, below which a run counts as failed")]
+
+
+class SequenceScored(Struct, frozen=True, kw_only=True):
+    """The truth of a sequence."""
+
+    sequence: str
+    truth: Annotated[str, Meta(description="the truth's file, as it was given")]
+    truth_hash: Annotated[str, Meta(description="of the truth's stamps and poses, to nine digits")]
+    poses: Count
+    duration_s: Annotated[float, Meta(ge=0)]
+    path_m: Annotated[float, Meta(ge=0)]
+
+
+class RunRecord(Struct, frozen=True, kw_only=True):
+    """One run of one system."""
+
+    sequence: str
+    estimator: Annotated[str, Meta(description="the system's name")]
+    run: str
+    file: Annotated[str | None, Meta(description="as it was given; null where there is none and ought to be one")]
+    output: Literal["final"]
+    status: Status
+    metrics: Annotated[dict[str, Value], Meta(description="by metric key")]
+    notes: Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on it")]
+    log: Annotated[tuple[str, ...], Meta(description="why it failed")]
+
+    def __post_init__(self) -> None:
+        for key, value in self.metrics.items():
+            if value is None and not self.notes.get(key):
+                raise ValueError(f"metrics.{key} is null, and notes does not say why")
+        if self.status != "ok" and not self.log:
+            raise ValueError(f"status is {self.status}, and log does not say why")
+
+
+class Quartiles(Struct, frozen=True, kw_only=True):
+    """Quartiles in which what failed is infinitely bad; null where that decides one."""
+
+    lower_quartile: float | None
+    median: float | None
+    upper_quartile: float | None
+
+
+class OverRuns(Struct, frozen=True, kw_only=True):
+    """All runs of a system on a sequence."""
+
+    sequence: str
+    estimator: str
+    runs: Count
+    ok: Count
+    metrics: Annotated[dict[str, Quartiles | None], Meta(description="null where runs are ok and none has a value")]
+
+
+class StandingRecord(Struct, frozen=True, kw_only=True):
+    """A system over all sequences, best first."""
+
+    estimator: str
+    mean_rank: float
+    wins: Count
+    sequences: Count
+    solved: Annotated[Count, Meta(description="sequences with a median over the runs")]
+    runs: Count
+    ok: Count
+    metrics: Annotated[dict[str, Quartiles | None], Meta(description="over the medians of the sequences")]
+
+
+class PairedRecord(Struct, frozen=True, kw_only=True):
+    """Two systems, paired over the sequences."""
+
+    estimator: str
+    other: str
+    better: Count
+    worse: Count
+    tied: Count
+    median_ratio: Annotated[float | None, Meta(description="first to second; null where failures decide it")]
+    p: Annotated[float, Meta(description="Wilcoxon's signed-rank test, exact, two-sided", ge=0, le=1)]
+    p_holm: Annotated[float, Meta(description="corrected for all pairs", ge=0, le=1)]
+
+
+class EvaluationRecord(Struct, frozen=True, kw_only=True):
+    """Every run of every system, and what they say together."""
+
+    schema: Literal["vislam.evaluation/1"]
+    terms: TermsRecord
+    ranked_by: Annotated[str, Meta(description="key of the metric that ranks and tests")]
+    sequences: Annotated[tuple[SequenceScored, ...], Meta(min_length=1)]
+    runs: Annotated[tuple[RunRecord, ...], Meta(min_length=1)]
+    over_runs: tuple[OverRuns, ...]
+    leaderboard: tuple[StandingRecord, ...]
+    paired: Annotated[tuple[PairedRecord, ...], Meta(description="every pair of systems; empty for one sequence")]
+    notes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        known = {one.sequence for one in self.sequences}
+        for i, run in enumerate(self.runs):
+            if run.sequence not in known:
+                raise ValueError(f"runs[{i}].sequence is none of sequences")
+
+
+def evaluation_document(evaluation: Evaluation) -> EvaluationRecord:
+    """Return an evaluation as a record."""
+    metrics = evaluation.scored_metrics
+    return EvaluationRecord(
+        schema="vislam.evaluation/1",
+        terms=_terms(evaluation.terms),
+        ranked_by=evaluation.ranked_by.key,
+        sequences=tuple(
+            SequenceScored(
+                sequence=name, truth=truth.path.as_posix(), truth_hash=truth.stamped.digest, poses=len(truth.poses),
+                duration_s=truth.duration_s, path_m=truth.path_m,
+            )
+            for name, truth in evaluation.truths.items()
+        ),
+        runs=tuple(map(_run, evaluation.runs)),
+        over_runs=tuple(_over_runs(cell, metrics) for cell in evaluation.cells.values()),
+        leaderboard=tuple(map(_standing, evaluation.leaderboard)),
+        paired=tuple(map(_paired, evaluation.paired)),
+        notes=evaluation.notes,
+    )  # fmt: skip
+
+
+def _terms(terms: Terms) -> TermsRecord:
+    return TermsRecord(
+        max_dt_s=terms.max_dt_s,
+        offset_s=terms.offset_s,
+        gap_s=terms.gap_s,
+        level=terms.level,
+        least_coverage_percent=terms.least_coverage_percent,
+    )
+
+
+def _run(run: EvaluatedRun) -> RunRecord:
+    counts = {metric.key for metric in METRICS if metric.count}
+    why = run.log[0] if run.log else ""
+    values = {metric.key: run.values.get(metric.key) for metric in METRICS}
+    notes = dict.fromkeys(values, why) if not run.values else dict(run.notes)
+    return RunRecord(
+        sequence=run.item.sequence,
+        estimator=run.item.system,
+        run=run.item.run,
+        file=None if run.item.path is None else run.item.path.as_posix(),
+        output="final",
+        status=run.status,
+        metrics={key: int(v) if v is not None and key in counts else v for key, v in values.items()},
+        notes={key: notes[key] for key in sorted(notes)},
+        log=run.log,
+    )
+
+
+def _over_runs(cell: Cell, metrics: tuple[Metric, ...]) -> OverRuns:
+    quartiles = {metric.key: _quartiles(cell.quantiles(metric)) for metric in metrics}
+    return OverRuns(sequence=cell.sequence, estimator=cell.system, runs=len(cell.runs), ok=cell.ok, metrics=quartiles)
+
+
+def _quartiles(found: QuantilesOfAll | None) -> Quartiles | None:
+    if found is None:
+        return None
+    return Quartiles(lower_quartile=found.lower_quartile, median=found.median, upper_quartile=found.upper_quartile)
+
+
+def _standing(standing: Standing) -> StandingRecord:
+    return StandingRecord(
+        estimator=standing.system,
+        mean_rank=standing.mean_rank,
+        wins=standing.wins,
+        sequences=standing.sequences,
+        solved=standing.solved,
+        runs=standing.runs,
+        ok=standing.ok,
+        metrics={key: _quartiles(found) for key, found in standing.quantiles.items()},
+    )
+
+
+def _paired(test: PairedTest) -> PairedRecord:
+    return PairedRecord(
+        estimator=test.system,
+        other=test.other,
+        better=test.better,
+        worse=test.worse,
+        tied=test.tied,
+        median_ratio=test.median_ratio,
+        p=test.p,
+        p_holm=test.p_holm,
+    )
+
+
+def read_evaluation(path: Path) -> EvaluationRecord:
+    """Read an ``evaluation.json``; raises DataError, in one line with the place, where it is not one."""
+    return documents.read(path, EvaluationRecord, remedy=_REMEDY)
+
+
+@dataclass(frozen=True)
+class EvaluatedRuns:
+    """The runs of an evaluation as the gate takes them: a sequence is SYSTEM/SEQUENCE where there are several systems.
+
+    Coverage and errors must be by the gate's own rules, so that the nearest poses of ``--max-dt`` are refused.
+    """
+
+    path: Path
+    record: EvaluationRecord
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences there are runs of."""
+        return tuple(self._runs)
+
+    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+        """Return the scores of a sequence's runs; raises DataError where one failed, or they were scored otherwise."""
+        self._check_terms(scoring)
+        runs = self._runs.get(sequence, ())
+        if not runs:
+            raise DataError(f"no run is in {self.path}; the baseline has {', '.join(before.files if before else ())}")
+        failed = next((run for run in runs if run.status != "ok"), None)
+        if failed is not None:
+            raise DataError(f"{failed.run} failed: {failed.log[0]}")
+        truth = next(one for one in self.record.sequences if one.sequence == runs[0].sequence)
+        scores: Mapping[str, Values] = {key: tuple(run.metrics.get(key) for run in runs) for key in scoring.metrics}
+        return Scored(truth.truth, truth.truth_hash, tuple(run.file or run.run for run in runs), scores)
+
+    def _check_terms(self, scoring: Scoring) -> None:
+        terms = self.record.terms
+        if terms.max_dt_s is not None:
+            raise DataError(f"{self.path}: it pairs nearest poses; evaluate again without --max-dt")
+        if terms.gap_s != scoring.gap_s:
+            gaps = f"its longest covered gap is {terms.gap_s:g} s, the baseline's {scoring.gap_s:g} s"
+            raise DataError(f"{self.path}: {gaps}; evaluate again with --gap {scoring.gap_s:g}")
+
+    @cached_property
+    def _runs(self) -> dict[str, tuple[RunRecord, ...]]:
+        several = len({run.estimator for run in self.record.runs}) > 1
+        found: dict[str, list[RunRecord]] = {}
+        for run in self.record.runs:
+            found.setdefault(f"{run.estimator}/{run.sequence}" if several else run.sequence, []).append(run)
+        return {name: tuple(runs) for name, runs in found.items()}

@@ -1,0 +1,142 @@
+"""Which trajectories are there: of which system, on which sequence, in which run; and where each truth is."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from toolkit.errors import DataError, printable
+from toolkit.gate.trajectory_files import files_by_sequence, trajectory_files
+
+
+@dataclass(frozen=True)
+class Item:
+    """One run of a system on a sequence: a file, or None where the system has none and ought to."""
+
+    system: str
+    sequence: str
+    run: str
+    path: Path | None
+
+
+class Gathered(NamedTuple):
+    """The truths by sequence, every run by system and sequence, and what was left out, in words."""
+
+    truths: Mapping[str, Path]
+    items: tuple[Item, ...]
+    notes: tuple[str, ...]
+
+
+# The files of each sequence, by system.
+_Found = dict[str, dict[str, tuple[Path, ...]]]
+
+
+def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gathered:
+    """Find the runs that some words name: NAME=FILE, FILE, NAME=FOLDER, or FOLDER with a folder a system.
+
+    With a truth that is a file there is one sequence, and the files of NAME=FOLDER are runs of it; with a folder of
+    truths SEQUENCE.tum, folders of systems hold SEQUENCE.tum or SEQUENCE/RUN.tum. A system that lacks a sequence
+    another has gets items without a file in their place, as many as it has runs elsewhere; and so does one that has
+    fewer than ``runs`` of a sequence. Raises DataError where a word names nothing, or nothing that has a truth.
+    """
+    truths = {_name(truth): truth} if truth.is_file() else _truths_in(truth)
+    found = _of_one_sequence(truth, given) if truth.is_file() else _of_folders(given)
+    known = {sequence for sequences in found.values() for sequence in sequences}
+    scored = [sequence for sequence in truths if sequence in known]
+    if not scored:
+        there = ", ".join(sorted(known))
+        raise DataError(f"{truth}: it has the truth of {', '.join(truths)}, and the trajectories are of {there}")
+    items = [
+        item
+        for name, files in found.items()
+        for sequence in scored
+        for item in _items(name, sequence, files.get(sequence, ()), runs or _runs_elsewhere(files, sequence))
+    ]
+    return Gathered({s: truths[s] for s in scored}, tuple(items), tuple(_left_out(truths, known)))
+
+
+def _runs_elsewhere(files: Mapping[str, tuple[Path, ...]], sequence: str) -> int:
+    """Return how many runs a system without any of a sequence ought to have: as many as of another one."""
+    return 0 if sequence in files else max(map(len, files.values()))
+
+
+def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:
+    """Return an item for each file, and for each that is missing until there are so many."""
+    there = [Item(system, sequence, printable(file.stem), file) for file in files]
+    return there + [Item(system, sequence, f"missing {n + 1}", None) for n in range(runs - len(there))]
+
+
+def _of_one_sequence(truth: Path, given: Iterable[str]) -> _Found:
+    found: _Found = {}
+    for word in given:
+        name, path = _named(word)
+        if path.is_dir() and name is None:
+            raise DataError(
+                f"{path}: a folder of one system's runs needs its name, NAME={path}; or give a folder of truths"
+            )
+        files = trajectory_files(path) if path.is_dir() else (_existing(path),)
+        if not files:
+            raise DataError(f"{path}: it holds no trajectory")
+        runs = found.setdefault(name or _name(path), {})
+        runs[_name(truth)] = (*runs.get(_name(truth), ()), *files)
+    return found
+
+
+def _of_folders(given: Iterable[str]) -> _Found:
+    found: _Found = {}
+    for word in given:
+        name, path = _named(word)
+        if not path.is_dir():
+            raise DataError(f"{path}: it is no folder; where the truth is a folder, give systems as NAME=FOLDER")
+        systems = {name: path} if name is not None else _systems_in(path)
+        for system, folder in systems.items():
+            if system in found:
+                raise DataError(f"{folder}: {system} is given twice; give each system another name")
+            found[system] = files_by_sequence(folder)
+    return found
+
+
+def _systems_in(tree: Path) -> dict[str, Path]:
+    """Return the folders of a tree by their names; raises DataError where there are none."""
+    folders = {printable(path.name): path for path in sorted(tree.iterdir()) if path.is_dir()}
+    systems = {name: path for name, path in folders.items() if not name.startswith(".")}
+    if not systems:
+        raise DataError(f"{tree}: it has no folders; expected SYSTEM/SEQUENCE.tum or SYSTEM/SEQUENCE/RUN.tum")
+    return systems
+
+
+def _truths_in(folder: Path) -> dict[str, Path]:
+    if not folder.exists():
+        raise DataError(f"{folder}: there is no such truth; give a file, or a folder that has SEQUENCE.tum")
+    found = files_by_sequence(folder)
+    for sequence, files in found.items():
+        if len(files) != 1:
+            raise DataError(f"{folder}: it has {len(files)} truths for {sequence}; leave one, {sequence}.tum")
+    return {sequence: files[0] for sequence, files in found.items()}
+
+
+def _left_out(truths: Mapping[str, Path], known: set[str]) -> Iterable[str]:
+    without_truth, without_runs = sorted(known - set(truths)), sorted(set(truths) - known)
+    if without_truth:
+        yield f"no truth is given for {', '.join(without_truth)}: not scored"
+    if without_runs:
+        yield f"no system has a trajectory of {', '.join(without_runs)}: not scored"
+
+
+def _named(word: str) -> tuple[str | None, Path]:
+    """Split NAME=PATH; a word that is the path of something, or has no name, is all path."""
+    name, equals, path = word.partition("=")
+    if not equals or not name.strip() or not path or Path(word).exists():
+        return None, Path(word)
+    return printable(name.strip()), Path(path)
+
+
+def _existing(path: Path) -> Path:
+    """Return the path; a file that is named and not there is a slip of the pen, and no failure of a system."""
+    if not path.exists():
+        raise DataError(f"{path}: there is no such file; check the path")
+    return path
+
+
+def _name(path: Path) -> str:
+    return printable(path.stem)

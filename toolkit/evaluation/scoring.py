@@ -1,0 +1,263 @@
+"""One trajectory file against the truth: matched in time, checked that it belongs to it, scored.
+
+The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so is the rule of association: poses are
+paired on the stamps of the sparser of both, between whose neighbours the other is interpolated. ``max_dt_s`` asks for
+the rule of evo (Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017) instead: the nearest pose.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.datasets.trajectories import read_poses
+from toolkit.datasets.trajectories.belonging import (
+    Reference,
+    check_clock,
+    check_length_unit,
+    check_turns,
+    in_other_order,
+    inverted,
+    range_s,
+    turned_body,
+)
+from toolkit.datasets.trajectories.poses import PosesFile, check_order
+from toolkit.errors import DataError
+from toolkit.evaluation.stated import nees_scores
+from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
+from toolkit.geometry import Array, IntArray, quaternion_from_rotation, so3_log
+from toolkit.metrics import Metric, Scores, Unavailable, ate, coverage, drift, kitti, nees, rpe
+from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, distance_along
+from toolkit.metrics._shared.evaluation import AgainstTruth, PairsAgainstTruth
+from toolkit.resampling import NS_PER_S
+
+COVERAGE = Metric(
+    TIME_COVERAGE,
+    "the truth's time that lies between poses no farther apart than the longest gap (percent)",
+    "%",
+    ("cover", "time"),
+    name="time coverage",
+    decimals=1,
+    best="most",
+    table="always",
+)
+_PAIRS = next(metric for metric in coverage.METRICS if metric.key == "pairs")
+NEES_KEYS = ("nees_ori_mean", "nees_pos_mean")
+METRICS: tuple[Metric, ...] = (
+    *ate.METRICS,
+    *rpe.METRICS,
+    *kitti.METRICS,
+    *drift.METRICS,
+    *(metric for metric in nees.METRICS if metric.key in NEES_KEYS),
+    COVERAGE,
+    _PAIRS,
+)
+_OVER_A_SECOND = ("rpe_1s_m", "rpe_1s_deg")
+# What depends on the body's axes, and not on where the body is alone.
+_OF_THE_BODY = (
+    *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
+    *("end_drift_percent", *NEES_KEYS),
+)
+# Frames without stamps are taken to be so far apart where only their order matters.
+_FRAME_NS = NS_PER_S // 10
+_ALONG_AN_AXIS = 0.9
+# More poses than these, evenly spread, say nothing more of how a body turns.
+_ENOUGH_TURNS = 1000
+
+
+@dataclass(frozen=True)
+class Terms:
+    """How trajectories are scored.
+
+    ``max_dt_s`` pairs each pose with the nearest one that is no farther in time, None interpolates; ``offset_s`` is
+    added to the stamps of the trajectories; ``gap_s`` is the longest time between two poses that counts as covered;
+    ``level`` says that the vertical is measured, as by an IMU; a run that covers less than ``least_coverage_percent``
+    of the truth's time counts as failed.
+    """
+
+    max_dt_s: float | None = None
+    offset_s: float = 0.0
+    gap_s: float = 5.0
+    level: bool = False
+    least_coverage_percent: float = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class TruthFile:
+    """The truth of a sequence: poses (N, 4, 4) on stamps (N,) ns, which are its lines where it has none."""
+
+    name: str
+    path: Path
+    t_ns: IntArray
+    poses: Array
+    is_timed: bool
+
+    @property
+    def stamped(self) -> Poses:
+        """Return the poses as the gate has them."""
+        return Poses(self.path, self.t_ns, self.poses)
+
+    @cached_property
+    def reference(self) -> Reference:
+        """What shows whether a trajectory is of this sequence."""
+        return Reference.of_truth(self.name, self.t_ns, self.poses)
+
+    @property
+    def duration_s(self) -> float:
+        """Return the time from the first pose to the last."""
+        return float((self.t_ns[-1] - self.t_ns[0]) / NS_PER_S)
+
+    @property
+    def path_m(self) -> float:
+        """Return the length of the path."""
+        return float(distance_along(self.poses[:, :3, 3])[-1])
+
+
+def read_truth(name: str, path: Path) -> TruthFile:
+    """Read the truth of a sequence; raises DataError where it is none, or holds fewer than two poses."""
+    file = read_poses(path)
+    if len(file) < 2:
+        raise DataError(f"{path}: a truth of {len(file)} pose; give at least two")
+    if file.other_order is not None:
+        check_order(path, file.T_world_imu, file.other_order)
+    t_ns = _lines_ns(len(file)) if file.t_ns is None else file.t_ns
+    return TruthFile(name, path, t_ns, file.T_world_imu, file.t_ns is not None)
+
+
+def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
+    """Return every metric of a trajectory file, None with the reason where one cannot be computed.
+
+    Raises DataError where the file cannot be used or does not belong to the truth: a wrong clock, unit of time or of
+    length, order of quaternions or number of lines is named.
+    """
+    file = read_poses(path)
+    estimate = _stamped(file, truth, terms.offset_s)
+    turn = _checked(file, estimate, truth)
+    matched = _matched(estimate, truth, terms.max_dt_s)
+    scores = _score(matched, file, estimate, truth, terms)
+    if not truth.is_timed:
+        scores = _without(scores, _OVER_A_SECOND, "the files have no stamps")
+    if turn is not None:
+        scores = _without(
+            scores, _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
+        )
+    return scores.remarked([_PAIRS.key], _how_matched(estimate, truth, terms.max_dt_s))
+
+
+def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:
+    """Return the poses on their stamps, or on the truth's where the file has none and as many lines."""
+    if file.t_ns is not None and truth.is_timed:
+        return Poses(file.path, file.t_ns + round(offset_s * NS_PER_S), file.T_world_imu)
+    if file.t_ns is not None:
+        raise DataError(f"{truth.path}: it has no stamps, and {file.path} has; give both with stamps or both without")
+    if len(file) != len(truth.poses):
+        what = f"{file.path}: {len(file)} lines without stamps, and the truth has {len(truth.poses)} poses"
+        raise DataError(f"{what}; write a pose for each, or a format with stamps")
+    return Poses(file.path, truth.t_ns, file.T_world_imu)
+
+
+def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None:
+    """Check that a trajectory belongs to the truth; return the turn to its body's axes where these are others."""
+    what, rotations = str(file.path), estimate.poses[:, :3, :3]
+    if len(file) == 0:
+        raise DataError(f"{what}: it holds no poses")
+    reference = truth.reference
+    check_clock(what, reference, estimate.t_ns)
+    check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
+    readings = [inverted()]
+    if file.other_order is not None:
+        readings.insert(0, in_other_order(file.other_order))
+    some = slice(None, None, 1 + len(rotations) // _ENOUGH_TURNS)
+    confirmed = check_turns(what, reference, estimate.t_ns[some], rotations[some], readings)
+    turn = None if confirmed else turned_body(reference, estimate.t_ns[some], rotations[some])
+    if file.other_order is not None and not confirmed and turn is None:
+        check_order(file.path, estimate.poses, file.other_order)
+    return turn
+
+
+def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:
+    matched = matched_poses(estimate, truth.stamped) if max_dt_s is None else nearest_poses(estimate, truth, max_dt_s)
+    if len(matched) < 2:
+        raise DataError(
+            f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
+            f"the truth {range_s(truth.t_ns)}; shift the one or the other with --offset, or allow more with --max-dt"
+        )
+    return matched
+
+
+def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched:
+    """Pair each pose of the one with fewer poses with the nearest of the other, as evo does; nothing is interpolated.
+
+    Of two that are equally near it is the earlier one; a pose may be paired twice.
+    """
+    path_m = distance_along(truth.poses[:, :3, 3])
+    estimate_is_longer = estimate.t_ns.size > truth.t_ns.size
+    few, many = (truth.t_ns, estimate.t_ns) if estimate_is_longer else (estimate.t_ns, truth.t_ns)
+    after = np.clip(np.searchsorted(many, few), 0, many.size - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(many[after] - few < few - many[before], after, before)
+    nearest = np.where(after == 0, 0, nearest)
+    met = np.flatnonzero(np.abs(many[nearest] - few) <= max_dt_s * NS_PER_S)
+    rows, others = (nearest[met], met) if estimate_is_longer else (met, nearest[met])
+    return Matched(estimate.t_ns[rows], truth.poses[others], estimate.poses[rows], path_m[others])
+
+
+def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile, terms: Terms) -> Scores:
+    pairs = PairsAgainstTruth(matched, terms.level)
+    files: tuple[Callable[[AgainstTruth], Scores], ...] = (ate.score, rpe.score, kitti.score, drift.score)
+    found: list[Scores] = []
+    with np.errstate(all="ignore"):  # what is not finite is no value, with that as its reason
+        for score, metrics in zip(files, (ate.METRICS, rpe.METRICS, kitti.METRICS, drift.METRICS), strict=True):
+            found.append(_or_reason(score, pairs, metrics))
+        found.append(nees_scores(file, estimate, truth.stamped, level=terms.level))
+    covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
+    found.append(Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)}))
+    values = {key: value for one in found for key, value in one.values.items()}
+    return Scores(values, {key: note for one in found for key, note in one.notes.items()})
+
+
+def _or_reason(score: Callable[[AgainstTruth], Scores], pairs: AgainstTruth, metrics: tuple[Metric, ...]) -> Scores:
+    try:
+        return score(pairs)
+    except Unavailable as reason:
+        keys = [metric.key for metric in metrics]
+        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(reason)))
+
+
+def _without(scores: Scores, keys: tuple[str, ...], reason: str) -> Scores:
+    return replace(scores, values=scores.values | dict.fromkeys(keys), notes=scores.notes | dict.fromkeys(keys, reason))
+
+
+def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> str:
+    """Say how stamps were met where they are not the same: a reader of another tool's number needs to know."""
+    if not truth.is_timed:
+        return "paired line by line, for the files have no stamps"
+    few, many = sorted((estimate.t_ns, truth.t_ns), key=lambda t_ns: t_ns.size)
+    after = np.clip(np.searchsorted(many, few), 1, many.size - 1)
+    apart_ms = np.minimum(np.abs(many[after] - few), np.abs(few - many[after - 1])) / 1e6
+    off = apart_ms > STAMP_TOLERANCE_NS / 1e6
+    if not off.any():
+        return ""
+    typical = f"{float(np.median(apart_ms[off])):.3g} ms"
+    if max_dt_s is None:
+        return f"{int(off.sum())} of {few.size} stamps lie {typical} off the other's, and poses are interpolated there"
+    return f"paired with the nearest pose, {typical} off, and not interpolated"
+
+
+def _axes(turn: Array) -> str:
+    """Describe a turn (3, 3) from a body's axes to the truth's."""
+    largest = np.abs(turn).argmax(axis=0)
+    if (np.abs(turn[largest, range(3)]) > _ALONG_AN_AXIS).all():
+        signed = ["xyz"[row] if turn[row, column] > 0.0 else f"-{'xyz'[row]}" for column, row in enumerate(largest)]
+        along = f"its x, y and z point along the truth's {signed[0]}, {signed[1]} and {signed[2]}"
+    else:
+        along = f"turned by {float(np.degrees(np.linalg.norm(so3_log(turn)))):.0f} deg"
+    x, y, z, w = quaternion_from_rotation(turn).tolist()
+    quaternion = f"x y z w {x:.3f} {y:.3f} {z:.3f} {w:.3f}"
+    return f"{along}; multiply each pose by the inverse of the extrinsic (about {quaternion}) from the right"
+
+
+def _lines_ns(count: int) -> IntArray:
+    return np.arange(count, dtype=np.int64) * _FRAME_NS

@@ -1,0 +1,339 @@
+"""What many runs on many sequences say together; a run that failed is in every figure, as an infinitely bad one.
+
+Over the runs of a system on a sequence: median and quartiles. Over sequences: ranks, and tests of each pair of systems
+by Wilcoxon's signed-rank test on the logarithms of the ratios of their medians (Wilcoxon, Biometrics Bulletin 1, 1945),
+in its exact form for ties (Pratt and Gibbons, "Concepts of nonparametric theory", 1981, section 3.7), with Holm's
+correction over all pairs. A sequence on which one of two systems has no median is the largest difference there is.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.estimate import Status
+from toolkit.evaluation.gathering import Gathered, Item
+from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
+from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
+from toolkit.experiment.workers import Lost, results_of
+from toolkit.gate.paired import holm
+from toolkit.geometry import Array, IntArray
+from toolkit.metrics import Metric
+from toolkit.progress import SILENT, Progress
+
+METRIC_BY_KEY: Mapping[str, Metric] = {metric.key: metric for metric in METRICS}
+RANKED_BY = "ate_se3_m"
+FALSE_ALARM_RATE = 0.05
+# Processes take a second to start, in which so many files are scored.
+_WORTH_PROCESSES = 200
+# As many signs as are counted exactly; beyond it the smallest p-value is below 1e-300 anyway.
+_MOST_EXACT = 1000
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """One run: how it ended, its metrics, and why they are missing; ``log`` has the reason of a failure."""
+
+    item: Item
+    status: Status
+    values: Mapping[str, float | None]
+    notes: Mapping[str, str]
+    log: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """All runs of a system on a sequence."""
+
+    system: str
+    sequence: str
+    runs: tuple[EvaluatedRun, ...]
+
+    @property
+    def ok(self) -> int:
+        """Return how many runs ended well."""
+        return sum(run.status == "ok" for run in self.runs)
+
+    @property
+    def failed(self) -> int:
+        """Return how many did not."""
+        return len(self.runs) - self.ok
+
+    def quantiles(self, metric: Metric) -> QuantilesOfAll | None:
+        """Return the quartiles over all runs; None where runs are ok and none of them has a value."""
+        good = [run.values.get(metric.key) for run in self.runs if run.status == "ok"]
+        values = [value for value in good if value is not None]
+        if good and not values:
+            return None
+        return quantiles_of_all(values, self.failed, metric.best or "most")
+
+    def median(self, metric: Metric) -> float | None:
+        """Return the median over all runs, None where failed runs decide it or there is no value."""
+        found = self.quantiles(metric)
+        return None if found is None else found.median
+
+    def reason(self, key: str) -> str:
+        """Return why a metric has no value in any run that is ok, or why no run is."""
+        if not self.ok:
+            return next((run.log[0] for run in self.runs if run.log), "no run is ok")
+        notes = (run.notes.get(key) for run in self.runs if run.status == "ok")
+        return next((note for note in notes if note), "not computed")
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A system over all sequences.
+
+    ``mean_rank`` and ``wins`` are by the median over the runs of each sequence; ``quantiles`` are over the sequences'
+    medians, in which one without a median is infinitely bad.
+    """
+
+    system: str
+    mean_rank: float
+    wins: int
+    sequences: int
+    solved: int
+    runs: int
+    ok: int
+    quantiles: Mapping[str, QuantilesOfAll | None]
+
+
+@dataclass(frozen=True)
+class PairedTest:
+    """Two systems over the sequences: how often the first is better, by what factor, and whether that is chance.
+
+    ``median_ratio`` is of the first's error to the second's, None where sequences without a median decide it. ``p`` is
+    two-sided and of this pair alone, ``p_holm`` corrected for all pairs.
+    """
+
+    system: str
+    other: str
+    better: int
+    worse: int
+    tied: int
+    median_ratio: float | None
+    p: float
+    p_holm: float
+
+    @property
+    def told_apart(self) -> bool:
+        """Say whether the two differ by more than chance, at 5 % for all pairs together."""
+        return self.p_holm <= FALSE_ALARM_RATE
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Every run of every system, the truths, and by which metric systems are ranked."""
+
+    truths: Mapping[str, TruthFile]
+    terms: Terms
+    runs: tuple[EvaluatedRun, ...]
+    ranked_by: Metric
+    notes: tuple[str, ...] = field(default=())
+
+    @cached_property
+    def systems(self) -> tuple[str, ...]:
+        """The systems, in the order given."""
+        return tuple(dict.fromkeys(run.item.system for run in self.runs))
+
+    @property
+    def sequences(self) -> tuple[str, ...]:
+        """Return the sequences' names."""
+        return tuple(self.truths)
+
+    @cached_property
+    def cells(self) -> Mapping[tuple[str, str], Cell]:
+        """The runs by system and sequence; every pair of the two has some."""
+        found: dict[tuple[str, str], list[EvaluatedRun]] = {}
+        for run in self.runs:
+            found.setdefault((run.item.system, run.item.sequence), []).append(run)
+        return {key: Cell(*key, tuple(runs)) for key, runs in found.items()}
+
+    @property
+    def all_ok(self) -> bool:
+        """Say whether every run ended well."""
+        return all(run.status == "ok" for run in self.runs)
+
+    @cached_property
+    def scored_metrics(self) -> tuple[Metric, ...]:
+        """The metrics that any run has."""
+        given = {key for run in self.runs for key, value in run.values.items() if value is not None}
+        return tuple(metric for metric in METRICS if metric.key in given)
+
+    @cached_property
+    def leaderboard(self) -> tuple[Standing, ...]:
+        """The systems from the lowest mean rank up, and of the same mean rank in the order given."""
+        ranks = self._ranks()
+        standings = [self._standing(system, row) for system, row in zip(self.systems, ranks, strict=True)]
+        return tuple(sorted(standings, key=lambda standing: standing.mean_rank))
+
+    @cached_property
+    def paired(self) -> tuple[PairedTest, ...]:
+        """Every pair of systems over the sequences, the one higher on the leaderboard first; none of one sequence."""
+        order = [standing.system for standing in self.leaderboard]
+        pairs = list(combinations(order, 2)) if len(self.sequences) > 1 else []
+        differences = [self._log_ratios(one, other) for one, other in pairs]
+        p_values = [signed_rank_p(given) for given in differences]
+        corrected = holm(np.array(p_values)).tolist() if pairs else []
+        return tuple(
+            _paired(*pair, given, p, p_holm)
+            for pair, given, p, p_holm in zip(pairs, differences, p_values, corrected, strict=True)
+        )
+
+    @cached_property
+    def ranked_sequences(self) -> tuple[str, ...]:
+        """The sequences that can rank systems: some have a median there. All of them where none does."""
+        metric, cells = self.ranked_by, self.cells
+        found = [s for s in self.sequences if any(cells[name, s].median(metric) is not None for name in self.systems)]
+        return tuple(found) or self.sequences
+
+    def _costs(self, system: str) -> Array:
+        """Return what is to be small (sequences,): the median of the metric, infinite where there is none.
+
+        Where the ideal is 1 it is the factor by which it is missed.
+        """
+        medians = [self.cells[system, sequence].median(self.ranked_by) for sequence in self.ranked_sequences]
+        return np.array([np.inf if value is None else _cost(value, self.ranked_by) for value in medians])
+
+    def _ranks(self) -> Array:
+        """Return ranks (systems, sequences) from 1, of equals the mean."""
+        costs = np.array([self._costs(system) for system in self.systems])
+        return np.array([_ranked(column) for column in costs.T]).T
+
+    def _standing(self, system: str, ranks: Array) -> Standing:
+        cells = [self.cells[system, sequence] for sequence in self.sequences]
+        solved = np.isfinite(self._costs(system))
+        return Standing(
+            system,
+            float(ranks.mean()),
+            int(((ranks == 1.0) & solved).sum()),
+            len(cells),
+            int(solved.sum()),
+            sum(len(cell.runs) for cell in cells),
+            sum(cell.ok for cell in cells),
+            {metric.key: _over_sequences(cells, metric) for metric in self.scored_metrics},
+        )
+
+    def _log_ratios(self, system: str, other: str) -> Array:
+        """Return the logarithms (sequences,) of the ratios of costs; infinite where one has none, 0 where both."""
+        one, two = self._costs(system), self._costs(other)
+        with np.errstate(all="ignore"):  # of two that are infinite, or zero, the ratio is no number
+            ratios = np.log(one / two)
+        return np.where(one == two, 0.0, ratios)
+
+
+def _cost(value: float, metric: Metric) -> float:
+    if metric.best == "most":
+        return 1.0 / value if value > 0.0 else np.inf
+    if metric.best == "one":
+        return float(np.exp(np.abs(np.log(value)))) if value > 0.0 else np.inf
+    return value
+
+
+def evaluate(
+    gathered: Gathered, terms: Terms, ranked_by: str = RANKED_BY, progress: Progress = SILENT, workers: int = 1
+) -> Evaluation:
+    """Score every run, in so many processes where they are many.
+
+    Raises DataError where a truth cannot be used, or not one of the runs can. A run that cannot is failed, with the
+    reason, as is one that covers too little of the truth's time.
+    """
+    truths = {name: read_truth(name, path) for name, path in gathered.truths.items()}
+    by_sequence = {name: tuple(item for item in gathered.items if item.sequence == name) for name in truths}
+    units = [_Unit(name, path, by_sequence[name], terms) for name, path in gathered.truths.items()]
+    scored: dict[Item, EvaluatedRun] = {}
+    processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
+    for place, found in results_of(units, processes, _evaluated, progress):
+        if isinstance(found, Lost):
+            scored |= {item: EvaluatedRun(item, "failed", {}, {}, (found.why,)) for item in units[place].items}
+        else:
+            scored |= {run.item: run for run in found}
+    runs = tuple(scored[item] for item in gathered.items)
+    if not any(run.values for run in runs):
+        raise DataError(next(run.log[0] for run in runs if run.log))
+    return Evaluation(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """All runs of a sequence, which share its truth: the work of one process."""
+
+    sequence: str
+    truth: Path
+    items: tuple[Item, ...]
+    terms: Terms
+
+
+def _evaluated(unit: _Unit, progress: Progress) -> tuple[EvaluatedRun, ...]:
+    truth = read_truth(unit.sequence, unit.truth)
+    runs = []
+    for i, item in enumerate(unit.items):
+        progress.advance(i, len(unit.items))
+        runs.append(evaluated(item, truth, unit.terms))
+    return tuple(runs)
+
+
+def evaluated(item: Item, truth: TruthFile, terms: Terms) -> EvaluatedRun:
+    """Score one run; what is wrong with its file is its log, and no error."""
+    if item.path is None:
+        return EvaluatedRun(item, "failed", {}, {}, ("there is no trajectory",))
+    try:
+        scores = score_file(item.path, truth, terms)
+    except DataError as error:
+        return EvaluatedRun(item, "failed", {}, {}, (" ".join(str(error).split()),))
+    covered = scores.values[COVERAGE.key]
+    if covered is not None and covered < terms.least_coverage_percent:
+        why = f"it covers {covered:.1f} % of the truth's time, and {terms.least_coverage_percent:g} % is asked for"
+        return EvaluatedRun(item, "failed", scores.values, scores.notes, (f"{item.path}: {why}",))
+    return EvaluatedRun(item, "ok", scores.values, scores.notes)
+
+
+def signed_rank_p(differences: Array) -> float:
+    """Return the two-sided p-value of Wilcoxon's signed-rank test, exact whatever ties there are.
+
+    Differences (n,) of zero take no part; of those that are infinite all are equally large. Without any the answer
+    is 1. The distribution of the sum of the ranks over all 2^n signs is counted, ranks doubled to be whole.
+    """
+    given = differences[differences != 0.0][:_MOST_EXACT]
+    if not given.size:
+        return 1.0
+    doubled = np.rint(2.0 * _ranked(np.abs(given))).astype(int)
+    chance = np.zeros(int(doubled.sum()) + 1)
+    chance[0] = 1.0
+    for rank in doubled.tolist():
+        chance[rank:] += chance[: chance.size - rank].copy()
+        chance *= 0.5
+    positive = int(doubled[given > 0.0].sum())
+    tail = min(float(chance[: positive + 1].sum()), float(chance[positive:].sum()))
+    return min(1.0, 2.0 * tail)
+
+
+def _ranked(values: Array) -> Array:
+    """Return the ranks (n,) of values from the least, 1, up; equal values share the mean of theirs."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    last: IntArray = np.cumsum(counts)
+    return np.asarray((last - 0.5 * (counts - 1))[place])
+
+
+def _paired(system: str, other: str, log_ratios: Array, p: float, p_holm: float) -> PairedTest:
+    middle = float(np.median(log_ratios)) if not np.isinf(np.median(log_ratios)) else None
+    better, worse = int((log_ratios < 0.0).sum()), int((log_ratios > 0.0).sum())
+    tied = log_ratios.size - better - worse
+    ratio = None if middle is None or np.isnan(middle) else float(np.exp(middle))
+    return PairedTest(system, other, better, worse, tied, ratio, p, p_holm)
+
+
+def _over_sequences(cells: Sequence[Cell], metric: Metric) -> QuantilesOfAll | None:
+    """Return the quartiles of the medians of sequences; those where every ok run lacks the metric take no part."""
+    due = [cell for cell in cells if cell.quantiles(metric) is not None]
+    return _quantiles([cell.median(metric) for cell in due], metric)
+
+
+def _quantiles(medians: Iterable[float | None], metric: Metric) -> QuantilesOfAll | None:
+    given = list(medians)
+    good = [value for value in given if value is not None]
+    return quantiles_of_all(good, len(given) - len(good), metric.best or "most") if good else None

@@ -1,0 +1,103 @@
+"""What to cite for estimators and data sets: BibTeX, from the constant ``CITES`` of their own modules.
+
+An entry of ``CITES`` is a key of references.bib beside this file, or BibTeX itself, so that a new estimator stays one
+file. Nothing is imported to read it.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+from toolkit import datasets
+from toolkit.discovery import FoundModule
+from toolkit.errors import VislamError, no_such
+from toolkit.estimator import discover
+from toolkit.report.records import read_manifest
+from toolkit.report.run_directory import MANIFEST
+
+_ENTRY = re.compile(r"^@\w+\{\s*([^,\s]+)\s*,.*?^\}", re.MULTILINE | re.DOTALL)
+_SOFTWARE = """@software{{vislam_toolkit,
+  title = {{{{vislam-toolkit}}: filters and smoothers for stereo visual-inertial odometry on the same measurements}},
+  version = {{{version}}}
+}}"""
+
+
+@dataclass(frozen=True)
+class Cited:
+    """The BibTeX entries of an estimator or a data set, by key; none where there is nothing to cite."""
+
+    name: str
+    entries: Mapping[str, str]
+
+
+def citations(names: Iterable[str]) -> tuple[Cited, ...]:
+    """Return what to cite for estimators, formats, files of estimators and run directories; for all without names.
+
+    Raises VislamError for a name nobody knows or a key that references.bib does not have, DataError for a directory
+    that is no run's.
+    """
+    known = _known()
+    wanted = [found for name in names for found in _meant(name, known)] or list(known.items())
+    return tuple(Cited(name, _entries(module)) for name, module in dict(wanted).items())
+
+
+def bibtex(cited: Iterable[Cited]) -> str:
+    """Return BibTeX: the toolkit itself, then every entry once, under the names that it is cited for."""
+    entries: dict[str, str] = {}
+    whose: dict[str, list[str]] = {}
+    nothing = []
+    for one in cited:
+        entries |= one.entries
+        for key in one.entries:
+            whose.setdefault(key, []).append(one.name)
+        nothing += [] if one.entries else [one.name]
+    parts = [f"% the toolkit\n{_SOFTWARE.format(version=version('vislam-toolkit'))}"]
+    parts += [f"% {', '.join(whose[key])}\n{text}" for key, text in entries.items()]
+    parts += [f"% nothing to cite for {', '.join(nothing)}"] if nothing else []
+    return "\n\n".join(parts) + "\n"
+
+
+def _known() -> dict[str, FoundModule]:
+    return {name: entry.found for name, entry in discover().items()} | datasets.modules()
+
+
+def _meant(name: str, known: Mapping[str, FoundModule]) -> list[tuple[str, FoundModule]]:
+    """Return the modules that a name stands for: several for a run directory."""
+    if name in known:
+        return [(name, known[name])]
+    path = Path(name)
+    if path.suffix == ".py" and path.is_file():
+        return [(path.stem.replace("_", "-"), FoundModule(path.stem, path))]
+    if not path.is_dir():
+        raise VislamError(f"{no_such('estimator or format', name, known)}, or name a run directory")
+    manifest = read_manifest(path / MANIFEST)
+    inside = (*manifest.estimators, manifest.sequence.format)
+    return [(one, known[one]) for one in inside if one in known]
+
+
+def _entries(module: FoundModule) -> dict[str, str]:
+    given = module.constants().get("CITES", ())
+    found: dict[str, str] = {}
+    for entry in (given,) if isinstance(given, str) else given if isinstance(given, tuple | list) else ():
+        text = str(entry)
+        if text.lstrip().startswith("@"):
+            found |= _parsed(text)
+        elif text in references():
+            found[text] = references()[text]
+        else:
+            raise VislamError(f"{module.path}: {no_such('reference', text, references())}; or give BibTeX, @...")
+    return found
+
+
+@cache
+def references() -> dict[str, str]:
+    """Return the entries of references.bib by key."""
+    return _parsed(files("toolkit.report").joinpath("references.bib").read_text(encoding="utf-8"))
+
+
+def _parsed(text: str) -> dict[str, str]:
+    return {found[1]: found[0].strip() for found in _ENTRY.finditer(text.strip() + "\n")}

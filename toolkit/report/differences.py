@@ -1,0 +1,238 @@
+"""What differs between two run directories: settings, versions, data, how runs ended, and metrics beyond chance.
+
+Over seeds metrics are compared pairwise where both sides read the same recordings, else as independent draws; the tests
+are those of the gate (:mod:`toolkit.gate.paired`, :mod:`toolkit.gate.unpaired`), with Holm's correction over all.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET, to_builtins
+
+from toolkit.estimate import Status
+from toolkit.gate.baseline import Criterion
+from toolkit.gate.paired import ROUNDING, Pairs, Where, holm, moved_p
+from toolkit.gate.unpaired import FEWEST_RUNS, Spread
+from toolkit.geometry import Array
+from toolkit.metrics import Metric, cost, known_metrics
+from toolkit.report.html.run_files import RunFiles, SeedsFiles
+
+Files = RunFiles | SeedsFiles
+FALSE_ALARM_RATE = 0.05
+_SAME = 1e-6
+_FEWEST_PAIRS = 2
+_COSTS = frozenset(metric.key for metric in cost.METRICS)
+# Of a manifest: what is asked for, what it runs with, what is read; the rest is where and when.
+_RUNS_WITH = ("versions", "git_revision", "cpu", "os", "threads")
+_READS = ("sequence", "start", "seeds", "references")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A thing of one name that the two sides have otherwise, as text; "" where one has none."""
+
+    name: str
+    before: str
+    after: str
+
+
+@dataclass(frozen=True)
+class MetricChange:
+    """A metric of one line of the tables: its values, or means over seeds, and whether the change is beyond chance.
+
+    ``p`` is corrected for all tests, None where there are too few runs to tell.
+    """
+
+    estimator: str
+    output: str
+    metric: str
+    before: float | None
+    after: float | None
+    p: float | None
+
+    @property
+    def change_percent(self) -> float | None:
+        """Return by how much it grew; None where a side has no value, or none but zero."""
+        if self.before is None or self.after is None or self.before == 0.0:
+            return None
+        return 100.0 * (self.after / self.before - 1.0)
+
+    @property
+    def moved(self) -> bool:
+        """Say whether the two sides differ by more than rounding."""
+        if self.before is None or self.after is None:
+            return self.before is not self.after
+        return not math.isclose(self.before, self.after, rel_tol=_SAME, abs_tol=1e-12)
+
+    @property
+    def beyond_chance(self) -> bool | None:
+        """Say whether chance is a poor explanation, None where it cannot be told."""
+        return None if self.p is None else self.p <= FALSE_ALARM_RATE
+
+    @property
+    def is_cost(self) -> bool:
+        """Say whether it is time or memory, which no two runs have the same."""
+        return self.metric in _COSTS
+
+
+@dataclass(frozen=True)
+class Differences:
+    """All that differs between two run directories, and every metric of the lines that both have."""
+
+    names: tuple[str, str]
+    settings: tuple[Change, ...]
+    environment: tuple[Change, ...]
+    data: tuple[Change, ...]
+    ends: tuple[Change, ...]
+    metrics: tuple[MetricChange, ...]
+    tests: int
+    paired: bool
+
+    @property
+    def same_results(self) -> bool:
+        """Say whether runs ended alike and every metric but time and memory is the same to a millionth."""
+        return not self.ends and not any(change.moved and not change.is_cost for change in self.metrics)
+
+
+def differences(before: Files, after: Files) -> Differences:
+    """Compare two run directories."""
+    one, two = (to_builtins(files.manifest) for files in (before, after))
+    lines = [_lines(files) for files in (before, after)]
+    both = [key for key in lines[0] if key in lines[1] and not all(_repeats_causal(side, key) for side in lines)]
+    paired = _reads_the_same(before, after)
+    values = [(key, metric) for key in both for metric in known_metrics()]
+    raw = [_tested(lines[0][key], lines[1][key], metric, paired=paired) for key, metric in values]
+    tested = [p for p in raw if p is not None]
+    corrected = iter(holm(np.array(tested)).tolist() if tested else [])
+    changes = []
+    for (key, metric), p in zip(values, raw, strict=True):
+        was, is_ = (side[key].value(metric) for side in lines)
+        changes.append(MetricChange(*key, metric.key, was, is_, None if p is None else next(corrected)))
+    return Differences(
+        (str(before.directory), str(after.directory)),
+        _changes(
+            {key: one.get(key) for key in ("compare", "settings")},
+            {key: two.get(key) for key in ("compare", "settings")},
+        ),
+        _changes({key: one.get(key) for key in _RUNS_WITH}, {key: two.get(key) for key in _RUNS_WITH}),
+        _changes({key: one.get(key) for key in _READS}, {key: two.get(key) for key in _READS}),
+        tuple(_ends(*lines)),
+        tuple(change for change in changes if change.before is not None or change.after is not None),
+        len(tested),
+        paired,
+    )
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One kind of output of one estimator: its status under each seed, and each metric's values, by seed."""
+
+    status: Mapping[int, Status]
+    values: Mapping[str, Mapping[int, float | None]]
+
+    def good(self, metric: Metric) -> dict[int, float]:
+        """Return the values of the runs that ended well, by seed."""
+        given = self.values.get(metric.key, {})
+        return {seed: value for seed, value in given.items() if value is not None and self.status[seed] == "ok"}
+
+    def value(self, metric: Metric) -> float | None:
+        """Return the value of the only run, however it ended, or the mean over those that ended well."""
+        if len(self.status) == 1:
+            return next(iter(self.values.get(metric.key, {}).values()), None)
+        good = list(self.good(metric).values())
+        return float(np.mean(good)) if good else None
+
+
+def _lines(files: Files) -> dict[tuple[str, str], _Line]:
+    if isinstance(files, SeedsFiles):
+        seeds = files.scores.seeds
+        return {
+            (run.estimator, run.output): _Line(
+                dict(zip(seeds, run.status, strict=True)),
+                {key: dict(zip(seeds, metric.values, strict=True)) for key, metric in run.metrics.items()},
+            )
+            for run in files.scores.runs
+        }
+    seed = files.manifest.seeds.sequence
+    return {
+        (run.estimator, run.output): _Line({seed: run.status}, {key: {seed: v} for key, v in run.metrics.items()})
+        for run in files.scores.runs
+    }
+
+
+def _repeats_causal(lines: Mapping[tuple[str, str], _Line], key: tuple[str, str]) -> bool:
+    """Say whether a final line repeats the causal one of its estimator, as a filter's does."""
+    causal = lines.get((key[0], "causal"))
+    if key[1] == "causal" or causal is None:
+        return False
+    given = {
+        metric: values for metric, values in lines[key].values.items() if any(v is not None for v in values.values())
+    }
+    return all(causal.values.get(metric) == values for metric, values in given.items())
+
+
+def _reads_the_same(before: Files, after: Files) -> bool:
+    """Say whether both sides read the same recording under each seed they share; two drawn otherwise are no pairs."""
+    one, two = (
+        dict(zip(files.scores.seeds, files.scores.hashes, strict=True))
+        if isinstance(files, SeedsFiles)
+        else {files.manifest.seeds.sequence: files.scores.sequence.hash}
+        for files in (before, after)
+    )
+    shared = one.keys() & two.keys()
+    return bool(shared) and all(one[seed] == two[seed] for seed in shared)
+
+
+def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> float | None:
+    """Return the p-value that a metric is the same on average, two-sided; None where too few runs tell.
+
+    What is the same under every seed needs no test, and time and memory depend on what else the machines did.
+    """
+    was, is_ = before.good(metric), after.good(metric)
+    if metric.key in _COSTS or was == is_:
+        return None
+    if paired:
+        seeds = sorted(was.keys() & is_.keys())
+        if len(seeds) < _FEWEST_PAIRS:
+            return None
+        sides = (np.array([side[seed] for seed in seeds]) for side in (was, is_))
+        return float(moved_p(Pairs(Where("", "", "", metric.key), Criterion("larger", 0.0), *sides)))
+    if min(len(was), len(is_)) < FEWEST_RUNS:
+        return None
+    spread = Spread.of(_array(was), _array(is_))
+    return min(1.0, 2.0 * min(spread.beyond_p(ROUNDING, sign) for sign in (1.0, -1.0)))
+
+
+def _array(values: Mapping[int, float]) -> Array:
+    return np.array(list(values.values()))
+
+
+def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[Change]:
+    """Yield each line whose runs ended otherwise, or that one side alone has."""
+    for key in dict.fromkeys((*before, *after)):
+        told = [_counts(side[key]) if key in side else "" for side in (before, after)]
+        if told[0] != told[1]:
+            yield Change(" ".join(key), *told)
+
+
+def _counts(line: _Line) -> str:
+    ends = list(line.status.values())
+    return ends[0] if len(ends) == 1 else f"{ends.count('ok')} of {len(ends)} ok"
+
+
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> tuple[Change, ...]:
+    one, two = dict(_flat(before)), dict(_flat(after))
+    names = dict.fromkeys((*one, *two))
+    return tuple(Change(name, one.get(name, ""), two.get(name, "")) for name in names if one.get(name) != two.get(name))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield nested values as texts by their dotted names; what is absent or null is left out."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        elif value is not None and value is not UNSET:
+            yield f"{prefix}{key}", ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

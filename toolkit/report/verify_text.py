@@ -1,0 +1,54 @@
+"""A verification of an estimator for people: what it keeps, what it breaks, and what to do about it; and as JSON."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from toolkit.report.prose import WIDTH, Width, filled
+from toolkit.report.table import Table, as_text
+from toolkit.verify.verification import Result, Verification
+
+
+class CheckRecord(Struct, frozen=True, kw_only=True):
+    """One promise and what came of it."""
+
+    name: str
+    result: Result
+    found: Annotated[str, Meta(description="what broke it, or why it could not be had")]
+    remedy: Annotated[str, Meta(description="what to do; empty where it is kept")]
+
+
+class VerificationRecord(Struct, frozen=True, kw_only=True):
+    """Every promise of an estimator."""
+
+    schema: Literal["vislam.verification/1"]
+    estimator: str
+    passed: bool
+    checks: tuple[CheckRecord, ...]
+
+
+def verification_document(verification: Verification) -> VerificationRecord:
+    """Return a verification as a record."""
+    return VerificationRecord(
+        schema="vislam.verification/1",
+        estimator=verification.estimator,
+        passed=verification.passed,
+        checks=tuple(
+            CheckRecord(name=check.name, result=check.result, found=check.found, remedy=check.remedy)
+            for check in verification.checks
+        ),
+    )
+
+
+def verification_text(verification: Verification, width: Width = WIDTH) -> str:
+    """Return the table of what passed and failed, then each failure with what to do, then the verdict."""
+    rows = tuple((check.name, check.result) for check in verification.checks)
+    lines = [as_text(Table((("promise",), ("result",)), rows, labels=2)), ""]
+    for check in verification.checks:
+        if check.result == "failed":
+            lines += [filled(f"{check.name}: {check.found}", width), filled(check.remedy, width, "  to do: "), ""]
+        elif check.found:
+            lines += [filled(f"{check.name}: {check.found}", width), ""]
+    failed = sum(check.result == "failed" for check in verification.checks)
+    verdict = "keeps every promise" if not failed else f"breaks {failed} of {len(verification.checks)} promises"
+    return "\n".join([*lines, f"{verification.estimator} {verdict}"])

@@ -1,0 +1,231 @@
+"""What must hold of a watched run. Each function returns what is wrong in a sentence, and nothing where all is well."""
+
+from collections.abc import Iterator
+from itertools import zip_longest
+
+import numpy as np
+
+from toolkit.estimate import Estimate, Finished, Run
+from toolkit.estimator import Build
+from toolkit.geometry import Array, IntArray
+from toolkit.metrics._shared.consistency import POSE_DOF, chi2_quantile
+from toolkit.verify.watching import Watched, answers, arrays_of
+
+# Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
+COV_SIZES = (6, 9, 12, 15)
+# Rounding of some hundred products of rotations.
+_ROTATION_TOLERANCE = 1e-12
+# Of the verdict on honesty: how often a consistent estimator is called otherwise.
+_FALSE_ALARM = 1e-3
+
+
+def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> str:
+    """Say at which frame an answer is another one where later packets are withheld."""
+    frames = len(watched.online)
+    for count in counts or (2, frames // 2):
+        early = answers(build, watched.sequence.truncated(count))
+        for k, (said, full) in enumerate(zip(early, watched.online, strict=False)):
+            if difference(said, full):
+                return (
+                    f"its answer to frame {k} is another one where the packets from frame {count} on are withheld: "
+                    f"{difference(said, full)}"
+                )
+    return ""
+
+
+def other_answers(build: Build, watched: Watched) -> str:
+    """Say where a second run over the same packets gives other answers."""
+    estimator = build(watched.setup)
+    for k, (packet, before) in enumerate(zip(watched.packets, watched.online, strict=True)):
+        if found := difference(estimator.step(packet), before):
+            return f"a second run answers otherwise to frame {k}: {found}"
+    found = difference(estimator.finish(), watched.finished)
+    return f"a second run ends otherwise: {found}" if found else ""
+
+
+def other_when_repeated(build: Build, watched: Watched) -> str:
+    """Say where a second run over packets of recordings that end early answers otherwise: both of the above in one run.
+
+    The first two packets come from a recording that ends with them, the others of the first half from one that ends
+    there: nothing of what comes later can be in them. Which of the two promises is broken it does not tell.
+    """
+    counts = (2, len(watched.online) // 2, len(watched.online))
+    cut = [list(watched.sequence.truncated(count).packets()) for count in counts]
+    packets = [packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:]]
+    estimator = build(watched.setup)
+    for k, (packet, before) in enumerate(zip(packets, watched.online, strict=True)):
+        if found := difference(estimator.step(packet), before):
+            return f"a second run answers otherwise to frame {k}: {found}"
+    found = difference(estimator.finish(), watched.finished)
+    return f"a second run ends otherwise: {found}" if found else ""
+
+
+def difference(one: Estimate | Finished | None, other: Estimate | Finished | None) -> str:
+    """Say how two answers differ in any bit; nothing where they are the same."""
+    if (one is None) != (other is None):
+        return "one run answers and the other does not"
+    for left, right in zip_longest(arrays_of(one), arrays_of(other)):
+        if left is None or right is None or left.shape != right.shape:
+            return "other fields or shapes"
+        if not np.array_equal(left, right, equal_nan=True):
+            return f"an array of shape {left.shape} differs by {_largest(left, right):.3g}"
+    if isinstance(one, Estimate) and isinstance(other, Estimate):
+        return _difference_of_info(one, other)
+    return ""
+
+
+def _difference_of_info(one: Estimate, other: Estimate) -> str:
+    ours, theirs = dict(one.info), dict(other.info)
+    same = ours.keys() == theirs.keys() and all(
+        np.array_equal(value, theirs[key], equal_nan=True) for key, value in ours.items()
+    )
+    return "" if same else "its diagnostics (info) differ"
+
+
+def _largest(left: Array, right: Array) -> float:
+    with np.errstate(all="ignore"):
+        return float(np.nanmax(np.abs(left - right), initial=0.0))
+
+
+def changed_later(watched: Watched) -> str:
+    """Say which answer changed after it was given."""
+    for k, (said, copies) in enumerate(zip(watched.online, watched.online_copies, strict=True)):
+        for array, copy in zip(arrays_of(said), copies, strict=True):
+            if not np.array_equal(array, copy, equal_nan=True):
+                return f"its answer to frame {k} changed after it was given, by {_largest(array, copy):.3g}"
+    return ""
+
+
+def touched(watched: Watched) -> str:
+    """Say whether the setup or a packet was written to."""
+    given = (watched.setup, watched.packets)
+    for array, copy in zip(arrays_of(given), watched.given_copies, strict=True):
+        if not np.array_equal(array, copy, equal_nan=True):
+            return f"it wrote into what it was given: an array of shape {array.shape} is another one now"
+    return ""
+
+
+def not_finite(watched: Watched) -> str:
+    """Say at which frame a pose, velocity or bias is no number."""
+    for k, said in enumerate(watched.online):
+        for name in ("T_world_imu", "v_world", "bias"):
+            value = None if said is None else getattr(said, name)
+            if value is not None and not np.isfinite(value).all():
+                return f"{name} of its answer to frame {k} is not finite"
+    trajectory = watched.finished.trajectory
+    for name in ("T_world_imu", "v_world", "bias"):
+        values = getattr(trajectory, name)
+        if values is not None and not np.isfinite(values).all():
+            first = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+            return f"{name} {first} of its final trajectory is not finite"
+    points = watched.finished.landmarks.points_world
+    return "" if np.isfinite(points).all() else "a landmark of its map is not finite"
+
+
+def states_covariance(watched: Watched) -> bool:
+    """Say whether any answer has a covariance."""
+    return any(e is not None and e.cov is not None for e in watched.online) or (
+        watched.finished.trajectory.cov is not None
+    )
+
+
+def unsound_covariance(watched: Watched) -> str:
+    """Say which covariance is not finite, of a wrong size, not symmetric or not positive definite."""
+    for where, cov in _stated(watched):
+        found = covariance_fault(cov, COV_SIZES)
+        if found:
+            return f"the covariance of {where} {found}"
+    landmarks = watched.finished.landmarks
+    for i, cov in enumerate(() if landmarks.cov is None else landmarks.cov):
+        found = covariance_fault(cov, (3,))
+        if found:
+            return f"the covariance of landmark {i} {found}"
+    return ""
+
+
+def _stated(watched: Watched) -> Iterator[tuple[str, Array]]:
+    for k, said in enumerate(watched.online):
+        if said is not None and said.cov is not None:
+            yield f"its answer to frame {k}", said.cov
+    finals = watched.finished.trajectory.cov
+    for k, cov in enumerate(() if finals is None else finals):
+        yield f"its final state {k}", cov
+
+
+def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
+    """Say what is wrong with a covariance (d, d), d one of the sizes; nothing where it is sound.
+
+    Units differ by orders of magnitude: what must be positive definite is the matrix of correlations.
+    """
+    if cov.ndim != 2 or cov.shape[0] != cov.shape[1] or len(cov) not in sizes:
+        return f"has the shape {cov.shape}; expected {' or '.join(f'{n} x {n}' for n in sizes)}"
+    if not np.isfinite(cov).all():
+        return "is not finite"
+    if not np.array_equal(cov, cov.T):
+        return f"is not symmetric: it differs from its transpose by {_largest(cov, cov.T):.3g}"
+    variances = np.diagonal(cov)
+    if (variances <= 0.0).any():
+        return f"has the variance {variances.min():.3g} in row {int(variances.argmin())}"
+    sigmas = np.sqrt(variances)
+    least = float(np.linalg.eigvalsh(cov / np.outer(sigmas, sigmas))[0])
+    return "" if least > 0.0 else f"is not positive definite: its least eigenvalue is {least:.3g} times its scale"
+
+
+def no_rotation(watched: Watched) -> str:
+    """Say which pose has a rotation that is none."""
+    poses = [said.T_world_imu for said in watched.online if said is not None]
+    stacked = np.concatenate([np.array(poses).reshape(-1, 4, 4), watched.finished.trajectory.T_world_imu])
+    rotations = stacked[:, :3, :3]
+    with np.errstate(all="ignore"):
+        off = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero(~(off < _ROTATION_TOLERANCE))
+    return (
+        "" if not bad.size else f"{bad.size} of {len(stacked)} rotations are none: R R^T is off by {off[bad].max():.3g}"
+    )
+
+
+def wrong_stamps(watched: Watched) -> str:
+    """Say where answers miss a frame, or have the stamp of another one."""
+    frames_t_ns = watched.sequence.frames_t_ns
+    silent = sum(said is None for said in watched.online)
+    if silent not in (0, len(watched.online)):
+        return f"it answers at {len(watched.online) - silent} of {len(watched.online)} frames; answer at each, or none"
+    for k, said in enumerate(watched.online):
+        if said is not None and said.t_ns != frames_t_ns[k]:
+            return f"its answer to frame {k} has the stamp {said.t_ns} ns, the frame has {frames_t_ns[k]} ns"
+    final = watched.finished.trajectory
+    if not np.array_equal(final.t_ns, frames_t_ns) or final.T_world_imu.shape != (frames_t_ns.size, 4, 4):
+        return (
+            f"its final trajectory has {len(final)} states, and there are {frames_t_ns.size} frames with their stamps"
+        )
+    return ""
+
+
+def gave_up(run: Run, frames_t_ns: IntArray) -> str:
+    """Say why a run is not one that went on to the end: it may say that it diverged, and why, and nothing else."""
+    if run.status not in ("ok", "diverged"):
+        return run.log[0] if run.log else f"it {run.status}"
+    if run.status != "ok" and not run.log:
+        return "it diverged and does not say why"
+    if run.final is None:
+        return "it has no final trajectory"
+    for output, trajectory in (("causal", run.causal), ("final", run.final)):
+        if trajectory is not None and not np.array_equal(trajectory.t_ns, frames_t_ns):
+            return f"its {output} trajectory has {len(trajectory)} states, and there are {frames_t_ns.size} frames"
+        if trajectory is not None and not np.isfinite(trajectory.T_world_imu).all():
+            return f"its {output} trajectory is not finite"
+    return ""
+
+
+def dishonest(nees_means: list[float]) -> str:
+    """Say whether mean pose NEES over 6, one a run, show too much or too little certainty, by more than chance.
+
+    The band is for poses of a run that share one error, the worst case, and holds 99.9 % of consistent estimators.
+    """
+    dof = POSE_DOF * len(nees_means)
+    low, high = (chi2_quantile(p, dof) / dof for p in (0.5 * _FALSE_ALARM, 1.0 - 0.5 * _FALSE_ALARM))
+    mean = float(np.mean(nees_means))
+    if low <= mean <= high:
+        return ""
+    how = "too sure of itself" if mean > high else "less sure of itself than it could be"
+    return f"it is {how}: mean pose NEES {mean:.3g}, and {low:.2f} to {high:.2f} holds 99.9 % of consistent estimators"

@@ -1,0 +1,69 @@
+"""Anybody's estimator: by its name where it is installed, or by the file or the module that defines it."""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import cast
+
+from toolkit.errors import EstimatorError, no_such, printable
+from toolkit.estimator import Build, discover
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An estimator to verify: its name, and what loads its ``build``."""
+
+    name: str
+    load: Callable[[], Build]
+
+
+def subject_of(word: str) -> Subject:
+    """Return the estimator that a word names: ``my_filter.py``, ``my_package.my_filter`` or ``ekf``.
+
+    Loading it raises EstimatorError where the file cannot be imported or has no function ``build(setup)``. Raises
+    EstimatorError where the word names nothing.
+    """
+    if word.endswith(".py"):
+        path = Path(word)
+        if not path.is_file():
+            raise EstimatorError(f"{path}: there is no such file")
+        return Subject(printable(path.stem.replace("_", "-")), lambda: _build_of(lambda: _imported(path), word))
+    known = discover()
+    if word in known:
+        return Subject(word, known[word].load)
+    if "." in word:
+        name = word.rpartition(".")[2].replace("_", "-")
+        return Subject(name, lambda: _build_of(lambda: importlib.import_module(word), word))
+    raise EstimatorError(f"{no_such('estimator', word, known)}; a file ends in .py")
+
+
+def _imported(path: Path) -> ModuleType:
+    """Import a file as a module of its own, which may import what stands beside it."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    folder = str(path.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    # As any import does, for dataclasses look their module up there.
+    sys.modules.setdefault(path.stem, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _build_of(imported: Callable[[], ModuleType], word: str) -> Build:
+    try:
+        module = imported()
+    except EstimatorError:
+        raise
+    except Exception as error:
+        where = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+        raise EstimatorError(f"{word}{where}: it cannot be imported ({type(error).__name__}: {error})") from error
+    if not callable(getattr(module, "build", None)):
+        raise EstimatorError(f"{word}: it defines no function build(setup)")
+    return cast(Build, module.build)

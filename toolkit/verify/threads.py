@@ -1,0 +1,81 @@
+"""One thread and two say the same bits: what a report shows can be repeated anywhere.
+
+The number of threads is settled when the numeric libraries are loaded, so each number has a process of its own:
+``python -m toolkit.verify.threads 2 ekf my_filter.py`` prints a digest of all that each said on each scenario.
+"""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+from toolkit import runner
+from toolkit.errors import EstimatorError
+from toolkit.progress import SILENT
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.verify.subject import subject_of
+from toolkit.verify.watching import arrays_of
+
+UNAVAILABLE = "unavailable"
+_DURATION_S, _SEED = 0.8, 4
+_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_TIMEOUT_S = 600
+
+
+def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
+    """Run estimators in a process of so many threads; return a digest of all each said, by "NAME on SCENARIO".
+
+    Raises EstimatorError where the process does not end well.
+    """
+    # Idle threads sleep at once: spinning, they starve a busy machine.
+    environment = os.environ | dict.fromkeys(_LIMITS, str(threads)) | {"OPENBLAS_THREAD_TIMEOUT": "4"}
+    words = [sys.executable, "-m", __name__, str(threads), *estimators]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=_TIMEOUT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise EstimatorError(f"with {threads} threads it did not end within {_TIMEOUT_S} s") from error
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
+        raise EstimatorError(f"with {threads} threads its process ended: {last[0]}")
+    said: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    return said
+
+
+def other_bits(estimator: str) -> str:
+    """Say on which scenario an estimator says other bits with two threads than with one; nothing where nowhere."""
+    one, two = (digests_at(threads, (estimator,)) for threads in (1, 2))
+    differing = [key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest]
+    return f"with two threads it says other bits than with one, on {', '.join(differing)}" if differing else ""
+
+
+def _digests(estimators: list[str]) -> dict[str, str]:
+    said = {}
+    for scenario in (DRIVE, FLIGHT):
+        sequence = simulate(replace(scenario, duration_s=_DURATION_S), _SEED)
+        assert sequence.prior is not None
+        for word in estimators:
+            subject = subject_of(word)
+            try:
+                run = runner.run(subject.name, subject.load(), sequence, sequence.prior, SILENT)
+            except EstimatorError:
+                said[f"{word} on {sequence.name}"] = UNAVAILABLE
+                continue
+            digest = hashlib.sha256()
+            for part in (run.causal, run.final, run.landmarks):
+                for array in arrays_of(part):
+                    digest.update(array.tobytes())
+            said[f"{word} on {sequence.name}"] = digest.hexdigest()
+    return said
+
+
+def main(words: list[str]) -> None:
+    """Print the digests of the estimators named behind the number of threads."""
+    if hasattr(os, "sched_setaffinity"):  # what GTSAM's pool goes by
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(words[0])])
+    print(json.dumps(_digests(words[1:])))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

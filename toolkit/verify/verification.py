@@ -1,0 +1,210 @@
+"""Every promise of one estimator, one after the other: passed, failed with what to do, or not to be had."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from toolkit import runner
+from toolkit.errors import EstimatorError
+from toolkit.estimator import Build
+from toolkit.metrics import Evaluation, Unavailable
+from toolkit.metrics._shared.consistency import nees_over_time
+from toolkit.progress import SILENT, Progress
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, simulate
+from toolkit.verify import promises
+from toolkit.verify.subject import Subject
+from toolkit.verify.threads import other_bits
+from toolkit.verify.trouble import SEED, deaths, short
+from toolkit.verify.watching import Watched, watch
+
+Result = Literal["passed", "failed", "not applicable"]
+SCENARIOS: tuple[Scenario, ...] = (short(DRIVE, 4.0), short(DRIVE_IMU, 4.0), short(FLIGHT, 2.0))
+SEEDS, _NEES_DURATION_S = 8, 10.0
+_FEWEST_NEES = 2
+
+
+@dataclass(frozen=True)
+class Check:
+    """One promise: what it is, what came of it, what was found, and what to do where it is broken."""
+
+    name: str
+    result: Result
+    found: str = ""
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """All checks of one estimator."""
+
+    estimator: str
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Say whether no promise is broken."""
+        return all(check.result != "failed" for check in self.checks)
+
+
+# What holds of one watched run: the promise, what says that it is broken, and what to do.
+_Of = Callable[[Build, Watched], str]
+_OF_A_RUN: tuple[tuple[str, _Of, str], ...] = (
+    (
+        "poses, velocities and biases are numbers",
+        lambda _, watched: promises.not_finite(watched),
+        "look for a division by zero, a logarithm or square root of less than zero, an inverse of a singular matrix; "
+        "raise EstimatorError where it cannot go on",
+    ),
+    (
+        "rotations are rotations",
+        lambda _, watched: promises.no_rotation(watched),
+        "compose with se3_exp, so3_exp and products of rotations; project onto SO(3) after many of them",
+    ),
+    (
+        "an answer at each frame, with its stamp",
+        lambda _, watched: promises.wrong_stamps(watched),
+        "answer with packet.frame.t_ns at every step, or with None at every one; finish() has a state for each frame",
+    ),
+    (
+        "causal: later packets change no earlier answer",
+        promises.look_ahead,
+        "use what step() was given so far alone: no packets kept from another run, no base of an array that reaches "
+        "into later frames",
+    ),
+    (
+        "deterministic: a second run says the same bits",
+        promises.other_answers,
+        "seed every random number in build(); keep nothing in the module or the class between runs",
+    ),
+    (
+        "an answer does not change after it was given",
+        lambda _, watched: promises.changed_later(watched),
+        "return a copy of the state, not the array that the next step writes into",
+    ),
+    (
+        "setup and packets stay untouched",
+        lambda _, watched: promises.touched(watched),
+        "copy an array before writing into it",
+    ),
+)
+_COVARIANCE = "covariances are finite, symmetric, positive definite"
+_COVARIANCE_REMEDY = (
+    "update in Joseph's form, P = (I - KH) P (I - KH)^T + K R K^T, and symmetrise; the pose comes first, rotation "
+    "before position, in the body frame"
+)
+_NO_COVARIANCE = "it states no covariance"
+_NEES = f"honest: pose NEES over {SEEDS} seeds"
+_NEES_REMEDY = (
+    "above the band it is too sure: more process noise, landmarks whose errors are correlated with the pose, or "
+    "Jacobians at first estimates; below it, less noise than stated; see docs/metrics.md"
+)
+_RUNS_REMEDY = "see the line named; raise EstimatorError, with the reason, where it cannot go on"
+_THREADS = "one thread and two say the same bits"
+_THREADS_REMEDY = "sum in a fixed order; leave no result to which thread is first"
+_TROUBLE = "it goes on through every planted fault"
+_TROUBLE_REMEDY = (
+    "expect frames without sightings, negative disparities, gross outliers; recover and say so in Finished(log=...)"
+)
+
+
+def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verification:
+    """Check every promise of an estimator, which ``word`` names in a process of its own.
+
+    Raises EstimatorError where it cannot be loaded.
+    """
+    build, steps = subject.load(), len(SCENARIOS) + 3
+    with warnings.catch_warnings(), np.errstate(all="ignore"):  # what they would say, the checks say
+        warnings.simplefilter("ignore")
+        watched: list[Watched] = []
+        raised = ""
+        for i, scenario in enumerate(SCENARIOS):
+            progress.advance(i, steps, "runs")
+            try:
+                watched.append(watch(build, simulate(scenario, SEED)))
+            except Exception as error:  # anybody's code, which may raise anything
+                raised = raised or f"{scenario.name}: {_told(error)}"
+        checks = [Check("it runs to the end", "failed" if raised else "passed", raised, _RUNS_REMEDY if raised else "")]
+        checks += _of_runs(build, watched) if watched else []
+        if watched:
+            progress.advance(len(SCENARIOS), steps, "NEES")
+            checks.append(_honest(subject.name, build))
+            progress.advance(len(SCENARIOS) + 1, steps, "threads")
+            checks.append(_threads(word))
+            progress.advance(len(SCENARIOS) + 2, steps, "faults")
+            checks.append(_trouble(subject.name, build))
+    return Verification(subject.name, tuple(checks))
+
+
+def _of_runs(build: Build, watched: list[Watched]) -> Iterator[Check]:
+    for name, broken, remedy in _OF_A_RUN:
+        yield _check(name, remedy, partial(_first, watched, partial(broken, build)))
+    if any(promises.states_covariance(one) for one in watched):
+        yield _check(_COVARIANCE, _COVARIANCE_REMEDY, lambda: _first(watched, promises.unsound_covariance))
+    else:
+        yield Check(_COVARIANCE, "not applicable", _NO_COVARIANCE)
+
+
+def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
+    """Return the first complaint about any of the runs, with its scenario."""
+    for one in watched:
+        if found := broken(one):
+            return f"{one.sequence.name}: {found}"
+    return ""
+
+
+def _check(name: str, remedy: str, find: Callable[[], str]) -> Check:
+    try:
+        found = find()
+    except Exception as error:  # anybody's code, which may raise anything
+        found = _told(error)
+    return Check(name, "failed", found, remedy) if found else Check(name, "passed")
+
+
+def _told(error: Exception) -> str:
+    if isinstance(error, EstimatorError):
+        return str(error)
+    frames = error.__traceback__
+    while frames is not None and frames.tb_next is not None:
+        frames = frames.tb_next
+    where = "" if frames is None else f" in line {frames.tb_lineno} of {frames.tb_frame.f_code.co_name}"
+    return f"{type(error).__name__}{where}: {error}"
+
+
+def _honest(name: str, build: Build) -> Check:
+    """Judge the mean NEES of several draws, causal where there is a causal output."""
+    scenario, means = short(DRIVE, _NEES_DURATION_S), list[float]()
+    why = _NO_COVARIANCE
+    for seed in range(SEEDS):
+        sequence = simulate(scenario, seed)
+        assert sequence.prior is not None
+        run = runner.run(name, build, sequence, sequence.prior, SILENT)
+        output: Literal["causal", "final"] = "final" if run.causal is None else "causal"
+        if run.trajectory(output) is None:
+            why = run.log[0] if run.log else "it gave no trajectory"
+            continue
+        try:
+            means.append(float(nees_over_time(Evaluation(run, output, sequence)).pose.mean()))
+        except Unavailable as lacking:
+            why = str(lacking)
+    if len(means) < _FEWEST_NEES:
+        return Check(_NEES, "not applicable", why)
+    found = promises.dishonest(means)
+    if not found and len(means) < SEEDS:
+        found = f"{SEEDS - len(means)} of {SEEDS} seeds have none: {why}"
+    return Check(_NEES, "failed", found, _NEES_REMEDY) if found else Check(_NEES, "passed", f"{np.mean(means):.2f}")
+
+
+def _threads(word: str) -> Check:
+    return _check(_THREADS, _THREADS_REMEDY, lambda: other_bits(word))
+
+
+def _trouble(name: str, build: Build) -> Check:
+    def told() -> str:
+        found = deaths(name, build)
+        return "; ".join(f"{trouble}: {why}" for trouble, why in found.items())
+
+    return _check(_TROUBLE, _TROUBLE_REMEDY, told)
