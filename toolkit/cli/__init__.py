@@ -11,7 +11,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-from toolkit.cli import baseline, check, check_data, compare, export, list_parts, report, simulate, tracks
+from toolkit.cli import (
+    baseline,
+    check,
+    check_data,
+    compare,
+    export,
+    import_tables,
+    list_parts,
+    report,
+    simulate,
+    tracks,
+)
 from toolkit.cli.arguments import Parser, ShowVersion, epilog
 from toolkit.errors import OutputError, VislamError, printable
 
@@ -38,7 +49,7 @@ def parser() -> Parser:
     )
     root.add_argument("--version", action=ShowVersion, help="print the version and exit")
     subcommands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in (compare, report, export, check, baseline, check_data, list_parts, simulate, tracks):
+    for module in (compare, report, export, check, baseline, check_data, list_parts, simulate, tracks, import_tables):
         module.add_to(subcommands)
     return root
 

@@ -153,6 +153,38 @@ def positive_seconds(text: str) -> float:
     return value
 
 
+def seconds_from_start(text: str) -> float:
+    """Parse a time since a recording's start, as in 10s, 500ms, 2min or 10."""
+    number = text.strip()
+    for unit, factor in (("min", 60.0), ("ms", 1e-3), ("s", 1.0)):
+        if number.endswith(unit):
+            return factor * _seconds_at_least_zero(number.removesuffix(unit), text)
+    return _seconds_at_least_zero(number, text)
+
+
+def _seconds_at_least_zero(number: str, text: str) -> float:
+    try:
+        value = float(number)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a time since the start, not {text}")
+    return value
+
+
+def add_part_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says which frames of a recording are used."""
+    after = "after the first frame, as in 10s"
+    parser.add_argument(
+        "--from", dest="from_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames before it, {after}"
+    )
+    parser.add_argument(
+        "--to", dest="to_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames behind it, {after}"
+    )
+    parser.add_argument("--every", metavar="N", type=at_least(1), help="use one frame in N")
+    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N of these frames only")
+
+
 def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the names of estimators, with what they are named for."""
     parser.add_argument(
