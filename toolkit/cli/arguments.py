@@ -238,6 +238,31 @@ def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes
     parser.add_argument("--workers", metavar="N", type=at_least(1, MOST_WORKERS), help=f"{what} (default: one a CPU)")
 
 
+# Repeated from toolkit.datasets.io.bag_topics (a test compares them), which would cost the help a third of a second.
+TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "twist", "truth")
+
+
+def topics(text: str) -> str:
+    """Parse ROLE=TOPIC,..., the topics of a bag."""
+    for part in text.split(","):
+        role, equals, name = (word.strip() for word in part.partition("="))
+        if not (equals and name):
+            raise argparse.ArgumentTypeError(f"expected ROLE=TOPIC,..., as in imu=/imu0, not {part.strip()!r}")
+        if role not in TOPIC_ROLES:
+            raise argparse.ArgumentTypeError(no_such("role", role, TOPIC_ROLES))
+    return text
+
+
+def add_topics_argument(parser: argparse.ArgumentParser) -> None:
+    """Add which topics of a bag are what; read it with :func:`with_tracks`."""
+    parser.add_argument(
+        "--topics",
+        metavar="ROLE=TOPIC,...",
+        type=topics,
+        help=f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
+    )
+
+
 def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
     """Add where tracks come from; read it with :func:`with_tracks`."""
     parser.add_argument(
@@ -246,15 +271,14 @@ def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
         help="of a recording with images and truth: made of the images, or simulated along the truth (default: auto, "
         "of the images where nearly all are there)",
     )
+    add_topics_argument(parser)
 
 
 def with_tracks(values: Mapping[str, Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the nested values of settings with --tracks put in where it was given."""
-    if options.tracks is None:
-        return dict(values)
-    from toolkit.settings import with_assignments
-
-    return with_assignments(values, (f"frontend.tracks={options.tracks}",))
+    """Return the nested values of settings with --tracks and --topics put in where they were given."""
+    given = {"tracks": getattr(options, "tracks", None), "topics": options.topics}
+    frontend = {key: value for key, value in given.items() if value is not None}
+    return {**values, "frontend": {**values.get("frontend", {}), **frontend}} if frontend else dict(values)
 
 
 def add_repair_arguments(parser: argparse.ArgumentParser) -> None:

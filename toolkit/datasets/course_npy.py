@@ -81,7 +81,7 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
     return tracks == "images" or (is_regular(_beside(path)) and _FEATURES not in read_dict(path))
 
 
-def images_of(path: Path) -> ImageRecording:
+def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs and their cameras; raises DataError where there are none or not one a stamp."""
     parts = _parts(path)
     spool = ImageSpool()

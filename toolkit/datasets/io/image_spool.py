@@ -39,7 +39,7 @@ class ImageSpool:
         """Write the content of an image file and return its path; raises OutputError where that cannot be."""
         path = self.folder / name
         try:
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
         except OSError as error:
             raise _unwritable(error) from error
