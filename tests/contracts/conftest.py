@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,9 +21,10 @@ Files = dict[str, bytes]
 
 
 @pytest.fixture(scope="session")
-def originals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Files]:
-    """Return a small valid recording, or trajectory, of every format by name."""
-    return valid_files(tmp_path_factory.mktemp("workshop")) | valid_trajectories()
+def original(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Files]:
+    """Return a function that gives a small valid recording, or trajectory, of a format by its name."""
+    made = valid_files(tmp_path_factory.mktemp("workshop")) | valid_trajectories()
+    return lambda name: made[name]
 
 
 def valid_files(workshop: Path) -> dict[str, Files]:

@@ -27,7 +27,7 @@ from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.io import bag_reader
 from toolkit.datasets.io.bag_topics import ROLES
 from toolkit.errors import DataError
-from toolkit.measured_motion import TwistSamples
+from toolkit.measured_motion import ImuNoise, TwistSamples
 from toolkit.models.noise import mems_imu
 from toolkit.settings import Frontend
 
@@ -221,6 +221,10 @@ def test_a_bag_that_brings_its_calibration_needs_no_file_beside_it(asl: Path, tm
     assert bag.noise == mems_imu()
     assert any(fact.startswith("no noise of the IMU is stated") for fact in bag.provenance.facts)
     assert bag.truth is None
+    keys = ("accelerometer_noise_density", "gyroscope_noise_density")
+    keys += ("accelerometer_random_walk", "gyroscope_random_walk")
+    (tmp_path / "imu.yaml").write_text("imu0:\n" + "".join(f"  {key}: 0.0{i + 1}\n" for i, key in enumerate(keys)))
+    assert load_sequence(str(path)).noise == ImuNoise(0.01, 0.02, 0.03, 0.04)
 
 
 def test_an_odometer_stands_for_the_motion_where_there_is_no_imu(asl: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from toolkit.datasets.io import bag_reader, ros_values
 from toolkit.datasets.io.bag_reader import COMPRESSED, Bag, Topic
 from toolkit.datasets.io.bag_topics import Chosen, choose
-from toolkit.datasets.io.euroc_calibration import read_calibration
+from toolkit.datasets.io.euroc_calibration import kalibr_noise, read_calibration
 from toolkit.datasets.io.fields import check_frame_count, observations
 from toolkit.datasets.io.image_pairs import facts_of, images_only, pairs_of_asl, rig_of
 from toolkit.datasets.io.image_spool import ImageSpool
@@ -38,6 +38,7 @@ from toolkit.settings import DEFAULTS, Frontend
 
 _NO_NOISE = "no noise of the IMU is stated: that of a MEMS unit in motion is taken (noise.motion_scale scales it)"
 
+_STATED = "the noise of the IMU is as its file states it"
 _PUT_BESIDE = "put Kalibr's camchain.yaml or an ASL folder's cam0/sensor.yaml beside the bag"
 
 uses_images = images_only
@@ -224,20 +225,26 @@ def _mounted(source: _Source, motion: MotionSamples) -> _Mounted:
             f"{source.frames.body!r} and {source.frames.left!r}; {_PUT_BESIDE}"
         )
     pair, how = _pair(source)
-    told = (f"calibration from {how} and /tf_static", *(() if twist else (_NO_NOISE,)))
-    return _Mounted(pair, T_imu_left, twist or mems_imu(), told)
+    stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
+    told = (f"calibration from {how} and /tf_static", *(() if twist else (_NO_NOISE if stated is None else _STATED,)))
+    return _Mounted(pair, T_imu_left, twist or stated or mems_imu(), told)
 
 
 def _calibration_folder(path: Path) -> tuple[Path, Path] | None:
     """Return the folder of calibration files beside a bag, or in the folder that it is, and that of its sensors."""
-    resolved = path.resolve()
-    for root in (resolved, resolved.parent) if resolved.is_dir() else (resolved.parent,):
+    for root in _folders_beside(path):
         if any(root.glob("*camchain*.yaml")):
             return root, root
         for mav0 in (root, root / "mav0"):
             if is_regular(mav0 / "cam0/sensor.yaml"):
                 return root, mav0
     return None
+
+
+def _folders_beside(path: Path) -> tuple[Path, ...]:
+    """Return where files about a bag may lie: in the folder that it is, and in that where it is."""
+    resolved = path.resolve()
+    return (resolved, resolved.parent) if resolved.is_dir() else (resolved.parent,)
 
 
 def _pair(source: _Source) -> tuple[RectifiedPair, str]:
