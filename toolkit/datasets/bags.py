@@ -113,6 +113,8 @@ def _read(path: Path, topics: str | None, spool: ImageSpool, progress: Progress)
         chosen = choose(path, bag.topics, topics)
         small = _small(bag, chosen)
         motion = _motion(path, chosen, small)
+        if not motion.t_ns.size:
+            raise DataError(f"{path}: {chosen.imu or chosen.twist} has no message; name another topic with --topics")
         tree = ros_values.Tree(_transforms(small, chosen))
         frames = _Frames.of(chosen, small)
         mounted = _mounted(_Source(path, chosen, small, tree, frames), motion)

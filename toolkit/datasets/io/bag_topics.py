@@ -1,7 +1,7 @@
 """Which topics of a bag are what: as asked for with ``--topics``, else guessed from their types and names."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from toolkit.datasets.io.bag_reader import (
@@ -50,7 +50,7 @@ class Chosen:
     twist: Topic | None
     truth: Topic | None
     transforms: tuple[Topic, ...]
-    facts: tuple[str, ...]
+    facts: tuple[str, ...] = ()
 
     @property
     def rectified(self) -> bool:
@@ -63,18 +63,20 @@ def choose(path: Path, topics: Sequence[Topic], asked: str | None) -> Chosen:
     given = _asked(path, topics, asked)
     usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
     left, right = _pair(path, topics, usable, given)
-    found: dict[str, Topic | None] = {
-        "left": left,
-        "right": right,
-        "left_info": given.get("left_info") or _info(usable, left),
-        "right_info": given.get("right_info") or _info(usable, right),
-        "imu": given.get("imu") or (None if "twist" in given else _most(_of_types(usable, (IMU,)))),
-    }
-    found["truth"] = given.get("truth") or _truth(usable)
-    odometry = [topic for topic in _of_types(usable, (ODOMETRY,)) if topic != found["truth"]]
-    found["twist"] = given.get("twist") or (None if found["imu"] else _most(odometry))
-    transforms = tuple(topic for topic in _of_types(usable, (TRANSFORMS,)) if topic.name.endswith(_STATIC))
-    return Chosen(**found, transforms=transforms, facts=_facts(topics, found, given, transforms))  # type: ignore[arg-type]
+    truth = given.get("truth") or _truth(usable)
+    imu = given.get("imu") or (None if "twist" in given else _most(_of_types(usable, (IMU,))))
+    odometry = [topic for topic in _of_types(usable, (ODOMETRY,)) if topic != truth]
+    chosen = Chosen(
+        left=left,
+        right=right,
+        left_info=given.get("left_info") or _info(usable, left),
+        right_info=given.get("right_info") or _info(usable, right),
+        imu=imu,
+        twist=given.get("twist") or (None if imu else _most(odometry)),
+        truth=truth,
+        transforms=tuple(topic for topic in _of_types(usable, (TRANSFORMS,)) if topic.name.endswith(_STATIC)),
+    )
+    return replace(chosen, facts=_facts(topics, chosen, given))
 
 
 def _asked(path: Path, topics: Sequence[Topic], asked: str | None) -> dict[str, Topic]:
@@ -161,16 +163,11 @@ def _most(topics: Iterable[Topic]) -> Topic | None:
     return max(sorted(topics, key=lambda topic: topic.name), key=lambda topic: topic.count, default=None)
 
 
-def _facts(
-    topics: Sequence[Topic], found: dict[str, Topic | None], given: dict[str, Topic], transforms: tuple[Topic, ...]
-) -> tuple[str, ...]:
+def _facts(topics: Sequence[Topic], chosen: Chosen, given: dict[str, Topic]) -> tuple[str, ...]:
     """Return which topics are what, said or guessed, and those that are not used."""
-    named = [
-        f"{role} {topic.name}{'' if role in given else ' (guessed)'}"
-        for role, topic in found.items()
-        if topic is not None
-    ]
-    used = {topic.name for topic in (*found.values(), *transforms) if topic is not None}
+    found = {role: topic for role in ROLES if (topic := getattr(chosen, role)) is not None}
+    named = [f"{role} {topic.name}{'' if role in given else ' (guessed)'}" for role, topic in found.items()]
+    used = {topic.name for topic in (*found.values(), *chosen.transforms)}
     left_out = [str(topic) for topic in topics if topic.name not in used]
     facts = [f"topics: {', '.join(named)}"]
     if left_out:
