@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from toolkit.api import Result, compare
     from toolkit.datasets import load_sequence
+    from toolkit.datasets.own_tables import save
     from toolkit.settings import Settings
 
-__all__ = ["Result", "Settings", "compare", "load_sequence"]
+__all__ = ["Result", "Settings", "compare", "load_sequence", "save"]
 
 _HOME = {
     "Result": "toolkit.api",
     "Settings": "toolkit.settings",
     "compare": "toolkit.api",
     "load_sequence": "toolkit.datasets",
+    "save": "toolkit.datasets.own_tables",
 }
 
 

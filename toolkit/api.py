@@ -22,6 +22,7 @@ from toolkit.estimator import Build, defaults
 from toolkit.experiment import Comparison, Plan, Record
 from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
+from toolkit.experiment.recording import Part
 from toolkit.progress import silent
 from toolkit.report.table import Table, as_markdown, as_text, columns_asked, comparison_table
 from toolkit.sequence import Sequence
@@ -42,6 +43,9 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     truth: str | Path | None = None,
     trajectories: Mapping[str, str | Path] | None = None,
     max_frames: int | None = None,
+    from_s: float = 0.0,
+    to_s: float | None = None,
+    every: int = 1,
     keep: Names = (),
     seed: int | None = None,
     seeds: int | None = None,
@@ -74,6 +78,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         trajectories={name: Path(file) for name, file in (trajectories or {}).items()},
         keep=frozenset(_names(keep)),
         max_frames=max_frames,
+        part=Part(from_s, to_s, every),
         workers=workers,
         scheduler=scheduler,
     )

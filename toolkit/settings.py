@@ -196,6 +196,10 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
         Tracks,
         Meta(description="where a recording with images has its tracks from; auto: images, where nearly all are there"),
     ] = "auto"
+    topics: Annotated[
+        str | None,
+        Meta(description="of a bag, as in left=/cam0/image_raw,imu=/imu0; what is not said is guessed from names"),
+    ] = None
     max_tracks: Annotated[int, Meta(ge=20, le=2000, description="stereo tracks a frame at most")] = 200
     spacing_px: Annotated[
         float,

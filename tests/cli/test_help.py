@@ -8,9 +8,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from toolkit.cli import simulate
+from toolkit.datasets import load_sequence
+from toolkit.datasets.trajectories import tum
+from toolkit.estimate import Trajectory
 
 COMMANDS = (
     "",
@@ -28,6 +32,7 @@ COMMANDS = (
     "cite",
     "simulate",
     "tracks",
+    "import",
     "verify",
     "completion",
 )
@@ -71,12 +76,31 @@ def test_help_has_an_example_and_the_exit_statuses(helps: dict[str, str], comman
 def test_examples_in_help_run(
     helps: dict[str, str], command: str, vislam: Callable[..., int], kitti_drive: Path
 ) -> None:
+    if command == "import":
+        write_tables(Path())
     if command == "tracks":
         shutil.copytree(kitti_drive, "kitti/sequences/06")
     examples = re.findall(r"^  \$ vislam (.*)$", helps[command], flags=re.MULTILINE)
     assert examples
     for example in examples:
         assert vislam(*shlex.split(example)) == 0, example
+
+
+def write_tables(folder: Path) -> None:
+    """Write a few frames of the drive as tables of one's own."""
+    drive = load_sequence("drive").truncated(4)
+    rig, seen, motion, truth = drive.rig, drive.observations, drive.motion, drive.truth
+    assert truth is not None
+    tracks = np.column_stack([drive.frames_t_ns[seen.frame], seen.track_id, seen.uv_px]).tolist()
+    twists = np.column_stack([motion.t_ns, motion.values]).tolist()
+    tables = {"tracks": ("t_ns,track_id,uL,uR,v", tracks), "twist": ("t_ns,vx,vy,vz,wx,wy,wz", twists)}
+    for name, (heading, rows) in tables.items():
+        lines = [heading, *(",".join([f"{row[0]:.0f}", *map(repr, row[1:])]) for row in rows)]
+        (folder / f"{name}.csv").write_text("\n".join(lines))
+    numbers = {key: getattr(rig, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")}
+    values = {**numbers, "T_imu_cam": rig.T_imu_cam.tolist()}
+    (folder / "rig.toml").write_text("".join(f"{key} = {value}\n" for key, value in values.items()))
+    (folder / "truth.tum").write_text(tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
 
 
 def test_the_scenarios_offered_are_those_there_are() -> None:

@@ -281,3 +281,24 @@ def test_another_programs_file_of_the_same_name_is_not_lost(tmp_path: Path, driv
     with pytest.raises(OutputError, match=r"recording\.json"):
         vislam_recording.save(drive, tmp_path)
     assert (tmp_path / "recording.json").read_text() == '{"tracks": 4}'
+
+
+@pytest.mark.parametrize("facts", [[["nested"]], [3], [None]])
+def test_facts_that_are_no_text_are_refused(drive: Sequence, tmp_path: Path, facts: list[Any]) -> None:
+    folder = tmp_path / "drive"
+    vislam_recording.save(drive, folder)
+    text = json.loads((folder / "recording.json").read_text())
+    text["provenance"]["facts"] = facts
+    (folder / "recording.json").write_text(json.dumps(text))
+    with pytest.raises(DataError, match="provenance holds what is no text"):
+        vislam_recording.load(folder)
+
+
+def test_numbers_with_an_imaginary_part_are_refused(drive: Sequence, tmp_path: Path) -> None:
+    folder = tmp_path / "drive"
+    vislam_recording.save(drive, folder)
+    with np.load(folder / "recording.npz") as archive:
+        arrays = dict(archive)
+    np.savez(folder / "recording.npz", **(arrays | {"motion_values": arrays["motion_values"].astype(complex)}))
+    with pytest.raises(DataError, match="motion_values holds complex128, expected real numbers"):
+        vislam_recording.load(folder)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import load_sequence
+from toolkit.errors import DataError
 from toolkit.experiment import Plan
-from toolkit.experiment.recording import Recording, prepare
-from toolkit.measured_motion import ImuNoise, MotionNoise, TwistNoise
+from toolkit.experiment.recording import Part, Recording, prepare
+from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.settings import DEFAULTS, Noise, SettingsError, settings_of
 
 
@@ -64,6 +65,37 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     seconds = prepare(Recording(whole, duration_s=1.0))
     t_ns = seconds.sequence.frames_t_ns
     assert t_ns[-1] - t_ns[0] <= 10**9 < whole.frames_t_ns[t_ns.size] - t_ns[0]
+
+
+def test_a_part_is_what_lies_between_its_times_thinned_and_is_told() -> None:
+    whole = load_sequence("drive").truncated(40)  # 10 Hz
+    prepared = prepare(Recording(whole, part=Part(1.0, 3.0, 3), max_frames=5))
+    np.testing.assert_array_equal(prepared.sequence.frames_t_ns, whole.frames_t_ns[10:31:3][:5])
+    assert prepared.sequence.provenance.facts[-1] == "a part of the recording: from 1 s to 3 s, one frame in 3"
+    assert prepared.whole.frame_count == 40
+    seen, all_seen = prepared.sequence.observations, whole.observations
+    np.testing.assert_array_equal(seen.uv_px[seen.frame == 1], all_seen.uv_px[all_seen.frame == 13])
+    # The prior was that of the first frame of the whole.
+    assert prepared.prior.source != prepare(Recording(whole)).prior.source
+
+
+def test_the_motion_between_thinned_frames_is_whole() -> None:
+    whole = load_sequence("drive").truncated(9)
+    packets = list(whole.packets())
+    thinned = list(prepare(Recording(whole, part=Part(every=2))).sequence.packets())
+    for k in range(1, 5):
+        one, two = packets[2 * k - 1].motion, packets[2 * k].motion
+        both = thinned[k].motion
+        assert isinstance(one, TwistMotion)
+        assert isinstance(two, TwistMotion)
+        assert isinstance(both, TwistMotion)
+        np.testing.assert_array_equal(both.v_mps, np.concatenate([one.v_mps, two.v_mps]))
+
+
+def test_a_part_without_two_frames_is_refused_with_what_there_is() -> None:
+    whole = load_sequence("drive").truncated(20)
+    with pytest.raises(DataError, match=r"drive: from 5 s to the end it has 0 frame\(s\).* it has 20 in 1.9 s"):
+        prepare(Recording(whole, part=Part(5.0)))
 
 
 def test_a_plan_reads_its_recordings_by_the_settings() -> None:

@@ -78,5 +78,5 @@ FAULT = Fault(
     "extrinsic-translation",
     "an extrinsic whose translation is that of its inverse",
     check,
-    after=("mixed-axes",),  # in the wrong axes no lever arm fits
+    after=("mixed-axes", "motion-gap"),  # in the wrong axes no lever arm fits
 )

@@ -125,5 +125,5 @@ FAULT = Fault(
     "mixed-axes",
     "motion samples and camera extrinsic in different axes, or an inverted extrinsic",
     check,
-    after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics", "units"),
+    after=("extrinsic-convention",),
 )

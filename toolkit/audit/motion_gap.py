@@ -119,5 +119,5 @@ FAULT = Fault(
     "motion-gap",
     "short holes in the motion samples",
     check,
-    after=("time-gap", "units"),
+    after=("time-gap", "units", "mixed-axes"),
 )

@@ -22,6 +22,7 @@ from toolkit.cli import (
     diff,
     evaluate,
     export,
+    import_tables,
     list_parts,
     report,
     reproduce,
@@ -47,7 +48,7 @@ _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
     *(compare, evaluate, diff, report, export, reproduce),
-    *(check, baseline, check_data, card, verify, list_parts, cite, simulate, tracks, completion),
+    *(check, baseline, check_data, card, verify, list_parts, cite, simulate, tracks, import_tables, completion),
 )
 
 

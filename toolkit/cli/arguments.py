@@ -169,6 +169,38 @@ def positive_seconds(text: str) -> float:
     return value
 
 
+def seconds_from_start(text: str) -> float:
+    """Parse a time since a recording's start, as in 10s, 500ms, 2min or 10."""
+    number = text.strip()
+    for unit, factor in (("min", 60.0), ("ms", 1e-3), ("s", 1.0)):
+        if number.endswith(unit):
+            return factor * _seconds_at_least_zero(number.removesuffix(unit), text)
+    return _seconds_at_least_zero(number, text)
+
+
+def _seconds_at_least_zero(number: str, text: str) -> float:
+    try:
+        value = float(number)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a time since the start, not {text}")
+    return value
+
+
+def add_part_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says which frames of a recording are used."""
+    after = "after the first frame, as in 10s"
+    parser.add_argument(
+        "--from", dest="from_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames before it, {after}"
+    )
+    parser.add_argument(
+        "--to", dest="to_s", metavar="TIME", type=seconds_from_start, help=f"leave out frames behind it, {after}"
+    )
+    parser.add_argument("--every", metavar="N", type=at_least(1), help="use one frame in N")
+    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N of these frames only")
+
+
 def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
     """Add the names of estimators, with what they are named for."""
     parser.add_argument(
@@ -222,6 +254,31 @@ def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes
     parser.add_argument("--workers", metavar="N", type=at_least(1, MOST_WORKERS), help=f"{what} (default: one a CPU)")
 
 
+# Repeated from toolkit.datasets.io.bag_topics (a test compares them), which would cost the help a third of a second.
+TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "twist", "truth")
+
+
+def topics(text: str) -> str:
+    """Parse ROLE=TOPIC,..., the topics of a bag."""
+    for part in text.split(","):
+        role, equals, name = (word.strip() for word in part.partition("="))
+        if not (equals and name):
+            raise argparse.ArgumentTypeError(f"expected ROLE=TOPIC,..., as in imu=/imu0, not {part.strip()!r}")
+        if role not in TOPIC_ROLES:
+            raise argparse.ArgumentTypeError(no_such("role", role, TOPIC_ROLES))
+    return text
+
+
+def add_topics_argument(parser: argparse.ArgumentParser) -> None:
+    """Add which topics of a bag are what; read it with :func:`with_tracks`."""
+    parser.add_argument(
+        "--topics",
+        metavar="ROLE=TOPIC,...",
+        type=topics,
+        help=f"of a bag, as in left=/cam0/image_raw,imu=/imu0 ({', '.join(TOPIC_ROLES)}); others are guessed",
+    )
+
+
 def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
     """Add where tracks come from; read it with :func:`with_tracks`."""
     parser.add_argument(
@@ -230,15 +287,14 @@ def add_tracks_argument(parser: argparse.ArgumentParser) -> None:
         help="of a recording with images and truth: made of the images, or simulated along the truth (default: auto, "
         "of the images where nearly all are there)",
     )
+    add_topics_argument(parser)
 
 
 def with_tracks(values: Mapping[str, Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the nested values of settings with --tracks put in where it was given."""
-    if options.tracks is None:
-        return dict(values)
-    from toolkit.settings import with_assignments
-
-    return with_assignments(values, (f"frontend.tracks={options.tracks}",))
+    """Return the nested values of settings with --tracks and --topics put in where they were given."""
+    given = {"tracks": getattr(options, "tracks", None), "topics": options.topics}
+    frontend = {key: value for key, value in given.items() if value is not None}
+    return {**values, "frontend": {**values.get("frontend", {}), **frontend}} if frontend else dict(values)
 
 
 def add_repair_arguments(parser: argparse.ArgumentParser) -> None:

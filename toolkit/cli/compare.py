@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import (
     Interrupted,
     add_estimators_argument,
+    add_part_arguments,
     add_repair_arguments,
     add_settings_arguments,
     add_tracks_argument,
@@ -73,7 +74,7 @@ def add_to(subcommands: Subcommands) -> None:
         help="run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the "
         "same command continues where it stopped",
     )
-    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
+    add_part_arguments(parser)
     add_repair_arguments(parser)
     parser.add_argument(
         "--start",
@@ -214,6 +215,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
         "truth": None if options.truth is None else str(options.truth),
         "trajectories": {name: str(file) for name, file in options.trajectory} or None,
         "max_frames": options.max_frames,
+        **{"from_s": options.from_s, "to_s": options.to_s, "every": options.every},
         "keep": _kept(options),
         "keep_trajectories": options.keep_trajectories,
     }
@@ -250,6 +252,7 @@ def _plan(asked: Configuration) -> Plan:
     from toolkit.cli.arguments import UsageError
     from toolkit.estimator import defaults
     from toolkit.experiment import Plan
+    from toolkit.experiment.recording import Part
 
     request, settings = asked.request, asked.settings
     sequences = request.sequences or SEQUENCES
@@ -269,6 +272,7 @@ def _plan(asked: Configuration) -> Plan:
         trajectories={name: Path(file) for name, file in request.trajectories.items()},
         keep=frozenset(request.keep),
         max_frames=request.max_frames,
+        part=Part(request.from_s, request.to_s, request.every),
         keep_trajectories=request.keep_trajectories,
     )
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_settings_arguments, at_least, epilog, settings_asked
+from toolkit.cli.arguments import add_settings_arguments, add_topics_argument, at_least, epilog, settings_asked
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -23,17 +23,20 @@ def add_to(subcommands: Subcommands) -> None:
         "and right image side by side, a circle a track, blue where it is new, red where it is old.",
         epilog=epilog("vislam tracks kitti/sequences/06 --out stills --count 4"),
     )
-    parser.add_argument("sequence", metavar="SEQUENCE", help="a folder with images, as EuRoC's or KITTI's")
+    parser.add_argument("sequence", metavar="SEQUENCE", help="a folder with images, as EuRoC's or KITTI's, or a bag")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--count", metavar="N", type=at_least(1), default=10, help="how many stills (default: 10)")
     what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
+    add_topics_argument(parser)
     add_settings_arguments(parser)
     parser.set_defaults(command=command)
 
 
 def command(options: argparse.Namespace) -> int:
     """Track, draw, and say what was written."""
+    import msgspec
+
     from toolkit.datasets import load_images
     from toolkit.files import check_parent
     from toolkit.frontend import track_images
@@ -41,8 +44,10 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.progress import of_this_process
 
     frontend = settings_asked(options).frontend
+    if options.topics is not None:
+        frontend = msgspec.structs.replace(frontend, topics=options.topics)
     check_parent(options.out.parent)
-    recording = load_images(options.sequence)
+    recording = load_images(options.sequence, frontend)
     with of_this_process()(options.sequence) as progress:
         tracks = track_images(recording.pairs, recording.rig, frontend, progress)
         if options.video:

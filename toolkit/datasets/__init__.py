@@ -73,7 +73,7 @@ class HasImages(Protocol):
     def load_from_images(self, path: Path, frontend: Frontend, progress: Progress) -> Sequence:
         """Read the recording with tracks made of its images; raise DataError where it cannot be."""
 
-    def images_of(self, path: Path) -> ImageRecording:
+    def images_of(self, path: Path, frontend: Frontend) -> ImageRecording:
         """Return the image pairs that tracks are made of and their cameras; raise DataError where there are none."""
 
 
@@ -177,8 +177,8 @@ def _of_images(reader: RecordingFormat, path: Path, frontend: Frontend) -> TypeG
     return reader.uses_images(path, frontend.tracks)
 
 
-def load_images(source: str) -> ImageRecording:
-    """Return the image pairs of a recording and their cameras.
+def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRecording:
+    """Return the image pairs of a recording and their cameras; of a bag, from the topics that ``frontend`` names.
 
     Raises DataError where the source is no recording with images, or they cannot be used.
     """
@@ -186,7 +186,7 @@ def load_images(source: str) -> ImageRecording:
     reader = None if source in built_ins() else _reader_of(path, source)
     if not isinstance(reader, HasImages):
         raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
-    return reader.images_of(path)
+    return reader.images_of(path, frontend)
 
 
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:

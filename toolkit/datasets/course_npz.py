@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, check_rows, observations, stamps_ns
-from toolkit.datasets.io.npz_archive import NpzArchive, SparseArray, glance, opened
-from toolkit.geometry import Array, se3_inverse
+from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, stamps_ns
+from toolkit.datasets.io.npz_archive import NpzArchive, glance, opened
+from toolkit.datasets.io.sparse import corners_of, sightings
+from toolkit.geometry import se3_inverse
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig
@@ -43,7 +44,7 @@ def load(path: Path) -> Sequence:
         fields.require(*_REQUIRED)
         t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
         check_frame_count(path, t_ns.size)
-        sightings, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
+        seen, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
     w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
     facts = () if has_features else (NO_FEATURES,)
@@ -52,7 +53,7 @@ def load(path: Path) -> Sequence:
         rig=_rig(fields),
         noise=twist_noise(t_ns, v_mps, w_radps),
         frames_t_ns=t_ns,
-        observations=sightings,
+        observations=seen,
         motion=TwistSamples(t_ns, v_mps, w_radps),
         provenance=Provenance("course-npz", str(path), facts),
     )
@@ -69,15 +70,4 @@ def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> Observation
         nothing = np.empty(0, dtype=np.int64)
         return Observations(nothing, nothing, np.empty((0, 3)))
     features = archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN)
-    return _gather(path, features)
-
-
-def _gather(path: Path, features: SparseArray) -> Observations:
-    """Join the coordinates of each sighting; one that lacks a coordinate gets NaN there, for the audit to find."""
-    coordinate, track, frame = features.indices
-    tracks = max(features.shape[1], 1)
-    cell, row = np.unique(frame * tracks + track, return_inverse=True)
-    corners_px: Array = np.full((cell.size, 4), np.nan)
-    corners_px[row, coordinate] = features.value
-    check_rows(path, corners_px)
-    return observations(cell // tracks, cell % tracks, corners_px)
+    return sightings(path, *corners_of(features))

@@ -29,14 +29,13 @@ from toolkit.datasets.io.fields import check_frame_count, observations
 from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_of_asl, rig_of
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
+from toolkit.datasets.io.truth_at_frames import stamps_within, truth_at, truth_near
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, rectified, track_images
-from toolkit.geometry import Array, IntArray, interpolate_poses
 from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuSamples
 from toolkit.progress import Progress
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Provenance, Sequence, Truth
+from toolkit.sequence import Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation.world import Camera
 
@@ -50,8 +49,6 @@ _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
 _NEARLY_ALL = 0.9
 # Up to 14 m the disparity stays five standard deviations above zero.
 _DEPTH_M = (0.5, 14.0)
-# Between truths farther apart nothing is known of the motion at 1 m/s: two periods of the camera.
-_LONGEST_TRUTH_GAP_NS = NS_PER_S // 10
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
     return _share_with_images(layout.mav0, layout.stamps) >= _NEARLY_ALL
 
 
-def images_of(path: Path) -> ImageRecording:
+def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs within the IMU's time and their cameras; raises DataError as :func:`load_from_images`."""
     layout = _whole(path)
     mav0 = _with_images(layout)
@@ -122,7 +119,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
         motion=imu,
         provenance=Provenance("euroc", f"{path}: {REAL}", facts),
-        truth=None if choice is None else _at(choice.truth, _near(tracks.t_ns, choice.truth.t_ns)),
+        truth=None if choice is None else truth_near(choice.truth, tracks.t_ns),
     )
 
 
@@ -137,9 +134,9 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     calibration = published() if layout.mav0 is None else read_calibration(layout.root, layout.mav0)
     choice = choose_truth(layout.root, layout.mav0, imu)
     stamps = read_stamps(layout.stamps)
-    frames_t_ns = _within(stamps, imu.t_ns, choice.truth.t_ns)
+    frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
-    truth = _at(choice.truth, frames_t_ns)
+    truth = truth_at(choice.truth, frames_t_ns)
     camera = Camera(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
     return Sequence(
         name=f"{layout.root.name} (simulated stereo)",
@@ -222,29 +219,3 @@ def _facts(truth_reason: str, calibration: Calibration) -> tuple[str, ...]:
         calibration.source,
         calibration.noise_source,
     )
-
-
-def _within(stamps: IntArray, imu_t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
-    """Return the stamps (K,) that lie within the IMU's time and between truths close enough to interpolate."""
-    first, last = max(imu_t_ns.min(), truth_t_ns[0]), min(imu_t_ns.max(), truth_t_ns[-1])
-    inside = stamps[(stamps >= first) & (stamps <= last)]
-    after = np.clip(np.searchsorted(truth_t_ns, inside), 1, truth_t_ns.size - 1)
-    return np.asarray(inside[truth_t_ns[after] - truth_t_ns[after - 1] <= _LONGEST_TRUTH_GAP_NS])
-
-
-def _near(t_ns: IntArray, truth_t_ns: IntArray) -> IntArray:
-    """Return the stamps (K,) between truths close enough to interpolate."""
-    return _within(t_ns, truth_t_ns, truth_t_ns)
-
-
-def _at(truth: Truth, t_ns: IntArray) -> Truth:
-    """Return the truth at stamps (K,) within it: poses on the geodesic, velocities and biases on straight lines."""
-    poses = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns)
-    return Truth(t_ns, poses, _linear(truth.v_world, truth.t_ns, t_ns), _linear(truth.bias, truth.t_ns, t_ns))
-
-
-def _linear(values: Array | None, t_ns: IntArray, at_ns: IntArray) -> Array | None:
-    if values is None:
-        return None
-    t_s, at_s = (t_ns - t_ns[0]) / NS_PER_S, (at_ns - t_ns[0]) / NS_PER_S
-    return np.stack([np.interp(at_s, t_s, column) for column in values.T], axis=1)

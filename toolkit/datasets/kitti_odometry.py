@@ -57,7 +57,7 @@ def load(path: Path) -> Sequence:
     return load_from_images(path, DEFAULTS.frontend, SILENT)
 
 
-def images_of(path: Path) -> ImageRecording:
+def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs and their cameras; raises DataError as :func:`load_from_images`."""
     layout = _whole(path)
     return ImageRecording(_listed(layout, _stamps(layout)[0]).pairs, _pair(layout))

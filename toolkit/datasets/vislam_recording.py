@@ -12,6 +12,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
+from toolkit.datasets.io.fields import check_numeric
 from toolkit.datasets.io.npz_archive import opened
 from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
@@ -159,7 +160,10 @@ def _read_text(file: Path) -> Text:
 
 def _read_arrays(file: Path) -> Arrays:
     with opened(file) as archive:
-        return archive.fields().arrays
+        arrays = archive.fields().arrays
+    for key, array in arrays.items():
+        check_numeric(file, key, array.dtype)
+    return arrays
 
 
 def _sequence(text: Text, arrays: Arrays) -> Sequence:
@@ -210,7 +214,10 @@ def _one_of(pairing: Any, known: tuple[Any, ...]) -> Any:
 
 
 def _provenance(fields: Text) -> Provenance:
-    return Provenance(fields["format"], fields["source"], tuple(fields["facts"]))
+    texts = (fields["format"], fields["source"], *fields["facts"])
+    if not all(isinstance(text, str) for text in texts):
+        raise DataError("provenance holds what is no text; save the recording again")
+    return Provenance(texts[0], texts[1], texts[2:])
 
 
 def _prior(text: Text, arrays: Arrays) -> Prior | None:

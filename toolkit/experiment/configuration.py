@@ -24,6 +24,9 @@ class Request(Struct, frozen=True):
     truth: str | None = None
     trajectories: dict[str, str] = {}
     max_frames: Annotated[int, Meta(ge=2)] | None = None
+    from_s: Annotated[float, Meta(ge=0)] = 0.0
+    to_s: Annotated[float, Meta(gt=0)] | None = None
+    every: Annotated[int, Meta(ge=1)] = 1
     keep: tuple[str, ...] = ()
     keep_trajectories: bool = False
 

@@ -15,7 +15,7 @@ from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
-from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
 from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
@@ -33,7 +33,7 @@ class Plan:
     are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
     leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
     writes those of every seed; of a single one they always are. ``scheduler`` is the address of a Dask cluster that
-    does the work instead.
+    does the work instead. ``part`` is what is used of each source, ``max_frames`` the first frames of that.
     """
 
     sources: tuple[str | Recorded, ...]
@@ -47,6 +47,7 @@ class Plan:
     workers: int | None = None
     keep_trajectories: bool = False
     scheduler: str | None = None
+    part: Part = WHOLE
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -67,6 +68,7 @@ class Plan:
             frontend=settings.frontend,
             vary=settings.vary,
             card=settings.card and seed == self.seeds[0],
+            part=self.part,
         )
 
 

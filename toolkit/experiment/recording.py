@@ -10,8 +10,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from toolkit.audit import Audit, Finding, audit
+from toolkit.audit.parts.subsets import keep_frames
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
@@ -29,13 +31,33 @@ STARTS: dict[Start, Callable[[Sequence], Prior]] = {
 
 
 @dataclass(frozen=True)
+class Part:
+    """Which frames of a recording are used: seconds after its first frame, ends included, and one frame in so many.
+
+    Motion samples and truth stay whole.
+    """
+
+    from_s: float = 0.0
+    to_s: float | None = None
+    every: int = 1
+
+    def __str__(self) -> str:
+        end = "the end" if self.to_s is None else f"{self.to_s:g} s"
+        thinned = "" if self.every == 1 else f", one frame in {self.every}"
+        return f"from {self.from_s:g} s to {end}{thinned}"
+
+
+WHOLE = Part()
+
+
+@dataclass(frozen=True)
 class Recording:
     """A source under one seed, and what is made of it before an estimator sees it.
 
     ``source`` is a path, a built-in name or a sequence; ``truth`` a TUM file; ``keep`` names faults that the audit
-    reports and leaves as they are. ``max_frames`` and ``duration_s`` cut it; a simulation of ``duration_s`` is made
-    that long. ``vary`` says what the seed draws of a simulation; ``card`` asks for the card of its tracks, which comes
-    with a fitted noise in any case.
+    reports and leaves as they are. ``part`` is what is used of it, ``max_frames`` the first frames of that;
+    ``duration_s`` cuts it before, and a simulation of ``duration_s`` is made that long. ``vary`` says what the seed
+    draws of a simulation; ``card`` asks for the card of its tracks, which comes with a fitted noise in any case.
     """
 
     source: str | Sequence
@@ -49,6 +71,7 @@ class Recording:
     frontend: Frontend = DEFAULTS.frontend
     vary: Varied = DEFAULTS.vary
     card: bool = False
+    part: Part = WHOLE
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,12 +152,29 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
 def _cut(sequence: Sequence, recording: Recording) -> Sequence:
     if recording.duration_s is not None:
         sequence = _first_seconds(sequence, recording.duration_s)
+    if recording.part != WHOLE:
+        sequence = _part(sequence, recording.part)
     return sequence if recording.max_frames is None else sequence.truncated(recording.max_frames)
 
 
 def _first_seconds(sequence: Sequence, duration_s: float) -> Sequence:
     end_ns = sequence.frames_t_ns[0] + round(duration_s * NS_PER_S)
     return sequence.truncated(int((sequence.frames_t_ns <= end_ns).sum()))
+
+
+def _part(sequence: Sequence, part: Part) -> Sequence:
+    """Return a part of the frames, which the facts tell; raises DataError where it has no two."""
+    elapsed_s = (sequence.frames_t_ns - sequence.frames_t_ns[:1]) / NS_PER_S
+    end_s = np.inf if part.to_s is None else part.to_s
+    kept = np.flatnonzero((elapsed_s >= part.from_s) & (elapsed_s <= end_s))[:: part.every]
+    if kept.size < 2:
+        raise DataError(
+            f"{sequence.name}: {part} it has {kept.size} frame(s), and two are needed; it has {sequence.frame_count} "
+            f"in {sequence.duration_s:g} s"
+        )
+    provenance = sequence.provenance
+    told = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
+    return replace(keep_frames(sequence, kept), provenance=told)
 
 
 def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:

@@ -34,7 +34,7 @@ def reference_runs(references: Mapping[str, Trajectory], sequence: Sequence) -> 
 def external_runs(files: Mapping[str, PosesFile], recording: Sequence, sequence: Sequence) -> tuple[Run, ...]:
     """Return a run for each trajectory file, with what it says of the frames as final output.
 
-    ``recording`` is the whole of it, of which ``sequence`` may be the first frames. Raises DataError where a file
+    ``recording`` is the whole of it, of which ``sequence`` may be a part. Raises DataError where a file
     is not of this recording: a wrong clock, unit of time, order of quaternions, body or number of rows is named.
     """
     return tuple(_external(name, poses, recording, sequence) for name, poses in files.items())
@@ -75,7 +75,8 @@ def _stamped(poses: PosesFile, recording: Sequence, sequence: Sequence) -> Traje
             f"{poses.path}: {len(poses)} rows, but a {poses.format} file has one for every frame, and there are "
             f"{expected}; write a pose for each, or a format with stamps"
         )
-    return Trajectory(recording.frames_t_ns[: len(poses)], poses.T_world_imu)
+    frames = recording if len(poses) == recording.frame_count else sequence
+    return Trajectory(frames.frames_t_ns, poses.T_world_imu)
 
 
 def _run(name: str, whole: Trajectory, sequence: Sequence, output: Output, read: str, *remarks: str) -> Run:

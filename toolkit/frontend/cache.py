@@ -24,6 +24,8 @@ from toolkit.settings import Frontend
 
 # Raised with every change of the front end that changes its tracks.
 _FRONT_END = 1
+# Settings that say where images are from, and not what becomes of them.
+_OF_THE_SOURCE = ("tracks", "topics")
 _ARRAYS = ("t_ns", "frame", "track_id", "corners_px")
 _HASHERS = 2
 
@@ -33,7 +35,7 @@ def key_of(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend)
     paths = [path for pair in pairs for path in (pair.left, pair.right)]
     with ThreadPoolExecutor(_HASHERS) as hashers:
         images = list(hashers.map(_digest, paths))
-    asked = {name: getattr(settings, name) for name in settings.__struct_fields__ if name != "tracks"}
+    asked = {name: getattr(settings, name) for name in settings.__struct_fields__ if name not in _OF_THE_SOURCE}
     stamps = np.array([pair.t_ns for pair in pairs], dtype=np.int64)
     made_by = f"{_FRONT_END} {version('opencv-python-headless')} {version('numpy')}"
     return content_digest((made_by, repr(asked), rig, stamps, *images))

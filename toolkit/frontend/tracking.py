@@ -27,10 +27,14 @@ _MISPAIRED = "left and right image are not of the same instant"
 
 @dataclass(frozen=True, eq=False)
 class ImageRecording:
-    """The image pairs of a recording in order of time, and the pair of cameras that took them."""
+    """The image pairs of a recording in order of time, and the pair of cameras that took them.
+
+    ``keeper`` is whatever takes the image files away when it is no longer referred to; None where they stay.
+    """
 
     pairs: tuple[StampedPair, ...]
     rig: RectifiedPair
+    keeper: object = None
 
 
 @dataclass(frozen=True, eq=False)

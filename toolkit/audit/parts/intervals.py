@@ -69,29 +69,48 @@ def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Arra
     into the next. An IMU measures no velocity and its gyro has a bias: there the camera's own velocity is taken, and
     the rates of rotation about their median difference from the camera's. Only intervals whose camera motion is known.
     """
+    return _median(_one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))[1])
+
+
+def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
+    """Return the median of the same residuals in each known interval that has any (M,), in pixels."""
+    interval, each_px = _one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))
+    first = np.flatnonzero(np.diff(interval, prepend=-1))
+    return np.array([_median(part) for part in np.split(each_px, first[1:])]) if interval.size else np.empty(0)
+
+
+def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
+    """Return the same median where the points are moved by a motion of the camera, for example its own."""
+    return _median(_one_step_px(sequence, camera, _moved_by(camera, sequence))[1])
+
+
+def _moved(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
+    """Return the camera's motion (K - 1, 4, 4) as the motion samples have it through an extrinsic."""
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     w_radps, v_mps = mean[:, 3:], mean[:, :3]
     R_imu_cam = T_imu_cam[:3, :3]
     if isinstance(sequence.motion, TwistSamples):
         dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
         T_before_after_imu = se3_exp(dt_s * np.concatenate([w_radps, v_mps], axis=1))
-        return _median_px(sequence, camera, se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
+        return np.asarray(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
     bias_radps = np.median((w_radps - camera.w_radps @ R_imu_cam.T)[camera.known], axis=0)
-    return own_one_step_px(sequence, camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam))
+    return _moved_by(camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam), sequence)
 
 
-def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
-    """Return the same median where the points are moved by a motion of the camera, for example its own."""
+def _moved_by(camera: CameraMotion, sequence: Sequence) -> Array:
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
-    return _median_px(sequence, camera, se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1)))
+    return se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1))
 
 
-def _median_px(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> float:
-    """Return the median residual under the camera's motion (K - 1, 4, 4) in the known intervals; NaN without any."""
+def _one_step_px(sequence: Sequence, camera: CameraMotion, T_before_after: Array) -> tuple[IntArray, Array]:
+    """Return interval (P,) and residual (P,) px under the camera's motion (K - 1, 4, 4) in the known intervals."""
     pairs, uv_px = usable_pairs(sequence), sequence.observations.uv_px
     pairs = pairs.select(camera.known[pairs.interval])
     points = transform(se3_inverse(T_before_after)[pairs.interval], triangulate(uv_px[pairs.before], sequence.rig))
     points[:, 2] = np.maximum(points[:, 2], 0.1)
     residual_px = uv_px[pairs.after] - project(points, sequence.rig)
-    each_px = np.sqrt(np.mean(residual_px**2, axis=1))
-    return float(np.median(each_px)) if each_px.size else float("nan")
+    return pairs.interval, np.sqrt(np.mean(residual_px**2, axis=1))
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if values.size else float("nan")

@@ -125,6 +125,15 @@ def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
     return _calibration(sides, noise, source, "the noise of the IMU is as its file states it")
 
 
+def kalibr_noise(folder: Path) -> ImuNoise | None:
+    """Return the noise that Kalibr's IMU file in a folder states, None where there is none.
+
+    Raises DataError where it is damaged or incomplete.
+    """
+    imu = next(iter(sorted(folder.glob("imu*.yaml"))), None)
+    return None if imu is None else _stated_noise(read_fields(imu), "imu0.")
+
+
 def _chains(root: Path, mav0: Path) -> list[Path]:
     folders = [root, mav0, root / "dso"]
     return [path for folder in folders for path in sorted(folder.glob("*camchain*.yaml"))]

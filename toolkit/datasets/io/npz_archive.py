@@ -12,38 +12,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.arrays import check_shape
-from toolkit.datasets.io.fields import Fields, check_numeric
+from toolkit.datasets.io.fields import Fields
+from toolkit.datasets.io.sparse import Layout, Named, SparseArray, sparse_array
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray
 from toolkit.inputs import is_regular, open_input
 
-# Small enough for the processor's cache, large enough that the Python around it does not show.
-_CHUNK_BYTES = 1 << 18
 # A dense array of a recording is far smaller: an hour of IMU samples at 1 kHz has 200 MB.
 _MOST_BYTES = 2 << 30
 _ZIP_MAGIC = b"PK\x03\x04"
 _ZIP_HEADER = struct.Struct("<26xHH")
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, struct.error, NotImplementedError, RuntimeError, MemoryError)
-
-
-class SparseArray(NamedTuple):
-    """The entries of a dense array that differ from its filler: indices per axis, each (E,), and values (E,)."""
-
-    shape: tuple[int, ...]
-    indices: tuple[IntArray, ...]
-    value: Array
-
-
-class _Header(NamedTuple):
-    shape: tuple[int, ...]
-    fortran_order: bool
-    dtype: np.dtype[np.generic]
 
 
 @dataclass(frozen=True)
@@ -66,13 +49,7 @@ class NpzArchive:
         """Stream one array of the given shape, in either memory order; keep what differs from the filler (NaN does)."""
         with self.archive.open(f"{key}.npy") as stream:
             header = self._header(key, stream)
-            check_numeric(self.path, key, header.dtype)
-            check_shape(f"{self.path}: {key}", header.shape, shape)
-            size, position, value = _kept_entries(stream, header.dtype, filler)
-        if size != math.prod(header.shape):
-            raise DataError(f"{self.path}: {key} ends after {size} of {math.prod(header.shape)} values; save it again")
-        indices = np.unravel_index(position, header.shape, order="F" if header.fortran_order else "C")
-        return SparseArray(header.shape, indices, value)
+            return sparse_array(Named(self.path, key), header, shape, stream, filler)
 
     def _dense(self, key: str) -> npt.NDArray[np.generic]:
         with self.archive.open(f"{key}.npy") as stream:
@@ -86,17 +63,17 @@ class NpzArchive:
                 raise DataError(f"{self.path}: {key} cannot be read: {why}; save it as plain numbers") from error
         return array
 
-    def _header(self, key: str, stream: IO[bytes]) -> _Header:
+    def _header(self, key: str, stream: IO[bytes]) -> Layout:
         try:
             version = np.lib.format.read_magic(stream)
             # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            header = _Header(*read(stream))
+            header = Layout(*read(stream))
         except (ValueError, TypeError, SyntaxError, OverflowError) as error:
             raise DataError(f"{self.path}: {key} has no valid .npy header: {_first_line(error)}") from error
         return header
 
-    def _check_size(self, key: str, header: _Header) -> None:
+    def _check_size(self, key: str, header: Layout) -> None:
         """Raise DataError where a header asks for more memory than its array fills, or than is sensible."""
         size = math.prod(header.shape) * header.dtype.itemsize
         stored = self.archive.getinfo(f"{key}.npy").file_size
@@ -141,19 +118,6 @@ def _first_key(path: Path) -> set[str]:
             return set()
         name_length, _ = _ZIP_HEADER.unpack(header)
         return {stream.read(name_length).decode(errors="replace").removesuffix(".npy")}
-
-
-def _kept_entries(stream: IO[bytes], dtype: np.dtype[np.generic], filler: float) -> tuple[int, IntArray, Array]:
-    """Return how many values a stream holds, and the positions and values of those that differ from the filler."""
-    chunk_bytes = _CHUNK_BYTES // dtype.itemsize * dtype.itemsize
-    size, positions, kept_values = 0, [np.empty(0, dtype=np.int64)], [np.empty(0)]
-    while chunk := stream.read(chunk_bytes):
-        values = np.frombuffer(chunk, dtype=dtype, count=len(chunk) // dtype.itemsize)
-        kept = np.flatnonzero(values != filler)
-        positions.append(kept + size)
-        kept_values.append(values[kept].astype(np.float64))
-        size += values.size
-    return size, np.concatenate(positions), np.concatenate(kept_values)
 
 
 def _first_line(error: BaseException) -> str:

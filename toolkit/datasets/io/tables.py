@@ -41,7 +41,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
 
     Raises DataError where the file is damaged, a column is missing (all are listed), or a row is not numeric.
     """
-    header, _, body = _content(path).partition(b"\n")
+    header, _, body = read_whole(path).partition(b"\n")
     columns = [name.strip() for name in header.decode(errors="replace").split(",")]
     missing = [name for name in names if name not in columns]
     if missing:
@@ -56,7 +56,8 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
     return table
 
 
-def _content(path: Path) -> bytes:
+def read_whole(path: Path) -> bytes:
+    """Return the content of a table, plain or gzipped; raises DataError where it cannot be read or is damaged."""
     content = read_input(path)
     try:
         return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content

@@ -1,0 +1,273 @@
+"""The course's pickled recordings: which way the extrinsic goes, how little memory it takes, that nothing is run."""
+
+import io
+import os
+import pickle
+import pickletools
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.datasets import load_images, load_sequence
+from toolkit.datasets.io.plain_pickle import read_dict
+from toolkit.errors import DataError
+from toolkit.geometry import Array, se3, se3_inverse
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import NO_FEATURES, Sequence
+from toolkit.settings import Frontend
+from toolkit.simulation import DRIVE, simulate
+
+Refused = Callable[..., None]
+T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+CONVENTIONS = {
+    "as given, camera axes optical": se3_inverse,
+    "as given, camera axes regular": lambda T_imu_cam: se3_inverse(T_imu_cam @ se3_inverse(T_REGULAR_OPTICAL)),
+    "inverted, camera axes optical": lambda T_imu_cam: T_imu_cam,
+    "inverted, camera axes regular": lambda T_imu_cam: T_imu_cam @ se3_inverse(T_REGULAR_OPTICAL),
+}
+
+
+@cache
+def drive() -> Sequence:
+    """Return a drive at 30 Hz, as the course records them, with 0.5 px and 0.05 m/s of noise."""
+    return simulate(replace(DRIVE, duration_s=4.0, camera=replace(DRIVE.camera, rate_hz=30.0, max_tracks=40)), 0)
+
+
+def course_dict(sequence: Sequence, convention: str, mismatched: float = 0.05) -> dict[str, Any]:
+    """Return a sequence as the course pickles it; a share of the sightings in the right image are mismatches."""
+    rig, seen, count = sequence.rig, sequence.observations, sequence.frame_count
+    rng = np.random.default_rng(0)
+    corners_px = seen.uv_px[:, [0, 2, 1, 2]]
+    wrong = rng.random(len(corners_px)) < mismatched
+    corners_px[wrong, 2] = rng.uniform(0.0, 2.0 * rig.cx_px, wrong.sum())
+    tracks, row = np.unique(seen.track_id, return_inverse=True)
+    features = np.full((4, tracks.size, count), -1.0)
+    features[:, row, seen.frame] = corners_px.T
+    T_imu_right = rig.T_imu_cam @ se3(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0]))
+    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
+    return {
+        "v_t": sequence.motion.values[:count, :3],
+        "w_t": sequence.motion.values[:count, 3:],
+        "timestamps": sequence.frames_t_ns / NS_PER_S,
+        "features": features,
+        **{"K_l": K, "K_r": K},
+        "extL_T_imu": CONVENTIONS[convention](rig.T_imu_cam),
+        "extR_T_imu": CONVENTIONS[convention](T_imu_right),
+    }
+
+
+def saved(folder: Path, content: Any, name: str = "dataset00.npy") -> Path:
+    np.save(folder / name, content, allow_pickle=True)
+    return folder / name
+
+
+@pytest.fixture
+def small() -> dict[str, Any]:
+    return course_dict(drive().truncated(6), next(iter(CONVENTIONS)))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_each_convention_of_the_extrinsic_is_found_with_noise_and_mismatches(tmp_path: Path, convention: str) -> None:
+    given = saved(tmp_path, course_dict(drive(), convention))
+    audited = audit(load_sequence(str(given)))
+    # The stereo tracks decide among four candidates; the right one is the simulation's to rounding.
+    np.testing.assert_allclose(audited.sequence.rig.T_imu_cam, drive().rig.T_imu_cam, atol=1e-12)
+    (told,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
+    assert told.endswith(f"the extrinsic is taken {convention}")
+    assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
+
+
+def test_kept_the_convention_is_told_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:
+    path = saved(tmp_path, course_dict(drive(), "inverted, camera axes regular"))
+    audited = audit(load_sequence(str(path)), keep=frozenset({"extrinsic-convention", "mixed-axes"}))
+    assert any(finding.fault == "extrinsic-convention" and finding.blocking for finding in audited.findings)
+    given = se3_inverse(read_dict(path)["extL_T_imu"].read())
+    np.testing.assert_array_equal(audited.sequence.rig.T_imu_cam, given)
+
+
+def test_without_sightings_the_convention_is_not_decidable(tmp_path: Path, small: dict[str, Any]) -> None:
+    del small["features"]
+    sequence = load_sequence(str(saved(tmp_path, small)))
+    assert NO_FEATURES in sequence.provenance.facts
+    assert "extrinsic-convention" in audit(sequence).undecided
+
+
+def test_a_recording_is_what_was_saved(tmp_path: Path, small: dict[str, Any]) -> None:
+    sequence, original = load_sequence(str(saved(tmp_path, small))), drive().truncated(6)
+    assert sequence.rig.baseline_m == pytest.approx(original.rig.baseline_m, rel=1e-12)
+    np.testing.assert_array_equal(sequence.motion.values, original.motion.values[:6])
+    assert len(sequence.observations) == len(original.observations)
+    # Seconds of today as doubles are exact to 0.2 us.
+    np.testing.assert_allclose(sequence.frames_t_ns, original.frames_t_ns, atol=500)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("dtype", ["<f8", ">f8", "<f4", "<i2"])
+def test_memory_order_and_number_type_do_not_matter(
+    tmp_path: Path, small: dict[str, Any], order: Any, dtype: str
+) -> None:
+    small["features"] = np.asarray(np.rint(small["features"]), dtype=dtype, order=order)
+    small["v_t"] = small["v_t"].astype(dtype if dtype != "<i2" else "<f8")
+    small["features_again"] = small["features"]  # by reference in the pickle
+    path = saved(tmp_path, small)
+    np.testing.assert_array_equal(read_dict(path)["features_again"].read(), small["features"])
+    assert len(load_sequence(str(path)).observations) == len(drive().truncated(6).observations)
+
+
+def test_cameras_that_differ_in_their_matrices_become_one(tmp_path: Path, small: dict[str, Any]) -> None:
+    expected = load_sequence(str(saved(tmp_path, small))).observations
+    K, factor, shift = small["K_l"], 1.25, 7.0
+    seen = small["features"][2:] != -1.0
+    small["K_r"] = np.diag([factor, factor, 1.0]) @ K + np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0.0]])
+    moved = factor * small["features"][2:] + np.array([shift, -shift])[:, None, None]
+    small["features"][2:] = np.where(seen, moved, -1.0)
+    read = load_sequence(str(saved(tmp_path, small))).observations
+    np.testing.assert_allclose(read.uv_px, expected.uv_px, atol=1e-9)
+
+
+def test_a_large_recording_takes_hardly_any_memory(tmp_path: Path) -> None:
+    frames, tracks = 600, 2500
+    small = course_dict(drive().truncated(3), next(iter(CONVENTIONS)))
+    features = np.full((4, tracks, frames), -1.0, order="C")  # 48 MB
+    features[:, ::10, ::20] = 100.0
+    big = {**small, "features": features, "timestamps": np.arange(frames) / 30.0}
+    big |= {key: np.zeros((frames, 3)) for key in ("v_t", "w_t")}
+    path = saved(tmp_path, big)
+    del features, big
+    tracemalloc.start()
+    sequence = load_sequence(str(path))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(sequence.observations) == 250 * 30
+    # The sightings take some; the array they were taken from would take 48 MB.
+    assert peak < 8e6
+
+
+# What must not be run --------------------------------------------------------------------------------------------
+
+
+class Touches:
+    """Unpickled it makes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.path),)
+
+
+def test_a_pickle_that_would_run_something_is_refused_by_name_and_nothing_is_run(
+    tmp_path: Path, small: dict[str, Any], assert_refused: Refused
+) -> None:
+    path = saved(tmp_path, {**small, "extra": Touches(tmp_path / "touched")})
+    assert_refused(lambda: load_sequence(str(path)), path, r"names posix\.mkdir.*nothing of it was executed")
+    assert not (tmp_path / "touched").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "pattern"),
+    [
+        (np.zeros(3), "one array of shape"),
+        (np.array([1, "x", None], dtype=object), "holds no dict of named values"),
+        ({"v_t": np.zeros((3, 3))}, "missing w_t, timestamps"),
+        ({"cam_imgs_L": [], "cam_imgs_R": []}, "the images of a recording alone; name the file beside it"),
+        ({"v_t": {1, 2}}, "which plain data do not need|only plain numbers"),
+        ({"v_t": np.array(["2026"], dtype="M8[Y]")}, "an array holds datetime64"),
+        ({"v_t": 1j}, "only plain numbers"),
+    ],
+)
+def test_other_content_is_refused_in_one_line(
+    tmp_path: Path, assert_refused: Refused, content: Any, pattern: str
+) -> None:
+    path = saved(tmp_path, content)
+    assert_refused(lambda: load_sequence(str(path)), path, pattern)
+
+
+def test_bytes_that_are_announced_and_not_there_are_no_memory_taken(tmp_path: Path, assert_refused: Refused) -> None:
+    path = saved(tmp_path, {"v_t": 1})
+    header = path.read_bytes()[:128]
+    path.write_bytes(header + b"\x80\x04\x8e" + (1 << 50).to_bytes(8, "little") + b"x")
+    assert_refused(lambda: load_sequence(str(path)), path, "damaged or truncated npy")
+
+
+def test_the_reader_agrees_with_pickle_on_plain_data(tmp_path: Path) -> None:
+    values = {
+        "numbers": [0, 1, -1, 255, 256, 65536, -(2**40), 2**70, 1.5, float("inf"), True, False, None],
+        "texts": ["", "a" * 300, "é"],
+        "nested": {"list": [[], [1, [2]], ()], "pair": (1, 2), "triple": (1, 2, 3), "more": (1, 2, 3, 4)},
+        "scalar": np.float64(2.5),
+        "bytes": b"abc",
+    }
+    for protocol in (3, 4):  # those of numpy.save in Python 3
+        path, stream = tmp_path / "plain.npy", io.BytesIO()
+        np.save(stream, np.array(None, dtype=object), allow_pickle=True)
+        pickled = pickle.dumps(np.array(values, dtype=object), protocol=protocol)
+        path.write_bytes(stream.getvalue()[:128] + pickletools.optimize(pickled))
+        assert read_dict(path) == values
+
+
+# Images beside it ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def with_images(kitti_drive: Path, tmp_path: Path, shared_cache: None) -> Path:
+    """Return a recording without features, and the images of a drive towards a wall beside it."""
+    sides = [sorted((kitti_drive / f"image_{side}").iterdir()) for side in (0, 1)]
+    left, right = ([cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths] for paths in sides)
+    count = len(left)
+    K = np.array([[250.0, 0.0, 160.0], [0.0, 250.0, 100.0], [0.0, 0.0, 1.0]])
+    T_imu_right = T_REGULAR_OPTICAL @ se3(np.eye(3), np.array([0.4, 0.0, 0.0]))
+    content: dict[str, Array] = {
+        "v_t": np.tile([1.5, 0.0, 0.0], (count, 1)),
+        "w_t": np.zeros((count, 3)),
+        "timestamps": 1.7e9 + np.arange(count) / 30.0,
+        **{"K_l": K, "K_r": K, "extL_T_imu": T_REGULAR_OPTICAL, "extR_T_imu": T_imu_right},
+    }
+    saved(tmp_path, {"cam_imgs_L": left, "cam_imgs_R": right}, "dataset02_imgs.npy")
+    return saved(tmp_path, content, "dataset02.npy")
+
+
+def test_tracks_are_those_of_the_images_as_files(with_images: Path, kitti_drive: Path) -> None:
+    sequence, expected = load_sequence(str(with_images)), load_sequence(str(kitti_drive)).observations
+    np.testing.assert_array_equal(sequence.observations.uv_px, expected.uv_px)
+    np.testing.assert_array_equal(sequence.observations.track_id, expected.track_id)
+    assert sequence.provenance.facts[0].startswith("stereo tracks made of 8 image pairs")
+
+
+def test_unpacked_images_go_when_they_are_no_longer_used(with_images: Path) -> None:
+    recording = load_images(str(with_images))
+    image = recording.pairs[0].left
+    assert image.is_file()
+    del recording
+    assert not image.parent.parent.exists()
+
+
+def test_features_are_taken_before_images_unless_asked(with_images: Path) -> None:
+    content = {key: value.read() for key, value in read_dict(with_images).items()}
+    with_images = saved(with_images.parent, {**content, "features": np.full((4, 2, 8), -1.0)}, with_images.name)
+    assert len(load_sequence(str(with_images)).observations) == 0
+    assert len(load_sequence(str(with_images), 0, Frontend(tracks="images")).observations) > 0
+    with pytest.raises(DataError, match="leave --tracks simulated out"):
+        load_sequence(str(with_images), 0, Frontend(tracks="simulated"))
+
+
+@pytest.mark.parametrize(
+    ("images", "pattern"),
+    [
+        ([np.zeros((4, 4), np.uint8)] * 3, "cam_imgs_L has 3 images and dataset02.npy 8 timestamps"),
+        ([np.zeros((4, 4))] * 8, r"cam_imgs_L\[0\] is no array \(height, width\) of uint8"),
+        (None, "cam_imgs_L is missing or no list of images"),
+    ],
+)
+def test_images_that_do_not_belong_are_refused(with_images: Path, images: Any, pattern: str) -> None:
+    saved(with_images.parent, {"cam_imgs_L": images, "cam_imgs_R": images}, "dataset02_imgs.npy")
+    with pytest.raises(DataError, match=pattern):
+        load_sequence(str(with_images))

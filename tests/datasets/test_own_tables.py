@@ -1,0 +1,225 @@
+"""Own tables: a recording comes back as it was, from files and from Python alike, and what is wrong is named."""
+
+import gzip
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import toolkit
+from toolkit.cli import main
+from toolkit.datasets import own_tables
+from toolkit.datasets.trajectories import tum
+from toolkit.errors import DataError, OutputError
+from toolkit.estimate import Trajectory
+from toolkit.sequence import Sequence
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+
+Refused = Callable[..., None]
+NAMES = {"imu": own_tables.IMU, "twist": own_tables.TWIST}
+
+
+@cache
+def recorded(kind: str) -> Sequence:
+    scenario = {"imu": FLIGHT, "twist": DRIVE}[kind]
+    return simulate(replace(scenario, duration_s=1.0, camera=replace(scenario.camera, max_tracks=10)), 0)
+
+
+def rig_of(sequence: Sequence) -> dict[str, Any]:
+    rig = {key: getattr(sequence.rig, key) for key in ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")}
+    noise = {
+        key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in vars(sequence.noise).items()
+    }
+    T_imu_cam, sigma_px = sequence.rig.T_imu_cam.tolist(), float(np.sqrt(sequence.rig.cov_uv_px2[0, 0]))
+    gravity = sequence.gravity_world.tolist()
+    return {**rig, "T_imu_cam": T_imu_cam, "pixel_sigma_px": sigma_px, "gravity_world": gravity, "noise": noise}
+
+
+def tables_of(sequence: Sequence) -> dict[str, dict[str, Any]]:
+    seen, (u_left, u_right, v) = sequence.observations, sequence.observations.uv_px.T
+    rows = {"vL": v, "vR": v} if sequence.rig.cov_uv_px2[2, 2] < sequence.rig.cov_uv_px2[0, 0] else {"v": v}
+    tracks = {"t_ns": sequence.frames_t_ns[seen.frame], "track_id": seen.track_id, "uL": u_left, "uR": u_right, **rows}
+    motion = zip(NAMES[sequence.motion_kind], sequence.motion.values.T, strict=True)
+    return {"tracks": tracks, "motion": {"t_ns": sequence.motion.t_ns, **dict(motion)}}
+
+
+def as_csv(table: dict[str, Any]) -> str:
+    rows = zip(*(np.asarray(column).tolist() for column in table.values()), strict=True)
+    return "\n".join([",".join(table), *(",".join(map(repr, row)) for row in rows)]) + "\n"
+
+
+def as_toml(values: dict[str, Any]) -> str:
+    noise = "".join(f"{key} = {value}\n" for key, value in values["noise"].items())
+    return "".join(f"{key} = {value}\n" for key, value in values.items() if key != "noise") + f"[noise]\n{noise}"
+
+
+def written(sequence: Sequence, folder: Path) -> Path:
+    """Write a sequence as own tables and return their folder."""
+    folder.mkdir()
+    tables, truth = tables_of(sequence), sequence.truth
+    assert truth is not None
+    (folder / "tracks.csv").write_text(as_csv(tables["tracks"]))
+    (folder / f"{sequence.motion_kind}.csv").write_text(as_csv(tables["motion"]))
+    (folder / "rig.toml").write_text(as_toml(rig_of(sequence)))
+    (folder / "truth.tum").write_text(tum.text(Trajectory(truth.t_ns, truth.T_world_imu)))
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["imu", "twist"])
+def test_a_recording_comes_back_to_the_bit(tmp_path: Path, kind: str) -> None:
+    original, read = recorded(kind), toolkit.load_sequence(str(written(recorded(kind), tmp_path / "own")))
+    np.testing.assert_array_equal(read.frames_t_ns, original.frames_t_ns)
+    np.testing.assert_array_equal(read.observations.uv_px, original.observations.uv_px)
+    np.testing.assert_array_equal(read.observations.track_id, original.observations.track_id)
+    np.testing.assert_array_equal(read.motion.values, original.motion.values)
+    np.testing.assert_allclose(read.rig.cov_uv_px2, original.rig.cov_uv_px2, rtol=1e-12)
+    assert {key: np.max(value) for key, value in vars(read.noise).items()} == {
+        key: np.max(value) for key, value in vars(original.noise).items()
+    }
+    assert read.truth is not None
+    assert read.provenance.format == "own-tables"
+
+
+def test_the_folder_the_command_and_python_give_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sequence = recorded("imu")
+    folder = written(sequence, tmp_path / "own")
+    words = ("--tracks", "tracks.csv", "--motion", "imu.csv", "--rig", "rig.toml", "--truth", "truth.tum")
+    places = [str(folder / word) if not word.startswith("--") else word for word in words]
+    assert main(["import", *places, "--out", str(tmp_path / "imported")]) == 0
+    assert f"{sequence.frame_count} frames" in capsys.readouterr().out
+    saved = toolkit.save(tmp_path / "saved", **tables_of(sequence), rig=rig_of(sequence), truth=folder / "truth.tum")
+    hashes = {toolkit.load_sequence(str(path)).content_hash() for path in (folder, tmp_path / "imported", saved)}
+    assert len(hashes) == 1
+
+
+def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Path) -> None:
+    folder = written(recorded("twist"), tmp_path / "own")
+    expected = toolkit.load_sequence(str(folder)).content_hash()
+    for name in ("tracks.csv", "twist.csv"):
+        heading, *lines = (folder / name).read_text().splitlines()
+        shuffled = [line.split(",") for line in lines]
+        seconds = [f"{row[0][:-9]}.{row[0][-9:]}" for row in shuffled]
+        rows = [",".join([*row[:0:-1], t, "0"]) for row, t in zip(shuffled, seconds, strict=True)]
+        names = ",".join([*heading.split(",")[:0:-1], "t", "comment"])
+        (folder / name).unlink()
+        (folder / f"{name}.gz").write_bytes(gzip.compress("\r\n".join([names, *rows]).encode()))
+    assert toolkit.load_sequence(str(folder)).content_hash() == expected
+    tables = own_tables.read("own", folder / "tracks.csv.gz", folder / "twist.csv.gz", folder / "rig.toml")
+    assert [name.rpartition(" ")[2] for name in tables.unused] == ["comment", "comment"]
+
+
+def test_without_a_stated_noise_a_twist_has_that_of_its_scatter(tmp_path: Path) -> None:
+    rig = rig_of(recorded("twist"))
+    del rig["noise"]
+    read = own_tables.read("own", **tables_of(recorded("twist")), rig=rig).sequence
+    assert all((np.asarray(value) > 0.0).all() for value in vars(read.noise).values())
+
+
+TRACKS = [
+    ("track_id", "trackid", r"missing column track_id \(rename trackid\?\); it has t_ns, trackid"),
+    ("\n", "\n#,", r"line 2 has 6 columns, expected 5|line 2 has 7 columns, expected 6"),
+    ("uL", "uR", "a column name is there twice"),
+    ("t_ns,", "t,", "must be in seconds, but the stamps look like nanoseconds"),
+]
+
+
+@pytest.mark.parametrize(("before", "after", "pattern"), TRACKS)
+def test_a_wrong_table_is_named_with_its_column(
+    tmp_path: Path, assert_refused: Refused, before: str, after: str, pattern: str
+) -> None:
+    folder = written(recorded("imu"), tmp_path / "own")
+    path = folder / "tracks.csv"
+    path.write_text(path.read_text().replace(before, after, 1))
+    assert_refused(lambda: toolkit.load_sequence(str(folder)), path, pattern)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "pattern"),
+    [
+        (4, 1, "x", "line 5: track_id is x, expected a whole number"),
+        (4, 1, "1.5", "line 5: track_id is 1.5, expected a whole number"),
+        (6, 2, "", "line 7: uL is empty, expected a number"),
+        (3, 0, "never", "line 4: t_ns is never, expected a whole number"),
+        (3, 0, "1" * 30, "line 4: t_ns is 1+, expected a whole number"),
+    ],
+)
+def test_a_wrong_cell_is_named_with_its_line(
+    tmp_path: Path, assert_refused: Refused, row: int, column: int, value: str, pattern: str
+) -> None:
+    folder = written(recorded("imu"), tmp_path / "own")
+    path = folder / "tracks.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[row].split(",")
+    cells[column] = value
+    path.write_text("\n".join([*lines[:row], ",".join(cells), *lines[row + 1 :]]))
+    assert_refused(lambda: toolkit.load_sequence(str(folder)), path, pattern)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "pattern"),
+    [
+        ("baseline_m", "baseline", "there is no baseline; did you mean baseline_m"),
+        ("accel_noise_density", "acc_noise_density", "there is no noise.acc_noise_density; did you mean"),
+        ("fx_px = ", "fx_px = -", "fx_px is -.*, expected a positive number"),
+        ("cy_px = ", "cy_px = '", "is not TOML"),
+        ("T_imu_cam = [[", "T_imu_cam = [[7.0, ", "T_imu_cam"),
+        ("T_imu_cam = [[", "T_imu_cam = [[1, 2, 3, 4], [", "T_imu_cam"),
+        ("gyro_random_walk", "#", "missing noise.gyro_random_walk; an IMU's data sheet has them"),
+    ],
+)
+def test_a_wrong_calibration_is_named_with_its_key(
+    tmp_path: Path, assert_refused: Refused, before: str, after: str, pattern: str
+) -> None:
+    folder = written(recorded("imu"), tmp_path / "own")
+    path = folder / "rig.toml"
+    path.write_text(path.read_text().replace(before, after, 1))
+    assert_refused(lambda: toolkit.load_sequence(str(folder)), path, pattern)
+
+
+def test_a_track_twice_in_a_frame_is_refused(tmp_path: Path, assert_refused: Refused) -> None:
+    folder = written(recorded("imu"), tmp_path / "own")
+    path = folder / "tracks.csv"
+    path.write_text(path.read_text() + path.read_text().splitlines()[3] + "\n")
+    assert_refused(lambda: toolkit.load_sequence(str(folder)), path, "is there twice in its frame")
+
+
+def test_values_given_in_python_are_named_too(tmp_path: Path) -> None:
+    sequence = recorded("twist")
+    given = {**tables_of(sequence), "rig": rig_of(sequence)}
+    shorter = {**given["tracks"], "uL": given["tracks"]["uL"][:-1]}
+    for wrong, pattern in (
+        ({"tracks": shorter}, "tracks: its columns differ in length: t_ns"),
+        ({"tracks": np.zeros((3, 4))}, "tracks: is no mapping of column names to values"),
+        ({"motion": {"t_ns": [1]}}, "motion: missing column ax, ay"),
+        ({"rig": {}}, "rig: missing fx_px, fy_px"),
+        ({"truth": {"t": [1.0]}}, "truth: missing column x, y"),
+    ):
+        with pytest.raises(DataError, match=pattern):
+            toolkit.save(tmp_path / "own", **(given | wrong))
+    assert not (tmp_path / "own").exists()
+
+
+def test_nothing_of_anybody_is_written_over(tmp_path: Path) -> None:
+    sequence = recorded("twist")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own/thesis.txt").touch()
+    with pytest.raises(OutputError, match="holds other files"):
+        toolkit.save(tmp_path / "own", **tables_of(sequence), rig=rig_of(sequence))
+
+
+def test_a_folder_with_a_table_missing_is_told_which(tmp_path: Path) -> None:
+    folder = written(recorded("imu"), tmp_path / "own")
+    (folder / "imu.csv").unlink()
+    with pytest.raises(DataError, match=r"missing imu\.csv or twist\.csv"):
+        toolkit.load_sequence(str(folder))
+
+
+def test_what_is_saved_says_it_is_of_own_tables(tmp_path: Path) -> None:
+    sequence = recorded("twist")
+    saved = toolkit.save(tmp_path / "own", **tables_of(sequence), rig=rig_of(sequence))
+    assert json.loads((saved / "recording.json").read_text())["provenance"]["format"] == "own-tables"

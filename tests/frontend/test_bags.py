@@ -1,0 +1,373 @@
+"""Bags of ROS 1, ROS 2 and MCAP: the same recording as the folder they were written of, and what is told where not."""
+
+import importlib.util
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags", reason='bags are read and written with rosbags: pip install ".[bags]"')
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from toolkit.cli import main
+from toolkit.cli.arguments import TOPIC_ROLES
+from toolkit.datasets import load_images, load_sequence
+from toolkit.datasets.io import bag_reader
+from toolkit.datasets.io.bag_topics import ROLES
+from toolkit.errors import DataError
+from toolkit.measured_motion import ImuNoise, TwistSamples
+from toolkit.models.noise import mems_imu
+from toolkit.settings import Frontend
+
+TF = "tf2_msgs/msg/TFMessage"
+KINDS = ("ros1", "sqlite", "mcap")
+
+
+class Item(NamedTuple):
+    """A message to be written."""
+
+    t_ns: int
+    topic: str
+    type: str
+    value: Any
+
+
+@dataclass(frozen=True)
+class Ros:
+    """The messages of one generation of ROS."""
+
+    kind: str
+    store: Any
+
+    @classmethod
+    @cache
+    def of(cls, kind: str) -> "Ros":
+        store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        if TF not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+        return cls(kind, store)
+
+    def make(self, name: str, *values: Any) -> Any:
+        return self.store.types[name.replace("/", "/msg/")](*values)
+
+    def header(self, t_ns: int, frame: str) -> Any:
+        stamp = self.make("builtin_interfaces/Time", *divmod(int(t_ns), 10**9))
+        return self.make("std_msgs/Header", *(() if self.kind != "ros1" else (0,)), stamp, frame)
+
+    def vector(self, values: Any) -> Any:
+        return self.make("geometry_msgs/Vector3", *map(float, values))
+
+    def pose(self, values: Any) -> Any:
+        position = self.make("geometry_msgs/Point", *map(float, values[:3]))
+        return self.make("geometry_msgs/Pose", position, self.make("geometry_msgs/Quaternion", *map(float, values[3:])))
+
+    def imu(self, t_ns: int, gyro: Any, accel: Any) -> Item:
+        turn = self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        nothing = np.zeros(9)
+        parts = (turn, nothing, self.vector(gyro), nothing, self.vector(accel), nothing)
+        return Item(
+            t_ns, "/imu0", "sensor_msgs/msg/Imu", self.make("sensor_msgs/Imu", self.header(t_ns, "imu0"), *parts)
+        )
+
+    def image(self, t_ns: int, camera: str, image: np.ndarray, encoding: str = "mono8") -> Item:
+        step = image.strides[0]
+        parts = (*image.shape[:2], encoding, 0, step, np.ascontiguousarray(image).view(np.uint8).ravel())
+        value = self.make("sensor_msgs/Image", self.header(t_ns, camera), *parts)
+        return Item(t_ns, f"/{camera}/image_raw", "sensor_msgs/msg/Image", value)
+
+    def compressed(self, t_ns: int, camera: str, content: bytes) -> Item:
+        parts = ("png", np.frombuffer(content, np.uint8))
+        value = self.make("sensor_msgs/CompressedImage", self.header(t_ns, camera), *parts)
+        return Item(t_ns, f"/{camera}/image_raw/compressed", "sensor_msgs/msg/CompressedImage", value)
+
+    def camera_info(self, t_ns: int, camera: str, sensor: Mapping[str, Any]) -> Item:
+        fx, fy, cx, cy = sensor["intrinsics"]
+        K = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+        lens = np.array([*sensor["distortion_coefficients"], 0.0])
+        region = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
+        width, height = sensor["resolution"]
+        parts = (height, width, "plumb_bob", lens, K, np.zeros(9), np.zeros(12), 0, 0, region)
+        value = self.make("sensor_msgs/CameraInfo", self.header(t_ns, camera), *parts)
+        return Item(t_ns, f"/{camera}/camera_info", "sensor_msgs/msg/CameraInfo", value)
+
+    def transform(self, t_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+        turn = self.make("geometry_msgs/Quaternion", *Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
+        moved = self.make("geometry_msgs/Transform", self.vector(T[:3, 3]), turn)
+        return self.make("geometry_msgs/TransformStamped", self.header(t_ns, parent), child, moved)
+
+    def static(self, t_ns: int, transforms: list[Any]) -> Item:
+        return Item(t_ns, "/tf_static", TF, self.store.types[TF](transforms))
+
+    def pose_stamped(self, t_ns: int, values: Any) -> Item:
+        value = self.make("geometry_msgs/PoseStamped", self.header(t_ns, "world"), self.pose(values))
+        return Item(t_ns, "/ground_truth/pose", "geometry_msgs/msg/PoseStamped", value)
+
+    def odometry(self, t_ns: int, pose: Any, linear: Any, angular: Any) -> Item:
+        twist = self.make("geometry_msgs/Twist", self.vector(linear), self.vector(angular))
+        twists = self.make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
+        poses = self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), np.zeros(36))
+        value = self.make("nav_msgs/Odometry", self.header(t_ns, "odom"), "imu0", poses, twists)
+        return Item(t_ns, "/odom", "nav_msgs/msg/Odometry", value)
+
+    def text(self, t_ns: int, text: str) -> Item:
+        return Item(t_ns, "/chatter", "std_msgs/msg/String", self.make("std_msgs/String", text))
+
+    def write(self, path: Path, items: list[Item]) -> Path:
+        """Write messages to a bag in order of time and return its path."""
+        storage = {"sqlite": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}.get(self.kind)
+        writer = Writer1(path) if storage is None else Writer2(path, version=9, storage_plugin=storage)
+        serialize = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
+        connections: dict[str, Any] = {}
+        with writer:
+            for item in sorted(items, key=lambda one: one.t_ns):
+                if item.topic not in connections:
+                    connections[item.topic] = writer.add_connection(item.topic, item.type, typestore=self.store)
+                writer.write(connections[item.topic], item.t_ns, serialize(item.value, item.type))
+        return path
+
+
+def sensor(folder: Path) -> dict[str, Any]:
+    """Return a sensor.yaml."""
+    text = (folder / "sensor.yaml").read_text().removeprefix("%YAML:1.0\n")
+    return dict(yaml.safe_load(text))
+
+
+def motion_of(asl: Path, ros: Ros) -> Iterator[Item]:
+    """Yield the IMU of an ASL folder."""
+    for line in (asl / "mav0/imu0/data.csv").read_text().splitlines()[1:]:
+        t, *values = line.split(",")
+        yield ros.imu(int(t), values[:3], values[3:])
+
+
+def images_of(asl: Path, make: Callable[[int, str, Path], Item]) -> Iterator[Item]:
+    """Yield the images of an ASL folder."""
+    for camera in ("cam0", "cam1"):
+        for path in sorted((asl / "mav0" / camera / "data").iterdir()):
+            yield make(int(path.stem), camera, path)
+
+
+def truth_of(asl: Path, ros: Ros) -> Iterator[Item]:
+    """Yield the truth of an ASL folder, from its TUM file."""
+    for line in next(asl.glob("*.tum")).read_text().splitlines():
+        if not line.startswith("#"):
+            t, *values = line.split()
+            yield ros.pose_stamped(int(Decimal(t) * 10**9), values)
+
+
+def raw(ros: Ros) -> Callable[[int, str, Path], Item]:
+    """Return a maker of raw grey images."""
+    return lambda t_ns, camera, path: ros.image(t_ns, camera, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+
+
+def calibration_of(asl: Path, ros: Ros, t_ns: int) -> Iterator[Item]:
+    """Yield the calibration of an ASL folder as messages."""
+    sensors = {camera: sensor(asl / "mav0" / camera) for camera in ("cam0", "cam1")}
+    mounted = {camera: np.array(one["T_BS"]["data"]).reshape(4, 4) for camera, one in sensors.items()}
+    yield ros.static(t_ns, [ros.transform(t_ns, "imu0", camera, T) for camera, T in mounted.items()])
+    for camera, one in sensors.items():
+        yield ros.camera_info(t_ns, camera, one)
+
+
+def written(asl: Path, kind: str, folder: Path, items: list[Item]) -> Path:
+    """Write a bag into a folder, with the calibration files of an ASL folder beside it where there is one."""
+    folder.mkdir(exist_ok=True)
+    for name in ("cam0", "cam1", "imu0"):
+        (folder / name).mkdir()
+        shutil.copy(asl / "mav0" / name / "sensor.yaml", folder / name)
+    return Ros.of(kind).write(folder / ("film.bag" if kind == "ros1" else "film"), items)
+
+
+def film_of(asl: Path, ros: Ros) -> list[Item]:
+    """Return the whole of an ASL folder as messages, and one that nobody needs."""
+    film = [*motion_of(asl, ros), *images_of(asl, raw(ros)), *truth_of(asl, ros)]
+    return [*film, ros.text(film[0].t_ns, "hello")]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_bag_is_the_folder_it_was_written_of(asl: Path, tmp_path: Path, kind: str) -> None:
+    bag = load_sequence(str(written(asl, kind, tmp_path / "bag", film_of(asl, Ros.of(kind)))))
+    assert bag.content_hash() == load_sequence(str(asl)).content_hash()
+    assert bag.name == "film"
+    topics = "left /cam0/image_raw (guessed), right /cam1/image_raw (guessed), imu /imu0 (guessed)"
+    assert f"topics: {topics}, truth /ground_truth/pose (guessed)" in bag.provenance.facts
+    assert "topics not used: /chatter (std_msgs/String)" in bag.provenance.facts
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_bag_that_brings_its_calibration_needs_no_file_beside_it(asl: Path, tmp_path: Path, kind: str) -> None:
+    ros = Ros.of(kind)
+    film = [*motion_of(asl, ros), *images_of(asl, lambda t, camera, path: ros.compressed(t, camera, path.read_bytes()))]
+    path = ros.write(
+        tmp_path / ("bare.bag" if kind == "ros1" else "bare"), [*film, *calibration_of(asl, ros, film[0].t_ns)]
+    )
+    bag, folder = load_sequence(str(path)), load_sequence(str(asl))
+    # A quaternion keeps fifteen digits of a rotation, and sensor.yaml has twelve.
+    np.testing.assert_allclose(bag.rig.T_imu_cam, folder.rig.T_imu_cam, atol=1e-9)
+    assert bag.rig.baseline_m == pytest.approx(folder.rig.baseline_m, rel=1e-9)
+    assert len(bag.observations) == len(folder.observations)
+    np.testing.assert_allclose(bag.observations.uv_px, folder.observations.uv_px, atol=1e-3)
+    assert bag.noise == mems_imu()
+    assert any(fact.startswith("no noise of the IMU is stated") for fact in bag.provenance.facts)
+    assert bag.truth is None
+    keys = ("accelerometer_noise_density", "gyroscope_noise_density")
+    keys += ("accelerometer_random_walk", "gyroscope_random_walk")
+    (tmp_path / "imu.yaml").write_text("imu0:\n" + "".join(f"  {key}: 0.0{i + 1}\n" for i, key in enumerate(keys)))
+    assert load_sequence(str(path)).noise == ImuNoise(0.01, 0.02, 0.03, 0.04)
+
+
+def test_an_odometer_stands_for_the_motion_where_there_is_no_imu(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("mcap")
+    poses = list(truth_of(asl, ros))
+    twists = [
+        ros.odometry(one.t_ns, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], [0.3, 0.1, 0.0], [0.0, 0.0, 0.2]) for one in poses
+    ]
+    bag = load_sequence(str(written(asl, "mcap", tmp_path / "bag", [*images_of(asl, raw(ros)), *twists])))
+    assert isinstance(bag.motion, TwistSamples)
+    np.testing.assert_array_equal(bag.motion.values[0], [0.3, 0.1, 0.0, 0.0, 0.0, 0.2])
+    assert "twist /odom (guessed)" in next(fact for fact in bag.provenance.facts if fact.startswith("topics: "))
+    # Another system's estimate is no truth unless it is said to be.
+    assert bag.truth is None
+
+
+def test_poses_of_another_frame_are_moved_to_the_body(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("sqlite")
+    T_imu_marker = np.eye(4)
+    T_imu_marker[:3, 3] = [0.1, 0.2, 0.3]
+    poses = list(truth_of(asl, ros))
+    marked = []
+    for one in poses:
+        at, turn = one.value.pose.position, one.value.pose.orientation
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+        T[:3, 3] = [at.x, at.y, at.z]
+        value = ros.transform(one.t_ns, "world", "marker", T @ T_imu_marker)
+        marked.append(Item(one.t_ns, "/vicon/marker", bag_reader.TRANSFORM, value))
+    static = ros.static(poses[0].t_ns, [ros.transform(poses[0].t_ns, "imu0", "marker", T_imu_marker)])
+    film = [*motion_of(asl, ros), *images_of(asl, raw(ros)), *marked, static]
+    truth = load_sequence(str(written(asl, "sqlite", tmp_path / "bag", film))).truth
+    expected = load_sequence(str(asl)).truth
+    assert truth is not None
+    assert expected is not None
+    np.testing.assert_allclose(truth.T_world_imu, expected.T_world_imu, atol=1e-9)
+
+
+def test_topics_are_those_said(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("sqlite")
+    film = [
+        item._replace(topic=item.topic.replace("/cam0/", "/port/").replace("/cam1/", "/starboard/"))
+        for item in film_of(asl, ros)
+    ]
+    path = written(asl, "sqlite", tmp_path / "bag", film)
+    with pytest.raises(DataError, match=r"no two topics of images are a stereo pair.*--topics left=TOPIC,right=TOPIC"):
+        load_sequence(str(path))
+    frontend = Frontend(topics="left=/port/image_raw, right=/starboard/image_raw")
+    assert load_sequence(str(path), 0, frontend).content_hash() == load_sequence(str(asl)).content_hash()
+    assert len(load_images(str(path), frontend).pairs) == 10
+    for wrong, pattern in (
+        ("left=/prot/image_raw", r"no topic is called /prot/image_raw \(did you mean /port/image_raw"),
+        ("imu=/chatter", r"/chatter \(std_msgs/String\) cannot be imu, which is sensor_msgs/Imu"),
+        ("ears=/imu0", "no role is called ears; there are left, right"),
+    ):
+        with pytest.raises(DataError, match=pattern):
+            load_sequence(str(path), 0, Frontend(topics=wrong))
+
+
+def test_the_roles_offered_are_those_there_are() -> None:
+    assert tuple(ROLES) == TOPIC_ROLES
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str) -> None:
+    path = written(asl, kind, tmp_path / "bag", film_of(asl, Ros.of(kind)))
+    file = path if kind == "ros1" else next(path.glob("*.mcap"))
+    shutil.move(file, tmp_path / "bag/download")
+    assert len(load_sequence(str(tmp_path / "bag/download")).observations) > 0
+
+
+@pytest.mark.parametrize(
+    ("left_out", "pattern"),
+    [
+        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry"),
+        ("/cam1/image_raw", "no two topics of images are a stereo pair"),
+        ("/cam0/camera_info", "there is no sensor_msgs/CameraInfo beside /cam0/image_raw"),
+        (
+            "/tf_static",
+            "nothing tells where the camera is on the body: no /tf_static joins the frames 'imu0' and 'cam0'",
+        ),
+    ],
+)
+def test_what_is_missing_is_told_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:
+    ros = Ros.of("sqlite")
+    film = film_of(asl, ros)
+    film = [item for item in [*film, *calibration_of(asl, ros, film[0].t_ns)] if item.topic != left_out]
+    with pytest.raises(DataError, match=pattern) as told:
+        load_sequence(str(ros.write(tmp_path / "bare", film)))
+    assert "\n" not in str(told.value)
+
+
+def test_without_the_library_a_bag_is_recognised_and_the_extra_named(
+    asl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(asl, "ros1", tmp_path / "bag", film_of(asl, Ros.of("ros1")))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    with pytest.raises(DataError, match=r"pip install \"vislam-toolkit\[bags\]\""):
+        load_sequence(str(path))
+
+
+def test_a_type_that_is_not_ros_own_is_not_read(asl: Path, tmp_path: Path) -> None:
+    """Another definition under the name of an IMU, whose code is never made."""
+    ros = Ros.of("ros1")
+    path = written(asl, "ros1", tmp_path / "bag", film_of(asl, ros))
+    content = path.read_bytes()
+    digest = ros.store.generate_msgdef("sensor_msgs/msg/Imu")[1].encode()
+    path.write_bytes(content.replace(digest, digest[::-1]))
+    with pytest.raises(DataError, match="no sensor_msgs/Imu"):
+        load_sequence(str(path))
+    with bag_reader.opened(path) as bag:
+        assert any("of another definition than ROS's" in str(topic) for topic in bag.topics)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_a_damaged_bag_is_read_or_refused_in_one_line(asl: Path, tmp_path: Path, kind: str) -> None:
+    """Cut and flipped at twelve places each, spread over the file."""
+    ros = Ros.of(kind)
+    few = [item for item in film_of(asl, ros) if item.topic in ("/imu0", "/chatter")][:40]
+    path = written(asl, kind, tmp_path / "bag", few)
+    file = path if kind == "ros1" else next(path.glob("*.mcap"))
+    content = file.read_bytes()
+    for place in np.linspace(20, len(content) - 1, 12).astype(int).tolist():
+        flipped = content[:place] + bytes([content[place] ^ 0x5A]) + content[place + 1 :]
+        for damaged in (content[:place], flipped):
+            file.write_bytes(damaged)
+            with pytest.raises(DataError) as told:
+                load_sequence(str(file))
+            assert "\n" not in str(told.value)
+            assert str(file) in str(told.value)
+
+
+def test_a_bag_that_breaks_off_leaves_nothing_behind(
+    asl: Path, tmp_path: Path, own_cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The images before the damage are unpacked already, and the run's directory is not there yet."""
+    ros = Ros.of("ros1")
+    film = film_of(asl, ros)
+    broken = ros.image(film[-2].t_ns, "cam1", np.zeros((4, 4), np.uint8), encoding="32FC1")
+    path = written(asl, "ros1", tmp_path / "bag", [*film, broken])
+    assert main(["compare", str(path), "--estimators", "dead-reckoning", "--out", str(tmp_path / "run")]) == 3
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "/cam1/image_raw: message" in told
+    assert not (tmp_path / "run").exists()
+    assert list(own_cache.glob("images-*")) == []

@@ -1,0 +1,189 @@
+"""The border to the rosbags library: which kind of bag a path is, its topics, and its messages, one by one.
+
+Messages are read with the library's own definitions of ROS's types and never with those a bag brings, for code is made
+of these. Whatever a damaged bag makes the library raise becomes a DataError.
+Formats: http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the folders and SQLite files of rosbag2.
+"""
+
+import importlib.util
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from toolkit.errors import DataError, VislamError, printable
+from toolkit.inputs import is_regular, open_input
+
+Kind = Literal["ros1", "mcap", "sqlite", "folder"]
+_MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}
+_SQLITE, _ROS_TABLES = b"SQLite format 3\0", (b"topics", b"messages")
+_METADATA, _IN_METADATA = "metadata.yaml", b"rosbag2_bagfile_information"
+_LOOKED_AT = 1 << 16
+_TF, _TF_DEFINITION = "tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms"
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, IMU, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", _TF
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
+KNOWN_TYPES = frozenset({IMAGE, COMPRESSED, CAMERA_INFO, IMU, TRANSFORMS, ODOMETRY, POSE, TRANSFORM})
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: its name, the type of its messages, how many there are, and why they cannot be read."""
+
+    name: str
+    type: str
+    count: int
+    unreadable: str = ""
+
+    def __str__(self) -> str:
+        why = f", {self.unreadable}" if self.unreadable else ""
+        return f"{printable(self.name)} ({printable(self.type).replace('/msg/', '/')}{why})"
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A message as the library decodes it, its topic, and when it was recorded (ns)."""
+
+    topic: str
+    t_ns: int
+    value: Any
+
+
+def kind_of(path: Path) -> Kind | None:
+    """Return the kind of bag a path is, from its content; None where it is none."""
+    if path.is_dir():
+        return "folder" if _of_rosbag2(path / _METADATA) else None
+    if not is_regular(path):
+        return None
+    with open_input(path) as file:
+        begin = file.read(_LOOKED_AT)
+    if begin.startswith(_SQLITE):
+        return "sqlite" if all(table in begin for table in _ROS_TABLES) else None
+    return next((kind for magic, kind in _MAGIC.items() if begin.startswith(magic)), None)
+
+
+def _of_rosbag2(metadata: Path) -> bool:
+    if not is_regular(metadata):
+        return False
+    with open_input(metadata) as file:
+        return _IN_METADATA in file.read(_LOOKED_AT)
+
+
+class Bag:
+    """An open bag."""
+
+    def __init__(self, path: Path, kind: Kind, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+        self._of_ros1 = kind == "ros1"
+        with _guarded(path):
+            self._connections = list(reader.connections)
+            self.topics = tuple(self._topic(name) for name in sorted({c.topic for c in self._connections}))
+
+    def messages(self, topics: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of some topics in the order of recording; raises DataError where one is damaged."""
+        connections = [connection for connection in self._connections if connection.topic in topics]
+        coming = iter(self._reader.messages(connections)) if connections else iter(())
+        while True:
+            with _guarded(self.path):
+                found = next(coming, None)
+                if found is None:
+                    return
+                connection, t_ns, raw = found
+                message = Message(connection.topic, t_ns, self._decoder(connection)(raw, connection.msgtype))
+            yield message
+
+    def _topic(self, name: str) -> Topic:
+        connections = [connection for connection in self._connections if connection.topic == name]
+        types = sorted({connection.msgtype for connection in connections})
+        count = sum(connection.msgcount or 0 for connection in connections)
+        unreadable = "" if types[0] not in KNOWN_TYPES else self._why_not(connections)
+        return Topic(name, types[0] if len(types) == 1 else " and ".join(types), count, unreadable)
+
+    def _why_not(self, connections: list[Any]) -> str:
+        """Return why messages of a known type cannot be read, nothing where they can."""
+        for connection in connections:
+            encoding = self._encoding(connection)
+            if encoding not in ("cdr", "ros1"):
+                return f"encoded as {printable(encoding)}"
+            digest, store = connection.digest, _store(encoding == "ros1")
+            if digest and digest != _digest(store, connection.msgtype, of_ros1=self._of_ros1):
+                return "of another definition than ROS's"
+        return ""
+
+    def _decoder(self, connection: Any) -> Callable[[bytes, str], Any]:
+        of_ros1 = self._encoding(connection) == "ros1"
+        store = _store(of_ros1)
+        decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if of_ros1 else store.deserialize_cdr
+        return decode
+
+    def _encoding(self, connection: Any) -> str:
+        return "ros1" if self._of_ros1 else str(getattr(connection.ext, "serialization_format", "cdr"))
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bag]:
+    """Open a bag; raises DataError where it is damaged, or the library is not installed."""
+    kind = kind_of(path)
+    if kind is None:
+        raise DataError(f"{path}: is no bag of ROS 1 or 2 and no MCAP")
+    if importlib.util.find_spec("rosbags") is None:
+        raise DataError(f'{path}: bags are read with the package rosbags; pip install "vislam-toolkit[bags]"')
+    with _guarded(path):
+        reader = _reader(kind)(path)
+        reader.open()
+    try:
+        yield Bag(path, kind, reader)
+    finally:
+        reader.close()
+
+
+def _reader(kind: Kind) -> Any:
+    """Return the class that reads a kind of bag, whatever the file is called."""
+    if kind == "ros1":
+        from rosbags.rosbag1 import Reader as Reader1
+
+        return Reader1
+    if kind == "folder":
+        from rosbags.rosbag2 import Reader as Reader2
+
+        return Reader2
+    from rosbags.rosbag2.storage_mcap import McapReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    return McapReader if kind == "mcap" else Sqlite3Reader
+
+
+@cache
+def _store(of_ros1: bool) -> Any:
+    """Return the definitions of ROS's messages."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if of_ros1 else Stores.ROS2_HUMBLE)
+    if _TF not in store.types:
+        store.register(get_types_from_msg(_TF_DEFINITION, _TF))
+    return store
+
+
+@cache
+def _digest(store: Any, message_type: str, *, of_ros1: bool) -> str:
+    """Return what bags state of a type's definition: MD5 in ROS 1, RIHS in ROS 2."""
+    return str(store.generate_msgdef(message_type)[1] if of_ros1 else store.hash_rihs01(message_type))
+
+
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """Raise as DataError whatever the library raises: of a damaged bag that can be anything."""
+    try:
+        yield
+    except VislamError:
+        raise
+    except Exception as error:
+        why = printable(" ".join(str(error).split()))[:200] or type(error).__name__
+        raise DataError(
+            f"{path}: damaged, cut off, or a bag that cannot be read ({why}); copy or reindex it"
+        ) from error

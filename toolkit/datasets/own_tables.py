@@ -1,0 +1,212 @@
+"""Own tables: tracks.csv, imu.csv or twist.csv, and rig.toml in a folder, with truth.tum where there is a truth.
+
+Columns, in any order, are those of :data:`TRACKS`, :data:`IMU` and :data:`TWIST`, beside a stamp ``t`` in seconds or
+``t_ns``. What they mean, and what rig.toml holds, is in docs/own-data.md. A frame is a stamp of the tracks.
+:func:`read` takes the tables from anywhere, :func:`save` makes a recording of them.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from toolkit.datasets import vislam_recording
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows
+from toolkit.datasets.io.named_columns import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file
+from toolkit.datasets.io.tables import find_table
+from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.trajectories.poses import checked_poses
+from toolkit.errors import DataError, did_you_mean
+from toolkit.geometry import Array, IntArray
+from toolkit.inputs import is_regular, read_text_input
+from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, TwistNoise, TwistSamples
+from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
+from toolkit.sequence import GRAVITY_WORLD, Observations, Provenance, Sequence, StereoRig, Truth
+
+TRACKS, ONE_ROW, TWO_ROWS = ("track_id", "uL", "uR"), ("v",), ("vL", "vR")
+IMU = ("ax", "ay", "az", "gx", "gy", "gz")
+TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+TRUTH = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_STAMPS = (SECONDS, NANOSECONDS)
+_RIG = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m", "T_imu_cam")
+_OPTIONAL = ("pixel_sigma_px", "gravity_world")
+_NOISE = "noise"
+_IMU_NOISE = ("accel_noise_density", "gyro_noise_density", "accel_random_walk", "gyro_random_walk")
+_TWIST_NOISE = ("velocity_noise_density", "gyro_noise_density", "gyro_random_walk")
+_FILES = ("tracks.csv", ("imu.csv", "twist.csv"), "rig.toml", "truth.tum")
+
+Table = str | PathLike[str] | Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """A recording made of tables, and the columns that were not used, each with its table."""
+
+    sequence: Sequence
+    unused: tuple[str, ...]
+
+
+def recognises(path: Path) -> bool:
+    """Say whether the path is a folder with a rig.toml and a table of tracks or of motion."""
+    tables = (_FILES[0], *_FILES[1])
+    return is_regular(path / _FILES[2]) and any(find_table(path, name) is not None for name in tables)
+
+
+def load(path: Path) -> Sequence:
+    """Read a folder of tables; raises DataError as :func:`read`, or where one of the files is missing."""
+    tracks = find_table(path, _FILES[0])
+    motions = [found for name in _FILES[1] if (found := find_table(path, name)) is not None]
+    if tracks is None or len(motions) != 1:
+        missing = _FILES[0] if tracks is None else " or ".join(_FILES[1])
+        raise DataError(f"{path}: {'missing' if tracks is None or not motions else 'both of'} {missing}")
+    truth = path / _FILES[3]
+    return read(path.name, tracks, motions[0], path / _FILES[2], truth if is_regular(truth) else None).sequence
+
+
+def save(
+    directory: str | PathLike[str], *, tracks: Table, motion: Table, rig: Table, truth: Table | None = None
+) -> Path:
+    """Write a recording of your own measurements, which ``vislam`` and ``toolkit.compare`` read; return its folder.
+
+    Each table is a file's path, or a mapping of column names to values (a dict of arrays, a data frame); ``rig`` is a
+    TOML file or the same as nested dicts. Names and units are in docs/own-data.md. Raises DataError naming table, row
+    and column of what cannot be used, OutputError where the folder holds anything else or cannot be written.
+    """
+    target = Path(directory)
+    vislam_recording.check_folder(target)
+    vislam_recording.save(read(target.name, tracks, motion, rig, truth).sequence, target)
+    return target
+
+
+def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | None = None) -> Read:
+    """Return the recording that tables describe, as :func:`save` takes them; raises DataError as it does."""
+    sightings, measured = _columns("tracks", tracks), _columns("motion", motion)
+    place, calibration = _calibration(rig)
+    frames_t_ns, observations = _observations(sightings)
+    samples, noise = _motion(measured, place, calibration.get(_NOISE, {}))
+    sequence = Sequence(
+        name=name,
+        rig=_rig(place, calibration, 2 if TWO_ROWS[0] in sightings.values else 1),
+        noise=noise,
+        frames_t_ns=frames_t_ns,
+        observations=observations,
+        motion=samples,
+        provenance=Provenance("own-tables", ", ".join(str(table.what) for table in (sightings, measured))),
+        gravity_world=_gravity(place, calibration),
+    )
+    if truth is not None:
+        sequence = with_truth(sequence, _truth(truth))
+    return Read(sequence, (*_unused(sightings, (*TRACKS, *ONE_ROW, *TWO_ROWS)), *_unused(measured, (*IMU, *TWIST))))
+
+
+def _columns(what: str, given: Table) -> Columns:
+    return columns_of_file(Path(given)) if isinstance(given, str | PathLike) else columns_given(what, given)
+
+
+def _unused(table: Columns, used: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{table.what}: {name}" for name in table.unused((*used, *_STAMPS)))
+
+
+def _observations(table: Columns) -> tuple[IntArray, Observations]:
+    """Return the stamps of the frames (K,) and the sightings in them."""
+    rows = TWO_ROWS if any(name in table.values for name in TWO_ROWS) else ONE_ROW
+    table.require("|".join(_STAMPS), *TRACKS, *rows)
+    frames_t_ns, frame = np.unique(table.stamps(), return_inverse=True)
+    check_frame_count(table.what, frames_t_ns.size)
+    track_id, columns_px, rows_px = table.whole(TRACKS[0]), table.numbers(*TRACKS[1:]), table.numbers(*rows)
+    if rows == TWO_ROWS:
+        check_rows(table.what, np.stack([columns_px[:, 0], rows_px[:, 0], columns_px[:, 1], rows_px[:, 1]], axis=1))
+    order = np.lexsort((track_id, frame))
+    twice = np.flatnonzero((np.diff(frame[order]) == 0) & (np.diff(track_id[order]) == 0))
+    if twice.size:
+        row = int(order[twice[0] + 1])
+        raise DataError(f"{table.what}: {table.at(row)}: track {track_id[row]} is there twice in its frame; remove one")
+    return frames_t_ns, Observations.sorted(frame, track_id, np.column_stack([columns_px, rows_px.mean(axis=1)]))
+
+
+def _motion(table: Columns, place: Path, noise: Mapping[str, Any]) -> tuple[MotionSamples, MotionNoise]:
+    """Return the samples, of an IMU or of body twists, as the columns say."""
+    is_twist = len(set(TWIST) & set(table.names)) > len(set(IMU) & set(table.names))
+    columns, known = (TWIST, _TWIST_NOISE) if is_twist else (IMU, _IMU_NOISE)
+    table.require("|".join(_STAMPS), *columns)
+    t_ns, values = table.stamps(), table.numbers(*columns)
+    _check_known(place, f"{_NOISE}.", noise, known)
+    if is_twist:
+        return TwistSamples(t_ns, values[:, :3], values[:, 3:]), _twist_noise(place, t_ns, values, noise)
+    missing = [key for key in known if key not in noise]
+    if missing:
+        raise DataError(
+            f"{place}: missing {', '.join(f'{_NOISE}.{key}' for key in missing)}; an IMU's data sheet has them"
+        )
+    fields = _fields(place, noise)
+    return ImuSamples(t_ns, values[:, :3], values[:, 3:]), ImuNoise(**{key: fields.positive(key) for key in known})
+
+
+def _twist_noise(place: Path, t_ns: IntArray, values: Array, noise: Mapping[str, Any]) -> TwistNoise:
+    """Return the noise stated, one number or one an axis; what is not stated is estimated from the scatter."""
+    fields, stated = _fields(place, noise), dict(vars(twist_noise(t_ns, values[:, :3], values[:, 3:])))
+    for key in noise:
+        stated[key] = np.full(3, fields.positive(key)) if fields.vector(key).size == 1 else fields.constant(key, 3)
+    return TwistNoise(**stated)
+
+
+def _calibration(rig: Table) -> tuple[Path, Mapping[str, Any]]:
+    """Return where a calibration is from, and its nested values."""
+    place = Path(rig) if isinstance(rig, str | PathLike) else Path("rig")
+    if isinstance(rig, Mapping):
+        values: Mapping[str, Any] = rig
+    else:
+        try:
+            values = tomllib.loads(read_text_input(place, "the calibration is TOML"))
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raise DataError(f"{place}: is not TOML ({error})") from error
+    _check_known(place, "", values, (*_RIG, *_OPTIONAL, _NOISE))
+    if not isinstance(values.get(_NOISE, {}), Mapping):
+        raise DataError(f"{place}: {_NOISE} is not a table; write [{_NOISE}] above its densities")
+    return place, values
+
+
+def _check_known(place: Path, prefix: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    for key in given:
+        if key not in known:
+            raise DataError(f"{place}: there is no {prefix}{key}{did_you_mean(str(key), known)}; remove or rename it")
+
+
+def _fields(place: Path, values: Mapping[str, Any]) -> Fields:
+    return Fields(place, {key: _array(value) for key, value in values.items() if key != _NOISE})
+
+
+def _array(value: Any) -> Any:
+    try:
+        return np.asarray(value)
+    except ValueError:  # rows of different lengths
+        return np.asarray(str(value))
+
+
+def _rig(place: Path, calibration: Mapping[str, Any], rows_averaged: int) -> StereoRig:
+    fields = _fields(place, calibration)
+    fields.require(*_RIG)
+    fx_px, fy_px, cx_px, cy_px, baseline_m = (
+        fields.positive(key) if key[0] in "fb" else fields.number(key) for key in _RIG[:-1]
+    )
+    sigma_px = fields.positive(_OPTIONAL[0]) if _OPTIONAL[0] in fields else TRACKED_PIXEL_SIGMA_PX
+    cov_uv_px2 = sigma_px**2 * np.diag([1.0, 1.0, 1.0 / rows_averaged])
+    return StereoRig(fx_px, fy_px, cx_px, cy_px, baseline_m, fields.rigid(_RIG[-1]), cov_uv_px2)
+
+
+def _gravity(place: Path, calibration: Mapping[str, Any]) -> Array:
+    fields = _fields(place, calibration)
+    return fields.constant(_OPTIONAL[1], 3) if _OPTIONAL[1] in fields else np.array(GRAVITY_WORLD)
+
+
+def _truth(given: Table) -> Truth:
+    if isinstance(given, str | PathLike):
+        return load_truth(Path(given))
+    table = columns_given("truth", given)
+    table.require("|".join(_STAMPS), *TRUTH)
+    t_ns = table.stamps()
+    return Truth(t_ns, checked_poses(table.what, list(range(t_ns.size)), t_ns, table.numbers(*TRUTH)))
