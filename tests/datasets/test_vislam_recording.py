@@ -15,6 +15,7 @@ from toolkit.errors import DataError, OutputError
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
+from toolkit.track_noise import TrackNoise
 
 DATA = Path(__file__).parents[2] / "data"
 
@@ -47,6 +48,15 @@ def test_what_is_optional_may_be_absent(flight: Sequence, tmp_path: Path) -> Non
     for name, sequence in (("poses", poses_only), ("none", replace(flight, prior=None, truth=None))):
         vislam_recording.save(sequence, tmp_path / name)
         assert_same(vislam_recording.load(tmp_path / name), sequence)
+
+
+def test_the_noise_of_tracks_comes_back(drive: Sequence, tmp_path: Path) -> None:
+    noise = TrackNoise(np.array([0.1, 0.2, 0.3]), np.array([0.2, 0.1, 0.15]), np.array([0.0, 0.7, 0.1]))
+    vislam_recording.save(replace(drive, rig=replace(drive.rig, track_noise=noise)), tmp_path / "correlated")
+    loaded = vislam_recording.load(tmp_path / "correlated").rig.track_noise
+    assert loaded is not None
+    for part in ("white_px", "walk_px", "offset_px"):
+        np.testing.assert_array_equal(getattr(loaded, part), getattr(noise, part))
 
 
 def test_pairing_and_gravity_come_back(drive: Sequence, tmp_path: Path) -> None:

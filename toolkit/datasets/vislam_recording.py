@@ -30,6 +30,7 @@ from toolkit.measured_motion import (
 )
 from toolkit.resampling import ImuPairing, Pairing
 from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth
+from toolkit.track_noise import TrackNoise
 
 SCHEMA = "vislam.recording/1"
 _TEXT, _ARRAYS = "recording.json", "recording.npz"
@@ -104,7 +105,7 @@ def _to_text(sequence: Sequence) -> Text:
         "counts": _counts(sequence),
         "units": "SI and px; time int64 ns; poses take the IMU frame to the world; bias and prior in [accel, gyro]",
         "gravity_world": sequence.gravity_world.tolist(),
-        "rig": _plain(sequence.rig),
+        "rig": _rig_to_text(sequence.rig),
         "motion": {
             "kind": sequence.motion_kind,
             "pairing": None if isinstance(motion, NoSamples) else motion.pairing,
@@ -124,7 +125,13 @@ def _counts(sequence: Sequence) -> dict[str, int]:
     return counts if sequence.truth is None else counts | {"truth_poses": sequence.truth.t_ns.size}
 
 
-def _plain(value: StereoRig | MotionNoise) -> Text:
+def _rig_to_text(rig: StereoRig) -> Text:
+    """Return a rig, with the noise of its tracks where it is not white."""
+    fields = {name: x for name, x in _plain(rig).items() if name != "track_noise"}
+    return fields if rig.track_noise is None else {**fields, "track_noise": _plain(rig.track_noise)}
+
+
+def _plain(value: StereoRig | MotionNoise | TrackNoise) -> Text:
     """Return the fields of a value with arrays as nested lists; Python writes floats so that they come back whole."""
     return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in vars(value).items()}
 
@@ -170,7 +177,7 @@ def _sequence(text: Text, arrays: Arrays) -> Sequence:
     motion, noise = _motion(text, arrays)
     return Sequence(
         name=str(text["name"]),
-        rig=StereoRig(**_arrays_again(text["rig"])),
+        rig=_rig(text["rig"]),
         noise=noise,
         frames_t_ns=arrays["frames_t_ns"],
         observations=Observations(
@@ -182,6 +189,13 @@ def _sequence(text: Text, arrays: Arrays) -> Sequence:
         truth=_truth(text, arrays),
         gravity_world=np.array(text["gravity_world"], dtype=float),
     )
+
+
+def _rig(fields: Text) -> StereoRig:
+    noise = fields.get("track_noise")
+    track_noise = None if noise is None else TrackNoise(**_arrays_again(noise))
+    rig = _arrays_again({name: x for name, x in fields.items() if name != "track_noise"})
+    return StereoRig(**rig, track_noise=track_noise)
 
 
 def _arrays_again(fields: Text) -> Text:
