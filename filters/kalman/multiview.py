@@ -54,7 +54,7 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
     What was not seen is zero throughout.
     """
-    whitener, seen = stereo.whitener(rig), sightings.seen[..., None]
+    whitener, seen = rig.whitener, sightings.seen[..., None]
     now = _seen_from(poses, points, rig)
     there = now if poses_at is poses else _seen_from(poses_at, points, rig)
     residuals = np.where(seen, (sightings.uvs_px - now.uv_px) @ whitener.T, 0.0)
