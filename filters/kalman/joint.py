@@ -87,13 +87,13 @@ class JointBelief:
         self.landmark_ids = self.landmark_ids[~which]
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, cov: Array) -> None:
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
         """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's, plus noise.
 
         ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
         """
-        cross = jacobian @ self._cov
-        own = _symmetric(cross @ jacobian.T + cov)
+        cross = np.asarray(jacobian @ self._cov)
+        own = _symmetric(jacobian @ cross.T + cov)
         self._cov = np.block([[self._cov, cross.T], [cross, own]])
         self.landmark_ids = np.concatenate([self.landmark_ids, track_ids])
         self.points = np.concatenate([self.points, points])

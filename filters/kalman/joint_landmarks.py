@@ -126,9 +126,10 @@ def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearise
     H_point = linearised.H_point.reshape(count, 3 * window, 3)
     cov_each = np.linalg.inv(np.swapaxes(H_point, 1, 2) @ H_point)
     pull = -cov_each @ np.swapaxes(H_point, 1, 2)
-    jacobian = np.zeros((3 * count, joint.cov.shape[0]))
-    blocks = np.swapaxes(multiview.by_pose(pull) @ linearised.H_pose, 1, 2)
-    jacobian[:, joint.clone_columns] = blocks.reshape(3 * count, 6 * window)
+    blocks = np.swapaxes(multiview.by_pose(pull) @ linearised.H_pose, 1, 2).reshape(3 * count, 6 * window)
+    clones = np.tile(np.arange(joint.clone_columns.start, joint.clone_columns.stop), 3 * count)
+    ends = np.arange(0, blocks.size + 1, 6 * window)
+    jacobian = csr_array((blocks.ravel(), clones, ends), (3 * count, joint.cov.shape[0]))
     cov = np.zeros((count, 3, count, 3))
     cov[np.arange(count), :, np.arange(count), :] = cov_each
     joint.add_landmarks(track_ids, points, jacobian, cov.reshape(3 * count, 3 * count))
