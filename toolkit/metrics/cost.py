@@ -13,7 +13,7 @@ METRICS = (
         "frame_ms_mean",
         "mean wall-clock time of a step, the first included (ms)",
         "ms",
-        ("frame", "mean"),
+        ("wall", "frame"),
         in_contract=True,
     ),
     Metric("frame_ms_p95", "95th percentile of the same (ms)", "ms", ("frame", "p95"), in_contract=True),
