@@ -17,13 +17,13 @@ BoolArray = npt.NDArray[np.bool_]
 
 _IDENTITY = np.eye(3)
 # Below this squared angle the closed forms lose digits and the Taylor polynomials (seven terms) are exact.
-_SMALL_ANGLE_SQUARED, _TERMS = 0.25, 7
+_SMALL_ANGLE_SQUARED = 0.25
 
 
 def _tails() -> Array:
     """Return the coefficients (7, 5) of sum_k (-1)^k x^k / (2k + n)!, lowest power first, for n = 1 ... 5."""
     inverse_factorials = 1.0 / np.concatenate([[1.0], np.cumprod(np.arange(1.0, 21.0))])
-    k = np.arange(_TERMS)[:, None]
+    k = np.arange(7)[:, None]
     return np.asarray((-1.0) ** k * inverse_factorials[2 * k + np.arange(1, 6)])
 
 
@@ -39,9 +39,11 @@ def _coefficients(phi: Array) -> list[Array]:
     x = np.asarray(_squared_norm(phi))
     large = x >= _SMALL_ANGLE_SQUARED
     some_large = large.any()
-    powers = np.empty((*x.shape, _TERMS))
-    powers[..., 0], powers[..., 1:] = 1.0, (np.where(large, 0.0, x) if some_large else x)[..., None]
-    values = np.multiply.accumulate(powers, axis=-1, out=powers) @ _TAILS
+    small = (np.where(large, 0.0, x) if some_large else x)[..., None]
+    values = small * _TAILS[-1] + _TAILS[-2]
+    for coefficients in _TAILS[-3::-1]:
+        values *= small
+        values += coefficients
     if some_large:
         values[large] = _closed_forms(x[large])
     return [values[..., i, None, None] for i in range(5)]
@@ -172,8 +174,6 @@ def _block_lower(upper_left: Array, lower_left: Array, lower_right: Array) -> Ar
 
 def transform(T_a_b: Array, points_b: Array) -> Array:
     """Take points (..., 3) from frame b to frame a by T_a_b (..., 4, 4)."""
-    if T_a_b.ndim == 2:
-        return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
     return (T_a_b[..., :3, :3] @ points_b[..., None])[..., 0] + T_a_b[..., :3, 3]
 
 

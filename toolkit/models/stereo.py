@@ -72,7 +72,7 @@ def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPr
 
 def in_camera(points_imu: Array, rig: StereoRig) -> Array:
     """Return points (..., 3) of the IMU frame in the left camera."""
-    return transform(rig.T_cam_imu, points_imu)
+    return np.asarray(points_imu @ rig.T_cam_imu[:3, :3].T + rig.T_cam_imu[:3, 3])
 
 
 def triangulate(uvs_px: Array, rig: StereoRig) -> Array:
