@@ -29,7 +29,7 @@ METRICS = (
     Metric("cpu_s", "processor time of all threads (s)", "s", ("CPU", ""), in_contract=True),
     Metric(
         "peak_rss_mb",
-        "peak resident memory of the process (MB)",
+        "peak resident memory of the process during the run (MB)",
         "MB",
         ("peak", "memory"),
         decimals=0,
