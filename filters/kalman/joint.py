@@ -35,7 +35,8 @@ class JointBelief:
     def core(self) -> Belief:
         """Return the belief of the IMU now, everything else marginalised."""
         d = self._core.layout.size
-        return replace(self._core, cov=self._cov[:d, :d])
+        # A copy: whoever keeps a part of it would keep the whole.
+        return replace(self._core, cov=self._cov[:d, :d].copy())
 
     @property
     def cov(self) -> Array:
