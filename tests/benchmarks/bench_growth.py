@@ -16,12 +16,13 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from toolkit import runner
 from toolkit.estimator import find
 from toolkit.sequence import Sequence as Recorded
-from toolkit.settings import DEFAULTS, Settings, Window
+from toolkit.settings import DEFAULTS, Settings
 from toolkit.simulation import DRIVE_IMU, simulate
 
 FILTERS = ("ekf", "riekf", "msckf-fej", "msckf-slam")
@@ -46,12 +47,13 @@ def recording(tracks: int = 100, frames: int = 80) -> Recorded:
 
 def with_window(**changed: float) -> Settings:
     """Return the default settings but for those of the window; its cap on states does not bind."""
-    return replace(DEFAULTS, window=replace(Window(), most_states=200, **changed))
+    window = msgspec.structs.replace(DEFAULTS.window, most_states=200, **changed)
+    return msgspec.structs.replace(DEFAULTS, window=window)
 
 
 GROWTHS = {
     "tracks": Growth(
-        (50, 100, 200, 400), (*FILTERS, "fixed-lag"), lambda n: (recording(tracks=int(n)), DEFAULTS), per_frame=True
+        (25, 50, 100, 200), (*FILTERS, "fixed-lag"), lambda n: (recording(tracks=int(n)), DEFAULTS), per_frame=True
     ),
     "frames": Growth(
         (100, 200, 400, 800), (*FILTERS, *SMOOTHERS), lambda n: (recording(frames=int(n)), DEFAULTS), per_frame=False
@@ -59,13 +61,13 @@ GROWTHS = {
     "window": Growth(
         (0.5, 1.0, 2.0, 4.0),
         ("msckf-fej", "msckf-slam", "fixed-lag"),
-        lambda s: (recording(frames=120), with_window(lag_s=s)),
+        lambda s: (recording(frames=100), with_window(lag_s=s)),
         per_frame=True,
     ),
     "landmarks": Growth(
         (25, 50, 100, 200),
         ("msckf-slam",),
-        lambda n: (recording(tracks=400), with_window(landmarks=int(n))),
+        lambda n: (recording(tracks=200), with_window(landmarks=int(n))),
         per_frame=True,
     ),
 }
