@@ -8,6 +8,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf", "li2013high")
 RUNG, CHANGE = 80, "+ long-lived landmarks, in metres"
+DEFAULT = True
 
 
 def build(setup: Setup) -> Estimator:

@@ -6,8 +6,6 @@ Tangent vectors follow GTSAM: an SE(3) twist is [rotation, translation] and pert
 estimation in robotics" (2018), appendix B.
 """
 
-from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,59 +15,46 @@ Array = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+_IDENTITY = np.eye(3)
 # Below this squared angle the closed forms lose digits and the Taylor polynomials (seven terms) are exact.
 _SMALL_ANGLE_SQUARED = 0.25
-# 1/n! for n = 0 ... 20
-_INVERSE_FACTORIALS = 1.0 / np.concatenate([[1.0], np.cumprod(np.arange(1.0, 21.0))])
 
 
-@cache
-def _cosine_tail(first: int) -> tuple[float, ...]:
-    """Return the coefficients of sum_k (-1)^k x^k / (2k + first)!, highest power first."""
-    orders = np.arange(first, first + 14, 2)
-    signs = np.where(np.arange(orders.size) % 2 == 0, 1.0, -1.0)
-    return tuple((signs * _INVERSE_FACTORIALS[orders])[::-1].tolist())
+def _tails() -> Array:
+    """Return the coefficients (7, 5) of sum_k (-1)^k x^k / (2k + n)!, lowest power first, for n = 1 ... 5."""
+    inverse_factorials = 1.0 / np.concatenate([[1.0], np.cumprod(np.arange(1.0, 21.0))])
+    k = np.arange(7)[:, None]
+    return np.asarray((-1.0) ** k * inverse_factorials[2 * k + np.arange(1, 6)])
 
 
-def _coefficient(angle_squared: Array, first: int, closed_form: Callable[[Array, Array], Array]) -> Array:
-    """Evaluate one of the trigonometric coefficients of the exponential map at any angle."""
-    small = angle_squared < _SMALL_ANGLE_SQUARED
-    if small.all():
-        return _taylor(angle_squared, first)
-    safe = np.where(small, 1.0, angle_squared)
-    return np.where(small, _taylor(np.where(small, angle_squared, 0.0), first), closed_form(np.sqrt(safe), safe))
+_TAILS = _tails()
 
 
-def _taylor(angle_squared: Array, first: int) -> Array:
-    highest, *lower = _cosine_tail(first)
-    result = np.full_like(angle_squared, highest)
-    for coefficient in lower:
-        result = result * angle_squared + coefficient
-    return result
+def _coefficients(phi: Array) -> list[Array]:
+    """Return the five coefficients (..., 1, 1) of the exponential map and its Jacobians at rotation vectors (..., 3).
+
+    They are tails of sine and cosine divided by powers of the angle a: sin a / a, (1 - cos a) / a^2,
+    (a - sin a) / a^3, (a^2 / 2 + cos a - 1) / a^4, (sin a - a + a^3 / 6) / a^5.
+    """
+    x = np.asarray(_squared_norm(phi))
+    large = x >= _SMALL_ANGLE_SQUARED
+    some_large = large.any()
+    small = (np.where(large, 0.0, x) if some_large else x)[..., None]
+    values = small * _TAILS[-1] + _TAILS[-2]
+    for coefficients in _TAILS[-3::-1]:
+        values *= small
+        values += coefficients
+    if some_large:
+        values[large] = _closed_forms(x[large])
+    return [values[..., i, None, None] for i in range(5)]
 
 
-def _sin_over_angle(x: Array) -> Array:
-    return _coefficient(x, 1, lambda a, _: np.sin(a) / a)
-
-
-def _one_minus_cos(x: Array) -> Array:
-    """(1 - cos a) / a^2"""
-    return _coefficient(x, 2, lambda a, a2: (1.0 - np.cos(a)) / a2)
-
-
-def _angle_minus_sin(x: Array) -> Array:
-    """(a - sin a) / a^3"""
-    return _coefficient(x, 3, lambda a, a2: (a - np.sin(a)) / (a * a2))
-
-
-def _fourth_order(x: Array) -> Array:
-    """(a^2 / 2 + cos a - 1) / a^4"""
-    return _coefficient(x, 4, lambda a, a2: (0.5 * a2 + np.cos(a) - 1.0) / a2**2)
-
-
-def _fifth_order(x: Array) -> Array:
-    """(sin a - a + a^3 / 6) / a^5"""
-    return _coefficient(x, 5, lambda a, a2: (np.sin(a) - a + a * a2 / 6.0) / (a * a2**2))
+def _closed_forms(x: Array) -> Array:
+    """Return all five coefficients (N, 5) at squared angles (N,) that are not small."""
+    a = np.sqrt(x)
+    sine, cosine = np.sin(a), np.cos(a)
+    fourth, fifth = (0.5 * x + cosine - 1.0) / x**2, (sine - a + a * x / 6.0) / (a * x**2)
+    return np.stack([sine / a, (1.0 - cosine) / x, (a - sine) / (a * x), fourth, fifth], axis=-1)
 
 
 def skew(v: Array) -> Array:
@@ -86,16 +71,12 @@ def _squared_norm(v: Array) -> Array:
     return squared
 
 
-def _spread(x: Array) -> Array:
-    """Give a scalar field two trailing axes, so that it scales matrices."""
-    return np.asarray(x)[..., None, None]
-
-
 def so3_exp(phi: Array) -> Array:
     """Return the rotation (..., 3, 3) of a rotation vector (..., 3) in radians (Rodrigues)."""
     phi = np.asarray(phi, dtype=float)
-    phi_x, x = skew(phi), _squared_norm(phi)
-    return np.eye(3) + _spread(_sin_over_angle(x)) * phi_x + _spread(_one_minus_cos(x)) * (phi_x @ phi_x)
+    phi_x = skew(phi)
+    first, second, *_ = _coefficients(phi)
+    return _IDENTITY + first * phi_x + second * (phi_x @ phi_x)
 
 
 def so3_log(rotation: Array) -> Array:
@@ -114,8 +95,9 @@ def so3_log(rotation: Array) -> Array:
 def so3_left_jacobian(phi: Array) -> Array:
     """Return J_l (..., 3, 3) with exp(phi + d) = exp(J_l d) exp(phi) (Barfoot, eq. 7.37)."""
     phi = np.asarray(phi, dtype=float)
-    phi_x, x = skew(phi), _squared_norm(phi)
-    return np.eye(3) + _spread(_one_minus_cos(x)) * phi_x + _spread(_angle_minus_sin(x)) * (phi_x @ phi_x)
+    phi_x = skew(phi)
+    _, second, third, *_ = _coefficients(phi)
+    return _IDENTITY + second * phi_x + third * (phi_x @ phi_x)
 
 
 def so3_right_jacobian(phi: Array) -> Array:
@@ -126,7 +108,9 @@ def so3_right_jacobian(phi: Array) -> Array:
 def se3(rotation: Array, translation: Array) -> Array:
     """Assemble T (..., 4, 4) from a rotation (..., 3, 3) and a translation (..., 3)."""
     rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
-    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    batch = rotation.shape[:-2]
+    if batch != translation.shape[:-1]:
+        batch = np.broadcast_shapes(batch, translation.shape[:-1])
     T = np.zeros((*batch, 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
     return T
@@ -135,8 +119,11 @@ def se3(rotation: Array, translation: Array) -> Array:
 def se3_exp(xi: Array) -> Array:
     """Return T (..., 4, 4) of a twist (..., 6) ordered [rotation, translation] (Barfoot, eq. 7.33)."""
     xi = np.asarray(xi, dtype=float)
-    phi, rho = xi[..., :3], xi[..., 3:]
-    return se3(so3_exp(phi), (so3_left_jacobian(phi) @ rho[..., None])[..., 0])
+    phi_x, rho = skew(xi[..., :3]), xi[..., 3:, None]
+    first, second, third, *_ = _coefficients(xi[..., :3])
+    turned = phi_x @ rho
+    translation = rho + second * turned + third * (phi_x @ turned)
+    return se3(_IDENTITY + first * phi_x + second * (phi_x @ phi_x), translation[..., 0])
 
 
 def se3_log(T: Array) -> Array:
@@ -165,16 +152,17 @@ def se3_right_jacobian(xi: Array) -> Array:
     """
     xi = -np.asarray(xi, dtype=float)
     phi, rho = xi[..., :3], xi[..., 3:]
-    phi_x, rho_x, x = skew(phi), skew(rho), _squared_norm(phi)
-    sandwich = phi_x @ rho_x @ phi_x
-    fourth, fifth = _spread(_fourth_order(x)), _spread(_fifth_order(x))
+    phi_x, rho_x = skew(phi), skew(rho)
+    _, second, third, fourth, fifth = _coefficients(phi)
+    squared, both = phi_x @ phi_x, phi_x @ rho_x
+    sandwich = both @ phi_x
     coupling = (
         0.5 * rho_x
-        + _spread(_angle_minus_sin(x)) * (phi_x @ rho_x + rho_x @ phi_x + sandwich)
-        + fourth * (phi_x @ phi_x @ rho_x + rho_x @ phi_x @ phi_x - 3.0 * sandwich)
+        + third * (both + rho_x @ phi_x + sandwich)
+        + fourth * (squared @ rho_x + rho_x @ squared - 3.0 * sandwich)
         + 0.5 * (fourth - 3.0 * fifth) * (sandwich @ phi_x + phi_x @ sandwich)
     )
-    jacobian = so3_left_jacobian(phi)
+    jacobian = _IDENTITY + second * phi_x + third * squared
     return _block_lower(jacobian, coupling, jacobian)
 
 
@@ -215,7 +203,7 @@ def rotation_from_quaternion(quaternion: Array) -> Array:
     q = np.asarray(quaternion, dtype=float)
     q = q / np.sqrt(_squared_norm(q))[..., None]
     vector_x = skew(q[..., :3])
-    return np.eye(3) + 2.0 * (_spread(q[..., 3]) * vector_x + vector_x @ vector_x)
+    return _IDENTITY + 2.0 * (q[..., 3, None, None] * vector_x + vector_x @ vector_x)
 
 
 def yaw_of(rotation: Array) -> Array:

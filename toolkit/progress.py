@@ -23,7 +23,10 @@ class Progress(Protocol):
     """Hears how many of all steps are done."""
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
-        """Take note; ``stage`` names what is under way where that changes, as in a solver's iterations."""
+        """Take note; ``stage`` names what is under way where that changes, as in a solver's iterations.
+
+        Where the total is another, or less is done than before, other steps are counted, and their time anew.
+        """
 
 
 class Silent:
@@ -76,8 +79,8 @@ class _Bar:
         if stage != self._stage:
             self._stage = stage
             self._bar.set_description_str(f"{self._label}, {stage}" if stage else self._label, refresh=False)
+        if total != self._bar.total or done < self._bar.n:
             self._bar.reset(total)
-        self._bar.total = total
         if done > self._bar.n:
             self._bar.update(done - self._bar.n)
 
@@ -91,14 +94,15 @@ class _Log:
 
     def __init__(self, label: str, stream: TextIO) -> None:
         self._label, self._stream = label, stream
-        self._stage, self._began_s = "", time.monotonic()
+        self._done, self._total, self._began_s = 0, 0, time.monotonic()
         self._first_s = self._told_s = self._began_s
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Write a line where the last one is long past."""
         now_s = time.monotonic()
-        if stage != self._stage:
-            self._stage, self._began_s = stage, now_s
+        if total != self._total or done < self._done:
+            self._began_s = now_s
+        self._done, self._total = done, total
         times_longer = min(max((now_s - self._first_s) / _SELDOM_AFTER_S, 1.0), _MOST_SELDOM)
         if now_s - self._told_s < LOG_EVERY_S * times_longer:
             return

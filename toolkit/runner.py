@@ -5,12 +5,16 @@ its trajectory does not contradict the measured motion and its gate lets measure
 ``diverged`` or ``failed`` and why.
 """
 
+import ctypes
+import re
 import resource
 import sys
 import time
 import traceback
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,12 +28,16 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, Sequence
 from toolkit.settings import DEFAULTS, Settings
 
+# Linux: what is written there sets back the peak that is read here (proc(5)).
+_RESETS_PEAK, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+
 
 @dataclass
 class _Clock:
     """Measures wall clock and CPU of one run; the wall clock of each step apart."""
 
     def __post_init__(self) -> None:
+        _count_memory_anew()
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         self.steps: list[float] = []
         self.finish_s = 0.0
@@ -39,8 +47,20 @@ class _Clock:
         return Timings(np.array(self.steps), self.finish_s, total_s, cpu_s, _peak_rss_mb())
 
 
+def _count_memory_anew() -> None:
+    """Give back what the allocator keeps of earlier work, and begin to count the peak here where the system can."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    with suppress(OSError):
+        _RESETS_PEAK.write_text("5", encoding="ascii")
+
+
 def _peak_rss_mb() -> float:
-    """Return the peak resident memory of this process: all that ran in it before counts too."""
+    """Return the peak resident memory of this process; where the system cannot count anew, of all that ran in it."""
+    with suppress(OSError):
+        peak = re.search(r"^VmHWM:\s+(\d+) kB$", _STATUS.read_text(encoding="ascii"), re.MULTILINE)
+        if peak is not None:
+            return int(peak[1]) * 1024 / 1e6
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
 

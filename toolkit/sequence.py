@@ -20,8 +20,10 @@ from toolkit.geometry import (
     BoolArray,
     IntArray,
     quaternion_from_rotation,
+    read_only,
     rotation_from_quaternion,
     se3,
+    se3_inverse,
 )
 from toolkit.measured_motion import (
     Motion,
@@ -81,6 +83,18 @@ class StereoRig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_imu_cam", _orthonormal(np.asarray(self.T_imu_cam, dtype=float)))
         freeze_arrays(self, T_imu_cam=(4, 4), cov_uv_px2=(3, 3))
+
+    @cached_property
+    def T_cam_imu(self) -> Array:
+        """The inverse of the extrinsic (4, 4)."""
+        inverse: Array = read_only(se3_inverse(self.T_imu_cam))
+        return inverse
+
+    @cached_property
+    def whitener(self) -> Array:
+        """W (3, 3) with W cov W^T = 1: a residual (..., 3) px becomes one of unit variance by ``residual @ W.T``."""
+        root: Array = read_only(np.linalg.inv(np.linalg.cholesky(self.cov_uv_px2)))
+        return root
 
 
 @dataclass(frozen=True, eq=False)

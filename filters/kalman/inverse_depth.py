@@ -11,6 +11,7 @@ metres, and what is unobservable stays so. Only the way an estimate takes is ano
 """
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
@@ -25,7 +26,7 @@ class LandmarkAnchors(JointBelief):
         self._T_imu_cam = T_imu_cam
         self.anchors: Array = np.empty((0, 4, 4))
 
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, cov: Array) -> None:
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
         """Add landmarks as every joint belief does, anchored in the newest clone."""
         super().add_landmarks(track_ids, points, jacobian, cov)
         anchor = self.clones[-1] @ self._T_imu_cam

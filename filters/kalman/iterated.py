@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from filters.kalman import joint_landmarks
 from filters.kalman.gate import FrameGate
@@ -96,12 +97,13 @@ class Measurement:
         H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
         H, residuals = self.stacked(now.seen._replace(H_pose=H_pose, H_point=H_point))
         carried = H @ P
-        innovation_cov = carried @ H.T + np.eye(len(H))
+        innovation_cov = H @ carried.T
+        innovation_cov.flat[:: len(carried) + 1] += 1.0
         pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[part]) - now.pull
         # |step|^2 in the metric P^-1 + H^T H
         return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
 
-    def stacked(self, seen: LandmarkSightings) -> tuple[Array, Array]:
+    def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
         return joint_landmarks.stacked(self.prediction, seen).weighed(self.weights)
 

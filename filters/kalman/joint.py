@@ -10,6 +10,8 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dtrsm
+from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import Belief, Prediction
@@ -27,13 +29,14 @@ class JointBelief:
         self.landmark_ids: IntArray = np.empty(0, dtype=np.int64)
         self.points: Array = np.empty((0, 3))
         self.first_points: Array = np.empty((0, 3))
-        self._cov = core.cov
+        self._cov = _symmetric(core.cov)
 
     @property
     def core(self) -> Belief:
         """Return the belief of the IMU now, everything else marginalised."""
         d = self._core.layout.size
-        return replace(self._core, cov=self._cov[:d, :d])
+        # A copy: whoever keeps a part of it would keep the whole.
+        return replace(self._core, cov=self._cov[:d, :d].copy())
 
     @property
     def cov(self) -> Array:
@@ -56,17 +59,15 @@ class JointBelief:
         d = self._core.layout.size
         self._core = replace(self._core, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world)
         self.first_core = self._core
-        cov = self._cov.copy()
-        cov[:d] = transition @ cov[:d]
-        cov[:, :d] = cov[:, :d] @ transition.T
-        cov[:d, :d] += prediction.noise
-        self._cov = _symmetric(cov)
+        cov, carried = self._cov.copy(), transition @ self._cov[:d]
+        cov[:d], cov[d:, :d] = carried, carried[:, d:].T
+        cov[:d, :d] = _symmetric(carried[:, :d] @ transition.T + prediction.noise)
+        self._cov = cov
 
     def clone(self, frame: int) -> None:
         """Add a clone of the pose now, with all its correlations (stochastic cloning)."""
         end = self.clone_columns.stop
-        rows = np.r_[0:end, 0:6, end : self._cov.shape[0]]
-        self._cov = self._cov[np.ix_(rows, rows)]
+        self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, None)])
         self.clone_frames = np.append(self.clone_frames, frame)
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
@@ -75,7 +76,7 @@ class JointBelief:
         """Marginalise clones (C,): their rows and columns are dropped."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.clone_columns] = np.repeat(~which, 6)
-        self._cov = self._cov[np.ix_(kept, kept)]
+        self._cov = _of_slices(self._cov, _stretches(kept))
         self.clone_frames = self.clone_frames[~which]
         self.clones, self.first_clones = self.clones[~which], self.first_clones[~which]
 
@@ -83,38 +84,46 @@ class JointBelief:
         """Marginalise landmarks (L,)."""
         kept = np.ones(self._cov.shape[0], dtype=bool)
         kept[self.landmark_columns] = np.repeat(~which, 3)
-        self._cov = self._cov[np.ix_(kept, kept)]
+        self._cov = _of_slices(self._cov, _stretches(kept))
         self.landmark_ids = self.landmark_ids[~which]
         self.points, self.first_points = self.points[~which], self.first_points[~which]
 
-    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array, cov: Array) -> None:
+    def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
         """Add landmarks (N,) at points (N, 3) whose error is ``jacobian`` (3 N, n) times the state's, plus noise.
 
         ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
         """
-        cross = jacobian @ self._cov
-        own = cross @ jacobian.T + cov
-        self._cov = _symmetric(np.block([[self._cov, cross.T], [cross, own]]))
+        cross = np.asarray(jacobian @ self._cov)
+        own = _symmetric(jacobian @ cross.T + cov)
+        self._cov = np.block([[self._cov, cross.T], [cross, own]])
         self.landmark_ids = np.concatenate([self.landmark_ids, track_ids])
         self.points = np.concatenate([self.points, points])
         self.first_points = np.concatenate([self.first_points, points])
 
-    def update(self, H: Array, residual: Array, columns: slice) -> None:
+    def update(self, H: Array | csr_array, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
-        self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
-        self.move(half_gain.T @ solve_triangular(root, residual, lower=True, check_finite=False))
+        self._reduce(half_gain)
+        whitened = solve_triangular(root, residual, lower=True, check_finite=False)
+        self.move(half_gain.T @ whitened)
 
-    def reduce_covariance(self, H: Array, columns: slice) -> None:
+    def reduce_covariance(self, H: Array | csr_array, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
-        _, half_gain = self._half_gain(H, columns)
-        self._cov = _symmetric(self._cov - half_gain.T @ half_gain)
+        self._reduce(self._half_gain(H, columns)[1])
 
-    def _half_gain(self, H: Array, columns: slice) -> tuple[Array, Array]:
+    def _reduce(self, half_gain: Array) -> None:
+        # Of a matrix and its own transpose NumPy makes an exactly symmetric product.
+        taken_away = half_gain.T @ half_gain
+        self._cov = np.subtract(self._cov, taken_away, out=taken_away)
+
+    def _half_gain(self, H: Array | csr_array, columns: slice) -> tuple[Array, Array]:
         """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
-        carried = H @ self._cov[columns]
-        root = np.asarray(np.linalg.cholesky(carried[:, columns] @ H.T + np.eye(len(H))), dtype=float)
-        half_gain: Array = solve_triangular(root, carried, lower=True, check_finite=False)
+        carried = np.asarray(H @ self._cov[columns])
+        innovation_cov = np.asarray(H @ carried[:, columns].T)
+        innovation_cov.flat[:: len(carried) + 1] += 1.0
+        root = np.asarray(np.linalg.cholesky(innovation_cov), dtype=float)
+        # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
+        half_gain: Array = dtrsm(1.0, root.T, carried.T, side=1, overwrite_b=1).T
         return root, half_gain
 
     def move(self, delta: Array) -> None:
@@ -145,3 +154,15 @@ class JointBelief:
 def _symmetric(cov: Array) -> Array:
     result: Array = 0.5 * (cov + cov.T)
     return result
+
+
+def _stretches(kept: BoolArray) -> list[slice]:
+    """Return the stretches of a mask (n,) that are True."""
+    edges = np.flatnonzero(np.diff(kept, prepend=False, append=False)).reshape(-1, 2)
+    return [slice(begin, end) for begin, end in edges.tolist()]
+
+
+def _of_slices(cov: Array, stretches: list[slice]) -> Array:
+    """Return the rows and columns of a matrix in some stretches, in their order; of few it is faster than an index."""
+    rows = np.concatenate([cov[stretch] for stretch in stretches])
+    return np.concatenate([rows[:, stretch] for stretch in stretches], axis=1)

@@ -6,6 +6,7 @@ Both go through the newest clone of the pose, whose estimate and covariance are 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
@@ -28,21 +29,33 @@ class LandmarkSightings(NamedTuple):
 
 
 class StackedSightings(NamedTuple):
-    """Whitened residuals (L, 3) of the state's landmarks with Jacobians (L, 3, k) to clones and landmarks."""
+    """Whitened residuals (L, 3) of the state's landmarks, and their Jacobians to the k errors of clones and landmarks.
+
+    A sighting depends on nine of them: ``blocks`` (L, 3, 9) are its Jacobians, to the newest clone and to its landmark,
+    and ``own`` (L, 9) where these errors stand among all k.
+    """
 
     residuals: Array
-    H: Array
+    blocks: Array
+    own: IntArray
+    k: int
 
-    def weighed(self, weights: Array) -> tuple[Array, Array]:
+    def weighed(self, weights: Array) -> tuple[csr_array, Array]:
         """Return the Jacobian (m, k) and the residuals (m,) of the landmarks (L,) that count, under each other."""
         rows, roots = np.flatnonzero(weights), np.sqrt(weights[weights > 0.0])
-        H = roots[:, None, None] * self.H[rows]
-        return H.reshape(-1, H.shape[2]), (roots[:, None] * self.residuals[rows]).reshape(-1)
+        values = roots[:, None, None] * self.blocks[rows]
+        places = np.repeat(self.own[rows], 3, axis=0)
+        H = csr_array((values.ravel(), places.ravel(), np.arange(0, values.size + 1, 9)), (3 * len(rows), self.k))
+        return H, (roots[:, None] * self.residuals[rows]).reshape(-1)
 
 
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
+    if not len(joint.landmark_ids):
+        return
     lost = ~np.isin(joint.landmark_ids, frame.track_ids)
+    if not lost.any():
+        return
     memory.remember(joint.landmark_ids[lost], joint.points[lost])
     joint.forget_landmarks(lost)
 
@@ -70,13 +83,13 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:
-    """Spread Jacobians to the newest clone and to each landmark over the columns of all clones and landmarks."""
+    """Put Jacobians to the newest clone and to each landmark among the columns of all clones and landmarks."""
     clones, count = 6 * len(joint.clones), len(seen.H_pose)
-    H = np.zeros((count, 3, clones + 3 * count))
-    H[:, :, clones - 6 : clones] = seen.H_pose
-    own = H[:, :, clones:].reshape(count, 3, count, 3)
-    own[np.arange(count), :, np.arange(count), :] = seen.H_point
-    return StackedSightings(seen.residuals, H)
+    own = np.empty((count, 9), dtype=np.int64)
+    own[:, :6] = np.arange(clones - 6, clones)
+    own[:, 6:] = np.arange(clones, clones + 3 * count).reshape(count, 3)
+    blocks = np.concatenate([seen.H_pose, seen.H_point], axis=2)
+    return StackedSightings(seen.residuals, blocks, own, clones + 3 * count)
 
 
 def columns(joint: JointBelief) -> slice:
@@ -113,9 +126,10 @@ def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearise
     H_point = linearised.H_point.reshape(count, 3 * window, 3)
     cov_each = np.linalg.inv(np.swapaxes(H_point, 1, 2) @ H_point)
     pull = -cov_each @ np.swapaxes(H_point, 1, 2)
-    jacobian = np.zeros((3 * count, joint.cov.shape[0]))
-    blocks = np.swapaxes(multiview.by_pose(pull) @ linearised.H_pose, 1, 2)
-    jacobian[:, joint.clone_columns] = blocks.reshape(3 * count, 6 * window)
+    blocks = np.swapaxes(multiview.by_pose(pull) @ linearised.H_pose, 1, 2).reshape(3 * count, 6 * window)
+    clones = np.tile(np.arange(joint.clone_columns.start, joint.clone_columns.stop), 3 * count)
+    ends = np.arange(0, blocks.size + 1, 6 * window)
+    jacobian = csr_array((blocks.ravel(), clones, ends), (3 * count, joint.cov.shape[0]))
     cov = np.zeros((count, 3, count, 3))
     cov[np.arange(count), :, np.arange(count), :] = cov_each
     joint.add_landmarks(track_ids, points, jacobian, cov.reshape(3 * count, 3 * count))

@@ -54,7 +54,7 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
     What was not seen is zero throughout.
     """
-    whitener, seen = stereo.whitener(rig), sightings.seen[..., None]
+    whitener, seen = rig.whitener, sightings.seen[..., None]
     now = _seen_from(poses, points, rig)
     there = now if poses_at is poses else _seen_from(poses_at, points, rig)
     residuals = np.where(seen, (sightings.uvs_px - now.uv_px) @ whitener.T, 0.0)
@@ -95,10 +95,14 @@ class Constraints(NamedTuple):
 def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
     """Project the measurements onto the left null space of the landmark's Jacobian (MSCKF, eqs. 23-24)."""
     tracks, window = seen.shape
-    basis = null_space(linearised)
-    residuals = (basis @ linearised.residuals.reshape(tracks, 3 * window, 1))[..., 0]
-    H = np.swapaxes(by_pose(basis) @ linearised.H_pose, 1, 2).reshape(tracks, 3 * window - 3, 6 * window)
-    return Constraints(residuals, H, 3 * seen.sum(axis=1) - 3)
+    vectors, weighted = _reflectors(linearised)
+    stacked = linearised.residuals.reshape(tracks, 3 * window, 1)
+    residuals = (stacked - vectors @ (weighted @ stacked))[:, 3:, 0]
+    reached = np.swapaxes(by_pose(weighted) @ linearised.H_pose, 1, 2).reshape(tracks, 3, 6 * window)
+    H = vectors @ -reached
+    own_poses = np.einsum("fwiwj->fwij", H.reshape(tracks, window, 3, window, 6))
+    own_poses += linearised.H_pose
+    return Constraints(residuals, H[:, 3:], 3 * seen.sum(axis=1) - 3)
 
 
 def by_pose(rows: Array) -> Array:
@@ -109,9 +113,24 @@ def by_pose(rows: Array) -> Array:
 
 def null_space(linearised: Linearised) -> Array:
     """Return rows (F, 3W - 3, 3W) that span what the landmark's Jacobian does not reach."""
+    vectors, weighted = _reflectors(linearised)
+    return np.asarray((np.eye(vectors.shape[1]) - vectors @ weighted)[:, 3:])
+
+
+def _reflectors(linearised: Linearised) -> tuple[Array, Array]:
+    """Return V (F, 3W, 3) and T^T V^T (F, 3, 3W) of the QR decomposition of the landmark's Jacobian, Q = 1 - V T V^T.
+
+    Three Householder reflections a track in compact form (Schreiber & Van Loan 1989, "A storage-efficient WY
+    representation for products of Householder transformations"): Q itself, 3W by 3W, is never formed.
+    """
     tracks, window = linearised.residuals.shape[:2]
-    q, _ = np.linalg.qr(linearised.H_point.reshape(tracks, 3 * window, 3), mode="complete")
-    return np.asarray(np.swapaxes(q[:, :, 3:], 1, 2))
+    packed, tau = np.linalg.qr(linearised.H_point.reshape(tracks, 3 * window, 3), mode="raw")
+    packed[:, :, :3] = np.triu(packed[:, :, :3], 1) + np.eye(3)
+    overlap = packed @ np.swapaxes(packed, 1, 2)
+    triangle = tau[:, None] * np.eye(3)
+    triangle[:, 0, 1] = -tau[:, 0] * tau[:, 1] * overlap[:, 0, 1]
+    triangle[:, :2, 2] = -tau[:, 2, None] * (triangle[:, :2, :2] @ overlap[:, :2, 2, None])[..., 0]
+    return np.swapaxes(packed, 1, 2), np.swapaxes(triangle, 1, 2) @ packed
 
 
 def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:

@@ -79,16 +79,19 @@ class TrackGate:
         weights = gate.weights(nis, constraints.dof, accepted)
         tracks = AcceptedTracks(sightings.track_ids, sightings.seen, points, linearised, constraints)
         mismatched = np.asarray(nis > MISMATCHED_TRACK_FACTOR * gate.bound(constraints.dof))
-        worst = _worst_sighting(tracks.select(mismatched), covs[mismatched])
-        seen = sightings.seen[mismatched].copy()
-        seen[np.arange(len(worst)), worst] = False
+        seen = sightings.seen[mismatched]
+        if len(seen):
+            worst = _worst_sighting(tracks.select(mismatched), covs[mismatched])
+            seen[np.arange(len(worst)), worst] = False
         return tracks.select(accepted).weighed(weights[accepted]), sightings.select(mismatched)._replace(seen=seen)
 
     def _covs(self, constraints: Constraints) -> Array:
         """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals."""
         P = self._joint.cov[self._joint.clone_columns, self._joint.clone_columns]
-        spread = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
-        return np.asarray(spread + np.eye(spread.shape[1]))
+        covs = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
+        variances = np.einsum("fii->fi", covs)
+        variances += 1.0
+        return np.asarray(covs)
 
 
 def _worst_sighting(tracks: AcceptedTracks, covs: Array) -> IntArray:

@@ -86,16 +86,15 @@ def _fit(points: Array, views: _Views, rig: StereoRig) -> _Fit:
     points_cam = (views.R_cam_world @ points[views.track][:, :, None])[..., 0] + views.t_cam
     depth_m = points_cam[:, 2].copy()
     points_cam[:, 2] = np.where(np.abs(depth_m) < 1e-3, 1e-3, depth_m)
-    information = np.linalg.inv(rig.cov_uv_px2)
-    residuals_px = views.uvs_px - stereo.project(points_cam, rig)
-    weighted_px = residuals_px @ information
-    H = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
-    H_transposed = np.swapaxes(H, 1, 2)
+    # Jacobian and residual side by side: one product yields the normal equations and the cost.
+    system = np.empty((len(depth_m), 3, 4))
+    system[..., :3] = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
+    system[..., 3] = views.uvs_px - stereo.project(points_cam, rig)
+    system = rig.whitener @ system
+    normal = np.add.reduceat(np.swapaxes(system, 1, 2) @ system, views.first)
     nearest_m = np.minimum.reduceat(depth_m, views.first)
-    cost = 0.5 * np.add.reduceat(np.einsum("ni,ni->n", residuals_px, weighted_px), views.first)
-    gradient = np.add.reduceat((H_transposed @ weighted_px[..., None])[..., 0], views.first)
-    hessian = np.add.reduceat(H_transposed @ information @ H, views.first)
-    return _Fit(points, np.where(nearest_m > 0.0, cost, np.inf), gradient, hessian, nearest_m)
+    cost = np.where(nearest_m > 0.0, 0.5 * normal[:, 3, 3], np.inf)
+    return _Fit(points, cost, normal[:, :3, 3], normal[:, :3, :3], nearest_m)
 
 
 def _chosen(rows: BoolArray, new: _Fit, old: _Fit) -> _Fit:

@@ -2,7 +2,9 @@
 
 Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree", in GTSAM's implementation.
 Landmarks are eliminated first and states in the order of time, the newest last: new sightings then change few
-cliques, and the marginal of the newest state stands in the root.
+cliques, and the marginal of the newest state stands in the root. But a landmark eliminated first hangs on the first
+state that saw it, and each new sighting has all states since then eliminated anew: one that has long been in view goes
+last instead, beside the newest state, where a sighting of it changes the root alone.
 """
 
 from collections import deque
@@ -23,9 +25,9 @@ from toolkit.geometry import Array
 from toolkit.models.factors import kind_of
 from toolkit.models.motion import MotionModel
 
-# The states of so many frames are eliminated last, in the order of time; more than the longest track lives, for
-# states left out of the order make the tree ever denser.
-RECENT_FRAMES = 100
+# The states of so many frames are eliminated last, in the order of time, and behind them what has more sightings than
+# these: a state costs as much as two landmarks, so that a longer track is cheaper in the root than the states it spans.
+RECENT_FRAMES, LONG_LIVED_SIGHTINGS = 100, 10
 # What none of the last so many frames has factors on stays linearised where it is, Python factors included: a heading
 # that turns a little moves the whole past, and a frame would cost as much as the run is long.
 FROZEN_AFTER_FRAMES = 30
@@ -134,12 +136,16 @@ class Isam2Tree:
         self.read(self._recent[-1][:1])
 
     def _order(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-        """Return the place of each recent state in the elimination; all else comes first.
+        """Return the place of each recent state, and each long-lived landmark it sees, in the elimination.
 
-        CCOLAMD takes no place beyond the number of variables it orders, of which the new factors' are the least.
+        All else comes first. CCOLAMD takes no place beyond the number of variables it orders, of which the new factors'
+        are the least.
         """
-        groups, places = gtsam.KeyGroupMap(), max(factors.keys().size() - 1, 0)
-        for place, keys in enumerate(list(self._recent)[max(len(self._recent) - places, 0) :], start=1):
+        groups, new = gtsam.KeyGroupMap(), list(factors.keys())
+        places = max(len(new) - 1, 0)
+        states = list(self._recent)[max(len(self._recent) - places + 1, 0) :]
+        long_lived = [key for key in new if len(self._sightings.get(key, ())) > LONG_LIVED_SIGHTINGS]
+        for place, keys in enumerate([*states[:-1], long_lived, *states[-1:]], start=1):
             for key in keys:
                 groups.insert2(key, place)
         return groups

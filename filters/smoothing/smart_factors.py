@@ -116,7 +116,7 @@ class Vision:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
         huber = self.camera.huber
         weights = np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
-        weighted = weights[:, None, None] * stereo.whitener(self.camera.rig)
+        weighted = weights[:, None, None] * self.camera.rig.whitener
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
         return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
 
@@ -130,7 +130,7 @@ class Vision:
     @cached_property
     def _residual(self) -> Array:
         """Measured less predicted, whitened (N, 3)."""
-        return (self.sightings.uv_px - self._predicted.uv_px) @ stereo.whitener(self.camera.rig).T
+        return (self.sightings.uv_px - self._predicted.uv_px) @ self.camera.rig.whitener.T
 
     @cached_property
     def _norm(self) -> Array:

@@ -242,6 +242,6 @@ def test_three_seconds_of_blackout_do_not_end_it(run_estimator):
 
 def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recording_with_a_fleck, run_estimator):
     """It ended as failed, with sightings of a landmark that the tree no longer had."""
-    run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 1, 30.0))
+    run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 2, 30.0))
     assert run.status == "ok", run.log
     assert any("indeterminate and was dropped" in line for line in run.log)

@@ -110,13 +110,13 @@ def test_its_update_is_that_of_the_filter_written_on_the_group(scenario) -> None
     P = convert @ joint.cov @ convert.T
     joint.clone(0)
     seen = joint_landmarks.linearise_sightings(joint, frame, AT, rig)
-    stacked = joint_landmarks.stacked(joint, seen)
-    H_plain = np.zeros((stacked.residuals.size, convert.shape[0]))
-    H_wide, d = stacked.H.reshape(stacked.residuals.size, -1), joint.core.layout.size
+    H, residuals = joint_landmarks.stacked(joint, seen).weighed(np.ones(len(seen.depth_m)))
+    H_plain = np.zeros((residuals.size, convert.shape[0]))
+    H_wide, d = H.toarray(), joint.core.layout.size
     H_plain[:, :6], H_plain[:, d:] = H_wide[:, :6], H_wide[:, 6:]
     H = H_plain @ np.linalg.inv(convert)
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
-    xi = gain @ stacked.residuals.reshape(-1)
+    xi = gain @ residuals
     joint_landmarks.correct(joint, frame, AT, rig, FrameGate(probability=1.0))
     joint.forget_clones(np.ones(1, dtype=bool))
 
@@ -169,7 +169,8 @@ def test_a_shift_and_a_turn_of_the_world_are_the_same_error_at_every_estimate(sc
         moved = joint.displaced(drawn)
         here = gauge(moved, turns=np.eye(3))
         assert np.abs(here - constant).max() > 0.01, "in the plain error they are others"
-        H = joint_landmarks.stacked(moved, joint_landmarks.linearise_sightings(moved, frame, AT, rig)).H
+        seen = joint_landmarks.linearise_sightings(moved, frame, AT, rig)
+        H, _ = joint_landmarks.stacked(moved, seen).weighed(np.ones(len(seen.depth_m)))
         part = joint_landmarks.columns(moved)
         # Jacobians of hundreds of pixels a radian or metre, directions of tens of metres.
         assert np.abs(H @ here[part]).max() < 1e-9

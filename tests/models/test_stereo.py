@@ -105,7 +105,7 @@ def test_a_point_in_the_plane_of_the_camera_has_an_image_and_keeps_its_depth(pos
 
 @every_rig
 def test_whitened_noise_has_unit_covariance(rig):
-    whitener = stereo.whitener(rig)
+    whitener = rig.whitener
     np.testing.assert_allclose(whitener @ rig.cov_uv_px2 @ whitener.T, np.eye(3), atol=1e-12)
 
 

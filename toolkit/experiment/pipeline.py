@@ -269,7 +269,6 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        ignored={name: rules for name, entry in entries.items() if (rules := entry.ignores())},
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,

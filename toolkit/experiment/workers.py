@@ -37,7 +37,9 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NU
 }
 _POLL_S, _PARENT_POLL_S = 0.1, 1.0
 # How far a unit has come, as its process writes it and the parent reads it.
-_ENTRY = np.dtype([("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64)])
+_ENTRY = np.dtype(
+    [("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")]
+)
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
 _STEPS = 100
 
@@ -144,13 +146,18 @@ class _Share:
         if stage and stage not in self._stages:
             self._stages.append(stage)
         steps = _share_done(len(self._stages), done, total)
-        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count)
+        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count, _in_words(stage, done))
 
 
 def _share_done(stages: int, done: int, total: int) -> int:
     half = _STEPS // 2
     part = half * done // max(total, 1)
     return part if stages == 0 else half + part
+
+
+def _in_words(stage: str, done: int) -> str:
+    """Return what a smoother does in the end, nothing where it has not come to that."""
+    return f"{stage}, iteration {done + 1}" if stage else ""
 
 
 class _Watch(Generic[T, R]):
@@ -183,7 +190,7 @@ class _Watch(Generic[T, R]):
                 result = future.result()
                 self._finished.add(place)
                 yield place, result
-            progress.advance(self._steps_done(), _STEPS * len(self._units))
+            progress.advance(self._steps_done(), _STEPS * len(self._units), self._stage())
 
     def _alone(self, place: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
         """Try a unit once more in a process of its own."""
@@ -199,12 +206,17 @@ class _Watch(Generic[T, R]):
         return future
 
     def _steps_done(self) -> int:
-        under_way = [
-            _share_done(int(entry["stages"]), int(entry["done"]), int(entry["total"]))
-            for place, entry in enumerate(self._entries)
-            if place not in self._finished and place < len(self._units)
-        ]
-        return _STEPS * len(self._finished) + sum(under_way)
+        shares = [_share_done(int(one["stages"]), int(one["done"]), int(one["total"])) for one in self._under_way()]
+        return _STEPS * len(self._finished) + sum(shares)
+
+    def _stage(self) -> str:
+        """Return what the first of the smoothers that have come to their end does there."""
+        stages = (_in_words(one["stage"].decode(), int(one["done"])) for one in self._under_way())
+        return next(filter(None, stages), "")
+
+    def _under_way(self) -> list[Any]:
+        """Return the entries of the units that are not finished."""
+        return [self._entries[place] for place in range(len(self._units)) if place not in self._finished]
 
 
 def _executor(count: int) -> ProcessPoolExecutor:
@@ -227,7 +239,7 @@ def _end_with(parent: int) -> None:
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
     """Do a unit of work in a process of its own."""
     entries = np.memmap(board, dtype=_ENTRY, mode="r+")
-    entries[place] = (1, 0, 1, 0)
+    entries[place] = (1, 0, 1, 0, b"")
     try:
         return work(unit, _Entry(entries, place))
     except MemoryError:
@@ -245,7 +257,7 @@ class _Entry:
         """Write how far the unit has come."""
         if stage and stage not in self._stages:
             self._stages.append(stage)
-        self._entries[self._place] = (1, done, total, len(self._stages))
+        self._entries[self._place] = (1, done, total, len(self._stages), stage.encode("ascii", "replace"))
 
 
 def _how_it_ended(error: BrokenProcessPool) -> str:

@@ -13,7 +13,7 @@ METRICS = (
         "frame_ms_mean",
         "mean wall-clock time of a step, the first included (ms)",
         "ms",
-        ("frame", "mean"),
+        ("wall", "frame"),
         in_contract=True,
     ),
     Metric("frame_ms_p95", "95th percentile of the same (ms)", "ms", ("frame", "p95"), in_contract=True),
@@ -29,7 +29,7 @@ METRICS = (
     Metric("cpu_s", "processor time of all threads (s)", "s", ("CPU", ""), in_contract=True),
     Metric(
         "peak_rss_mb",
-        "peak resident memory of the process (MB)",
+        "peak resident memory of the process during the run (MB)",
         "MB",
         ("peak", "memory"),
         decimals=0,

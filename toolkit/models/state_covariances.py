@@ -8,12 +8,15 @@ each state, which takes a hundred times as long.
 """
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
 from toolkit.models.motion import MotionModel
+
+_STATES_AT_A_TIME = 10
 
 
 def state_covs(
@@ -24,11 +27,56 @@ def state_covs(
     ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them.
     """
     states = [motion.keys(k) for k in range(len(poses))]
-    _, reduced = linear.eliminatePartialSequential(_ordering(landmark_keys))
-    in_time = [key for keys in states for key in keys]
-    net = reduced.eliminateSequential(_ordering(in_time))
-    covs = list(_recovered([net.at(i) for i in range(net.size())], states))[::-1]
+    covs = list(_recovered(_eliminated(linear, landmark_keys, states), states))[::-1]
     return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
+
+
+def _eliminated(
+    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]]
+) -> list[gtsam.GaussianConditional]:
+    """Return each state's variables given later ones, in the order of time.
+
+    Some states are eliminated at a time, after the landmarks first seen from them. A landmark without its sightings is
+    a dense factor on all states that saw it: of all landmarks at once they would take gigabytes.
+    """
+    parts, rest = _parts(linear, landmark_keys, states), gtsam.GaussianFactorGraph()
+    conditionals: list[gtsam.GaussianConditional] = []
+    for factors, landmarks, keys in parts:
+        factors.push_back(rest)
+        net, rest = factors.eliminatePartialSequential(_ordering([*landmarks, *keys]))
+        found = {one.firstFrontalKey(): one for one in (net.at(i) for i in range(net.size()))}
+        conditionals += [found[key] for key in keys]
+    return conditionals
+
+
+class _Part(NamedTuple):
+    """The factors of which some landmarks and states are the first to be eliminated, and the keys of both."""
+
+    factors: gtsam.GaussianFactorGraph
+    landmarks: list[int]
+    states: list[int]
+
+
+def _parts(
+    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]]
+) -> list[_Part]:
+    """Divide a graph among stretches of states: a landmark belongs to the first that saw it, with its sightings."""
+    part_of = {key: k // _STATES_AT_A_TIME for k, keys in enumerate(states) for key in keys}
+    landmarks, count = set(landmark_keys), len(states)
+    factors = [linear.at(i) for i in range(linear.size())]
+    keys_of = [factor.keys() for factor in factors]
+    for keys in keys_of:
+        seen_from = [part_of[key] for key in keys if key not in landmarks]
+        for key in landmarks.intersection(keys):
+            part_of[key] = min([part_of.get(key, count), *seen_from])
+    parts = [_Part(gtsam.GaussianFactorGraph(), [], []) for _ in range(0, count, _STATES_AT_A_TIME)]
+    for factor, keys in zip(factors, keys_of, strict=True):
+        parts[min(part_of[key] for key in keys)].factors.push_back(factor)
+    for key in landmark_keys:
+        parts[part_of[key]].landmarks.append(key)
+    for k, of_state in enumerate(states):
+        parts[k // _STATES_AT_A_TIME].states.extend(of_state)
+    return parts
 
 
 def _ordering(keys: Sequence[int]) -> gtsam.Ordering:

@@ -28,21 +28,24 @@ class StereoPrediction(NamedTuple):
 def project(points_cam: Array, rig: StereoRig) -> Array:
     """Project points (..., 3) in left-camera coordinates to (uL, uR, v) (..., 3) px (Kang, eq. 3)."""
     x, y, z = points_cam[..., 0], points_cam[..., 1], points_cam[..., 2]
-    u_left_px = rig.fx_px * x / z + rig.cx_px
-    u_right_px = rig.fx_px * (x - rig.baseline_m) / z + rig.cx_px
-    v_px = rig.fy_px * y / z + rig.cy_px
-    return np.stack([u_left_px, u_right_px, v_px], axis=-1)
+    uv_px = np.empty(points_cam.shape)
+    uv_px[..., 0] = rig.fx_px * x / z + rig.cx_px
+    uv_px[..., 1] = rig.fx_px * (x - rig.baseline_m) / z + rig.cx_px
+    uv_px[..., 2] = rig.fy_px * y / z + rig.cy_px
+    return uv_px
 
 
 def projection_jacobian(points_cam: Array, rig: StereoRig) -> Array:
     """Return d(uL, uR, v)/d(point) (..., 3, 3) in camera coordinates: K_s dpi/dq (Kang, eq. 7)."""
     x, y, inverse_z = points_cam[..., 0], points_cam[..., 1], 1.0 / points_cam[..., 2]
+    across_px, down_px = rig.fx_px * inverse_z, rig.fy_px * inverse_z
     jacobian = np.zeros((*points_cam.shape, 3))
-    jacobian[..., 0, 0] = jacobian[..., 1, 0] = rig.fx_px * inverse_z
-    jacobian[..., 0, 2] = -rig.fx_px * x * inverse_z**2
-    jacobian[..., 1, 2] = -rig.fx_px * (x - rig.baseline_m) * inverse_z**2
-    jacobian[..., 2, 1] = rig.fy_px * inverse_z
-    jacobian[..., 2, 2] = -rig.fy_px * y * inverse_z**2
+    jacobian[..., 0, 0] = jacobian[..., 1, 0] = across_px
+    jacobian[..., 2, 1] = down_px
+    across_px = across_px * inverse_z
+    jacobian[..., 0, 2] = -across_px * x
+    jacobian[..., 1, 2] = -across_px * (x - rig.baseline_m)
+    jacobian[..., 2, 2] = -down_px * inverse_z * y
     return jacobian
 
 
@@ -61,20 +64,15 @@ def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPr
     points_cam[..., 2] = np.where(np.abs(depth_m) < _LEAST_DIVISIBLE_M, _LEAST_DIVISIBLE_M, depth_m)
     d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ rig.T_imu_cam[:3, :3].T
     # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the IMU frame.
-    d_uv_d_pose = np.concatenate([d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu], axis=-1)
+    d_uv_d_pose = np.empty((*points_imu.shape, 6))
+    d_uv_d_pose[..., :3], d_uv_d_pose[..., 3:] = d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu
     d_uv_d_point = d_uv_d_point_imu @ np.swapaxes(R_world_imu, -1, -2)
     return StereoPrediction(project(points_cam, rig), d_uv_d_pose, d_uv_d_point, depth_m)
 
 
 def in_camera(points_imu: Array, rig: StereoRig) -> Array:
     """Return points (..., 3) of the IMU frame in the left camera."""
-    T_cam_imu = se3_inverse(rig.T_imu_cam)
-    return np.asarray(points_imu @ T_cam_imu[:3, :3].T + T_cam_imu[:3, 3])
-
-
-def whitener(rig: StereoRig) -> Array:
-    """Return W (3, 3) with W cov W^T = 1: a residual (..., 3) px becomes one of unit variance by ``residual @ W.T``."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(rig.cov_uv_px2)))
+    return np.asarray(points_imu @ rig.T_cam_imu[:3, :3].T + rig.T_cam_imu[:3, 3])
 
 
 def triangulate(uvs_px: Array, rig: StereoRig) -> Array:

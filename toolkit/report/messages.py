@@ -23,14 +23,16 @@ _MARK = {
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
-_RULES = {"outliers": "outliers", "window": "the window"}
-
 # A difference that takes more seeds than these to find is none that matters.
 _MOST_SEEDS = 10_000
 
 # Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
+_WITHOUT_TRUTH = (
+    "without ground truth the table shows how well an estimate explains tracks that none was given (held-out) and what "
+    "it cost, the notes whether its innovations fit its covariance; not how far it is from the true path"
+)
 _STATUS = {
     "diverged": (
         "diverged: it ran to the end, but its answers left what is physically plausible. That is a result, not a "
@@ -67,6 +69,8 @@ def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[st
     warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
     if warnings:
         yield f"whatever its status, no result stands without what the audit says of: {', '.join(warnings)}"
+    if comparison.sequence.truth is None and len(comparison.sequence.observations):
+        yield _WITHOUT_TRUTH
 
 
 def rules_line(comparison: Comparison) -> str:
@@ -133,9 +137,6 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     if not len(comparison.sequence.observations):
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
-    for name, rules in comparison.ignored.items():
-        for rule, why in rules.items():
-            yield f"{name} does not obey the common rule for {_RULES.get(rule, rule)}: {why}"
     yield from _marks(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)

@@ -1,7 +1,7 @@
 """The camera's motion from each frame to the next, from its own stereo tracks and nothing else.
 
 Points triangulated in the earlier frame are projected into the later one; Gauss-Newton on that residual with
-Cauchy weights, from "no motion", all intervals of a recording at once. The points are corrected with the motion, and
+Cauchy weights, from "no motion", many intervals of a recording at once. The points are corrected with the motion, and
 every residual and Jacobian is taken at the best point for both views: with the first view's alone the noise of near
 and far points biases the motion, by 0.01 rad/s where disparities are a few pixels. A residual is weighted by the noise
 of both its measurements, J R J^T + R: far points determine the rotation, near ones the translation.
@@ -9,6 +9,7 @@ Source: Geiger, Ziegler & Stiller, "StereoScan" (2011), section III-A, with the 
 Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment" (2000), section 6.1.
 """
 
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -35,6 +36,8 @@ RIDGE = 1e-12
 MOST_DEPTH_M = 1e5
 # Median of a chi-square variable with three degrees of freedom.
 CHI2_3_MEDIAN = 2.366
+# So many pairs of sightings at a time: what is computed of them takes some 10 MB, however long the recording.
+PAIRS_AT_A_TIME = 10_000
 
 
 class CameraMotion(NamedTuple):
@@ -60,6 +63,13 @@ class _TwoViews(NamedTuple):
     interval: IntArray
     first: IntArray
 
+    def over(self, intervals: slice) -> "_TwoViews":
+        """Return those of some intervals, counted from the first of them."""
+        first = self.first[intervals.start : intervals.stop + 1]
+        rows = slice(first[0], first[-1])
+        pixels = (self.uv_before_px[rows], self.uv_after_px[rows])
+        return _TwoViews(self.points[rows], *pixels, self.interval[rows] - intervals.start, first - first[0])
+
 
 def usable_pairs(sequence: Sequence) -> Neighbours:
     """Return the neighbouring sightings that are finite and near enough to be triangulated."""
@@ -75,14 +85,32 @@ def camera_motion(sequence: Sequence) -> CameraMotion:
     if views.interval.size == 0:
         return CameraMotion(np.zeros((intervals, 3)), np.zeros((intervals, 3)), np.zeros(intervals, dtype=bool))
     T_before_after, support = np.tile(np.eye(4), (intervals, 1, 1)), np.zeros(intervals)
-    for _ in range(ITERATIONS):
-        step, support, points = _gauss_newton(views, T_before_after, sequence.rig)
-        T_before_after, views = T_before_after @ se3_exp(step), views._replace(points=points)
+    for stretch in _stretches(views.first):
+        T_before_after[stretch], support[stretch] = _motion_over(views.over(stretch), sequence.rig)
     known = (support > LEAST_SUPPORT) & np.isfinite(T_before_after).all(axis=(1, 2))
     dt_s = np.diff(sequence.frames_t_ns)[known] / NS_PER_S
     twist = np.zeros((intervals, 6))
     twist[known] = se3_log(T_before_after[known]) / dt_s[:, None]
     return CameraMotion(twist[:, :3], twist[:, 3:], known)
+
+
+def _stretches(first: IntArray) -> Iterator[slice]:
+    """Yield the intervals that have pairs, some at a time; ``first`` (K,) is where the pairs of each begin."""
+    begin, last = 0, first.size - 1
+    while begin < last and first[begin] < first[-1]:
+        full = int(np.searchsorted(first, first[begin] + PAIRS_AT_A_TIME, side="right")) - 1
+        end = max(full, begin + 1)
+        yield slice(begin, end)
+        begin = end
+
+
+def _motion_over(views: _TwoViews, rig: StereoRig) -> tuple[Array, Array]:
+    """Return the motion (K, 4, 4) over every interval and the sum of its weights (K,)."""
+    T_before_after, support = np.tile(np.eye(4), (views.first.size - 1, 1, 1)), np.zeros(views.first.size - 1)
+    for _ in range(ITERATIONS):
+        step, support, points = _gauss_newton(views, T_before_after, rig)
+        T_before_after, views = T_before_after @ se3_exp(step), views._replace(points=points)
+    return T_before_after, support
 
 
 def _two_views(sequence: Sequence, intervals: int) -> _TwoViews:

@@ -181,7 +181,7 @@ def _without_mismatches(
 
 def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Array, rig: StereoRig) -> StereoFrame:
     seen = stereo.predict(points[np.searchsorted(track_ids, frame.track_ids)], pose, rig)
-    whitened = (frame.uvs_px - seen.uv_px) @ stereo.whitener(rig).T
+    whitened = (frame.uvs_px - seen.uv_px) @ rig.whitener.T
     likely = np.square(whitened).sum(axis=1) < chi2_bound(3, 1.0 - _MISMATCH_PROBABILITY)
     return frame.select(likely & (seen.depth_m > 0.0))
 
@@ -196,7 +196,7 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
     uvs_px, seen_from = uvs_px[order], poses[pose[order]]
     track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
     points = stereo.triangulate_world(uvs_px[first], seen_from[first], rig)
-    whitener = stereo.whitener(rig)
+    whitener = rig.whitener
     for _ in range(_POINT_ITERATIONS):
         seen = stereo.predict(points[track], seen_from, rig)
         H, residuals = whitener @ seen.d_uv_d_point, (uvs_px - seen.uv_px) @ whitener.T
@@ -271,7 +271,7 @@ class _Information:
         problem, rows = self._problem, self._problem.rows(frame)
         self._join(rows[~np.isin(rows, self._landmarks)])
         seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
-        whitener = stereo.whitener(problem.rig)
+        whitener = problem.rig.whitener
         H = np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
         residuals = (frame.uvs_px - seen.uv_px) @ whitener.T
         place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]

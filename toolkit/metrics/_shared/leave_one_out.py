@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.models.stereo import whitener
 from toolkit.sequence import StereoRig
 
 # 95 % quantile of the length of three whitened residuals: sqrt(chi2(3, 0.95)).
@@ -154,7 +153,7 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
         denominator_0=constant[:, 2],
         focal_px=np.array([rig.fx_px, rig.fx_px, rig.fy_px]),
         centre_px=np.array([rig.cx_px, rig.cx_px, rig.cy_px]),
-        sqrt_information=whitener(rig),
+        sqrt_information=rig.whitener,
     )
 
 
