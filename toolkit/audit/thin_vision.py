@@ -18,7 +18,8 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     known = evidence.camera_motion.known
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
-    spans = [(begin, end) for begin, end in _runs(~known) if frame_s[end] - frame_s[begin] >= LEAST_S]
+    # A single interval that long is a hole in the frames, which time-gap names.
+    spans = [run for run in _runs(~known) if run[1] - run[0] > 1 and frame_s[run[1]] - frame_s[run[0]] >= LEAST_S]
     if not spans:
         return None
     longest = max(spans, key=lambda span: frame_s[span[1]] - frame_s[span[0]])

@@ -1,0 +1,61 @@
+"""Warnings: told where they are planted and of the size they have, and of nothing in sound recordings."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.audit.fault import Evidence
+from toolkit.audit.parts.deviations import Deviation, sustained
+from toolkit.audit.parts.turn import turn_of_camera
+from toolkit.geometry import se3, so3_exp
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+WARNINGS = {"conflict", "miscalibration", "thin-vision"}
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_a_sound_recording_warns_of_nothing(scenario: str, seed: int) -> None:
+    assert audit(simulate(replace(SCENARIOS[scenario], duration_s=8.0), seed)).findings == ()
+
+
+def test_a_conflict_is_told_at_its_time_and_of_its_size() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 3)
+    disturbed = faults.disturbed_motion(sound, 3.0, 3)
+    off = np.flatnonzero(np.any(disturbed.motion.values != sound.motion.values, axis=1))
+    begin_s, end_s = (disturbed.motion.t_ns[off[[0, -1]]] - sound.frames_t_ns[0]) / 1e9
+    (found,) = (finding for finding in audit(disturbed).findings if finding.fault == "conflict")
+    told = re.search(r"at (\d+)-(\d+) s \(by ([\d.]+) m/s", found.detail)
+    assert told is not None
+    # Whole seconds, and a quarter of the stretch of 2 s at either end.
+    assert [float(told[1]), float(told[2])] == pytest.approx([begin_s, end_s], abs=1.0)
+    assert float(told[3]) == pytest.approx(3.0, abs=0.15)
+    assert found.warning and not found.blocking and not found.repaired
+
+
+def test_what_scatters_all_along_is_no_conflict_and_what_stands_out_is() -> None:
+    rng, t_s = np.random.default_rng(0), 0.1 * np.arange(600)
+    wander = np.repeat(rng.normal(0.0, 0.5, (30, 3)), 20, axis=0)  # lasts 2 s each, as slip does
+    value = wander + rng.normal(0.0, 0.05, (600, 3))
+    noise = np.full(3, 0.06)
+    assert sustained(Deviation("velocity", "m/s", t_s, value, noise, False), 10.0, 0.2) == []
+    value[300:350] += np.array([9.0, 0.0, 0.0])
+    (span,) = sustained(Deviation("velocity", "m/s", t_s, value, noise, False), 10.0, 0.2)
+    assert (span.begin_s, span.end_s) == pytest.approx((30.0, 35.0), abs=1.0)
+
+
+def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determines() -> None:
+    """A car drives ahead: its velocity tells pitch and yaw, and nothing of the roll."""
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 3)
+    intervals, T_imu_cam = Evidence(sound).intervals, sound.rig.T_imu_cam
+    assert intervals is not None
+    turned = se3(so3_exp(np.array([0.3, 0.03, -0.04])), np.zeros(3)) @ T_imu_cam
+    turned[:3, 3] = T_imu_cam[:3, 3]
+    found = turn_of_camera(intervals, turned)
+    assert found.rad.size == 2
+    # Five of its standard errors, about 0.001 rad, and what the roll turns the sides into each other.
+    assert np.linalg.norm(found.rad) == pytest.approx(0.05, abs=0.01)
+    assert (np.abs(turn_of_camera(intervals, T_imu_cam).rad) < 0.006).all()

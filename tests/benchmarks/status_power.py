@@ -1,0 +1,319 @@
+"""How often a bad run says so, and how often a sound one raises a false alarm; not part of the tests.
+
+A scenario is a fault of toolkit.simulation.faults in a stretch of a simulated recording, or none, with the truth taken
+away. The recording is audited and run as a user would; then the truth is put back for the error: the RMS of the
+position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
+that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
+overconfident, or where the audit found something in its recording, repaired or not; faults that could not be judged do
+not count. In a sound recording all of that is a false alarm, and so is the mark timid.
+
+The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
+thresholds may be chosen, and `score`, which is not to be looked at while they are.
+
+    python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
+    python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
+
+With --keep DIRECTORY every run is pickled there, and what is there already is judged by the code as it is, not run.
+"""
+
+import argparse
+import json
+import pickle
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence, Sized
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from toolkit.errors import VislamError
+from toolkit.estimate import Output, Run, Status
+from toolkit.experiment.consistency import consistency_of
+from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.experiment.units import Unit, outcome_of, run_estimator
+from toolkit.metrics import Evaluation, ate
+from toolkit.progress import SILENT
+from toolkit.resampling import NS_PER_S
+from toolkit.runner import judged
+from toolkit.sequence import Observations
+from toolkit.sequence import Sequence as Recorded
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+LENGTH_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+Result = TypeVar("Result")
+FAULTS: dict[str, Callable[..., Recorded]] = {
+    f"{injector.__name__} {dose:g}": partial(injector, dose=dose)
+    for injector, doses in (
+        (faults.dropped_sightings, (0.1, 0.5)),
+        (faults.blackout, (1.0, 3.0)),
+        (faults.outlier_tracks, (0.1, 0.3, 0.6)),
+        (faults.moving_objects, (0.3, 0.5, 0.8)),
+        (faults.few_tracks, (3, 10)),
+        (faults.one_sided_view, (0.5, 0.8)),
+        (faults.swapped_images, (0.1, 1.0)),
+        (faults.swapped_coordinates, (0.1, 1.0)),
+        (faults.shifted_pixels, (20, 5000)),
+        (faults.misaligned_rows, (4, 12)),
+        (faults.skewed_pixels, (10, 50)),
+        (faults.motion_gap, (0.5, 1.0, 3.0)),
+        (faults.disturbed_motion, (0.5, 2.0)),
+        (faults.spike, (5.0, 1e300)),
+        (faults.nan_span, (0.25, 1.0)),
+        (faults.linear_unit, (0.8, 1.1, 3.6)),
+        (faults.angular_unit, (1.2, 57.3)),
+        (faults.gyro_bias, (0.01, 0.05)),
+        (faults.wrong_noise, (0.33, 2.0, 5.0)),
+        (faults.camera_clock, (-0.05, 0.02, 0.25)),
+        (faults.clock_jump, (-0.5, 0.5)),
+        (faults.standstill, (5.0, 10.0)),
+        (faults.zero_intrinsics, (0.0,)),
+        (faults.identity_intrinsics, (1.0,)),
+        (faults.transposed_intrinsics, (0.0,)),
+        (faults.negative_focal, (-1.0,)),
+        (faults.baseline_unit, (1.1, 1000.0)),
+        (faults.extrinsic_unit, (1000.0,)),
+        (faults.inverted_extrinsic, (1.0,)),
+        (faults.turned_camera, (0.01, 0.05)),
+    )
+    for dose in doses
+}
+HALVES = ("fit", "score")
+# So many stretches of each recording a half has, and in so many of these faults are planted.
+STRETCHES, FAULTY_STRETCHES = 7, 5
+# The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
+CHEAP = ("dead-reckoning", "ekf", "ekf-slam", "mapping", "msckf", "msckf-fej", "msckf-slam", "riekf", "seed-ekf")
+DEAR = ("batch", "fixed-lag", "smart", "isam2", "batch", "fixed-lag", "smart", "iekf")
+SOUND = ""
+LIMIT = 3.0
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A fault, or none, in a stretch of a simulated recording, and the estimators that meet it."""
+
+    recording: str
+    seed: int
+    fault: str
+    estimators: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Return a name as one of a file."""
+        return "_".join(filter(None, (self.recording, str(self.seed), self.fault.replace(" ", "-"))))
+
+
+def scenarios(half: str) -> list[Scenario]:
+    """Return the scenarios of a half: every fault is in both, in other recordings, and the stretches are others.
+
+    Sound stretches come first: all cheap estimators run on them, and of the dear ones those that meet a fault there.
+    """
+    first_seed, faulty = 1000 * (1 + HALVES.index(half)), list[Scenario]()
+    for i, fault in enumerate(FAULTS):
+        for j, recording in enumerate(LENGTH_S):
+            if (i + j) % 2 == HALVES.index(half):
+                count = len(faulty)
+                cheap = (CHEAP[(2 * count + k) % len(CHEAP)] for k in range(2))
+                dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 else ()
+                seed = first_seed + (count // len(LENGTH_S)) % FAULTY_STRETCHES
+                faulty.append(Scenario(recording, seed, fault, (*cheap, *dear)))
+    sound = []
+    for k in range(STRETCHES):
+        for recording in LENGTH_S:
+            here = [one for one in faulty if (one.recording, one.seed) == (recording, first_seed + k)]
+            dear = sorted({name for one in here for name in one.estimators} - set(CHEAP))
+            sound.append(Scenario(recording, first_seed + k, SOUND, (*CHEAP, *dear)))
+    return sound + faulty
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How one run ended, and what it and the audit of its recording said without the truth."""
+
+    half: str
+    recording: str
+    seed: int
+    fault: str
+    estimator: str
+    error_m: float | None = None
+    status: str = "ok"
+    mark: str = ""
+    found: Sequence[str] = ()
+    log: Sequence[str] = ()
+
+    @property
+    def is_told(self) -> bool:
+        """Say whether the run's status, its mark or the audit says that something is wrong."""
+        return bool(self.found) or self.status != "ok" or self.mark == "overconfident"
+
+    @property
+    def is_alarm(self) -> bool:
+        """Say whether anything but ``ok`` is said."""
+        return self.is_told or bool(self.mark)
+
+
+def is_bad(run: Ended, sound: Ended) -> bool:
+    """Say whether a fault costs more than the limit, or the result."""
+    if run.error_m is None:
+        return True
+    return sound.error_m is not None and run.error_m > LIMIT * sound.error_m
+
+
+def stretch(recording: str, seed: int) -> Recorded:
+    """Return some seconds of a simulated recording: its beginning, or with odd seeds from a time drawn."""
+    length_s = LENGTH_S[recording]
+    whole = simulate(SCENARIOS[recording], seed)
+    begin_s = np.random.default_rng(seed).uniform(1.0, 59.0 - length_s) if seed % 2 else 0.0
+    t_s = (whole.frames_t_ns - whole.frames_t_ns[0]) / NS_PER_S
+    inside = (t_s >= begin_s) & (t_s <= begin_s + length_s)
+    rows, first = inside[whole.observations.frame], int(np.argmax(inside))
+    seen = whole.observations.select(rows)
+    return replace(
+        whole,
+        frames_t_ns=whole.frames_t_ns[inside],
+        observations=Observations(seen.frame - first, seen.track_id, seen.uv_px),
+        prior=whole.prior if first == 0 else None,
+    )
+
+
+def planted(scenario: Scenario) -> Recorded | None:
+    """Return the recording of a scenario, or None where its fault cannot be planted in such a one."""
+    sound = stretch(scenario.recording, scenario.seed)
+    if scenario.fault == SOUND:
+        return sound
+    try:
+        return FAULTS[scenario.fault](sound, seed=scenario.seed + sorted(FAULTS).index(scenario.fault))
+    except VislamError:
+        return None
+
+
+def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
+    """Run a scenario's estimators and put the truth back for their errors; nothing where the fault cannot be planted.
+
+    A recording or a run that is refused has no error and says why.
+    """
+    recorded = planted(scenario)
+    if recorded is None:
+        return
+    prepared = _unless_refused(partial(prepare, Recording(replace(recorded, truth=None))))
+    for name in scenario.estimators:
+        run = prepared
+        if isinstance(prepared, Prepared):
+            kept = keep and keep / f"{scenario.name}_{name}.run"
+            run = _unless_refused(partial(_run, name, prepared, kept))
+        one = Ended(half, scenario.recording, scenario.seed, scenario.fault, name)
+        if isinstance(run, str):
+            yield replace(one, status="refused", log=(run,))
+        elif isinstance(run, Run) and isinstance(prepared, Prepared):
+            yield _scored(one, run, prepared, replace(prepared.sequence, truth=recorded.truth))
+
+
+def _unless_refused(make: Callable[[], Result]) -> Result | str:
+    """Return what a function makes, or in words why it refuses to."""
+    try:
+        return make()
+    except VislamError as reason:
+        return str(reason)
+
+
+def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
+    """Run an estimator, or judge the run that is kept by the code as it is."""
+    if kept is not None and kept.exists():
+        run: Run = pickle.loads(kept.read_bytes())
+        log = tuple(line for line in run.log if not line.startswith("the trajectory diverged"))
+        status: Status = "ok" if run.status == "diverged" else run.status
+        return judged(replace(run, status=status, log=log), prepared.sequence)
+    run = run_estimator(Unit(prepared, 0, name), prepared, SILENT)
+    if kept is not None:
+        kept.write_bytes(pickle.dumps(run))
+    return run
+
+
+def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> Ended:
+    scored = outcome_of(run, prepared.sequence, 0).outputs.values()
+    verdicts = [found.verdict for found in map(consistency_of, ([output] for output in scored)) if found is not None]
+    return replace(
+        one,
+        error_m=_error_m(run, with_truth),
+        status=run.status,
+        mark=next((verdict for verdict in verdicts if verdict != "consistent"), ""),
+        found=tuple(sorted(finding.fault for finding in prepared.findings)),
+        log=run.log,
+    )
+
+
+def _error_m(run: Run, sequence: Recorded) -> float | None:
+    """Return the RMS position error, aligned by what the sensors leave open: heading and position, or the pose."""
+    output: Output = "final" if run.causal is None else "causal"
+    if run.trajectory(output) is None:
+        return None
+    aligned = "ate_se3_m" if sequence.motion_kind == "twist" else "ate_yaw_m"
+    value = ate.score(Evaluation(run, output, sequence)).values[aligned]
+    return None if value is None or not np.isfinite(value) else float(value)
+
+
+def run_half(half: str, file: Path, keep: Path | None) -> None:
+    """Append a line a run to a file, without the scenarios that it has."""
+    lines = read(file)
+    done = {(one.recording, one.seed, one.fault, one.estimator) for one in lines}
+    for scenario in scenarios(half):
+        where = (scenario.recording, scenario.seed, scenario.fault)
+        missing = tuple(name for name in scenario.estimators if (*where, name) not in done)
+        for one in ended(half, replace(scenario, estimators=missing), keep) if missing else ():
+            with file.open("a") as out:
+                out.write(json.dumps(asdict(one)) + "\n")
+        print(scenario.name, flush=True)
+
+
+def read(file: Path) -> list[Ended]:
+    """Return the runs of a file; none where it is not there."""
+    return [Ended(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def print_table(lines: list[Ended]) -> bool:
+    """Print power and false alarms, by estimator and by fault, and every silent run; say whether the bar is reached."""
+    sound = {(one.recording, one.seed, one.estimator): one for one in lines if one.fault == SOUND}
+    pairs = [(one, sound.get((one.recording, one.seed, one.estimator))) for one in lines if one.fault != SOUND]
+    bad = [one for one, clean in pairs if clean is not None and is_bad(one, clean)]
+    told, alarms = [one for one in bad if one.is_told], [one for one in sound.values() if one.is_alarm]
+    harmless = [one for one, clean in pairs if clean is not None and not is_bad(one, clean)]
+    print(f"{len(pairs)} faulty runs, {len(bad)} bad: {len(told)} of them say so ({_percent(told, bad)})")
+    print(f"{len(sound)} sound runs: {len(alarms)} raise a false alarm ({_percent(alarms, sound)})")
+    warned = [one for one in harmless if one.is_told]
+    print(f"{len(harmless)} runs that a fault cost less: {len(warned)} tell of it ({_percent(warned, harmless)})")
+    by = Counter("audit" if one.found else "status" if one.status != "ok" else "mark" for one in told)
+    print(f"the bad say so by the audit, else by the status, else by the mark: {dict(by)}")
+    for key in ("estimator", "fault"):
+        for name in sorted({getattr(one, key) for one in bad}):
+            of_name = [one for one in bad if getattr(one, key) == name]
+            print(f"{name:<24} bad {len(of_name):>3}, silent {sum(not one.is_told for one in of_name):>3}")
+    for one in (*(one for one in bad if not one.is_told), *alarms):
+        what = "false alarm" if one.fault == SOUND else f"silent: {one.fault}"
+        print(
+            f"{what}, {one.recording} {one.seed}, {one.estimator}: {one.error_m} m, {one.status} {one.mark} {one.found}"
+        )
+    return len(told) >= 0.95 * len(bad) and len(alarms) <= 0.02 * len(sound)
+
+
+def _percent(part: Sized, whole: Sized) -> str:
+    return f"{100.0 * len(part) / max(len(whole), 1):.1f} %"
+
+
+def main(words: list[str]) -> int:
+    """Run a half, or print its table and exit 1 beside the bar: 95 % of the bad say so, at most 2 % of the sound do."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("run", "table"))
+    parser.add_argument("half", choices=HALVES)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--keep", type=Path, metavar="DIRECTORY")
+    wanted = parser.parse_args(words)
+    if wanted.what == "run":
+        run_half(wanted.half, wanted.file, wanted.keep)
+        return 0
+    return 0 if print_table([one for one in read(wanted.file) if one.half == wanted.half]) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
