@@ -30,7 +30,7 @@ def belief_with_a_landmark(depth_m: float) -> JointBelief:
 def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
     """Return a frame that shows the landmark where the projection's formula puts it, but for ``off_px`` (3,)."""
     uv_px = stereo.predict(joint.points, joint.clones[0], SEQUENCE.rig).uv_px + off_px
-    return StereoFrame(0, np.array([7]), uv_px)
+    return StereoFrame(0, np.array([7]), uv_px, np.zeros(1, dtype=np.int64))
 
 
 @pytest.mark.parametrize("correct", [joint_landmarks.correct, iterated.correct], ids=["single", "iterated"])
