@@ -62,7 +62,12 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
     rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    sightings = TrackSightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
+    sightings = TrackSightings(
+        joint.landmark_ids,
+        frame.uvs_px[rows][:, None],
+        np.ones((len(rows), 1), dtype=bool),
+        frame.ages[rows][:, None],
+    )
     newest = joint.clones[-1:]
     now = multiview.linearise(sightings, joint.points, newest, newest, rig)
     there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)
