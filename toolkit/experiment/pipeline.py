@@ -267,12 +267,20 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        ignored={name: rules for name, entry in entries.items() if (rules := entry.ignores())},
+        ignored=_ignored(entries, sequence),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
         card=case.prepared.card,
     )
+
+
+def _ignored(entries: Mapping[str, EstimatorEntry], sequence: Recorded) -> dict[str, dict[str, str]]:
+    """Return which rules estimators do not obey, and why; that for the noise of tracks where the rig states one."""
+    rules = {name: dict(entry.ignores()) for name, entry in entries.items()}
+    if sequence.rig.track_noise is None:
+        rules = {name: {r: why for r, why in of_one.items() if r != "tracks"} for name, of_one in rules.items()}
+    return {name: of_one for name, of_one in rules.items() if of_one}
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:

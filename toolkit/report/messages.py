@@ -23,7 +23,7 @@ _MARK = {
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
-_RULES = {"outliers": "outliers", "window": "the window"}
+_RULES = {"outliers": "outliers", "window": "the window", "tracks": "correlated noise of tracks"}
 
 # A difference that takes more seeds than these to find is none that matters.
 _MOST_SEEDS = 10_000
