@@ -106,6 +106,15 @@ def correct(joint: ErringBelief, frame: StereoFrame, at: Linearisation, rig: Ste
         joint.update(H.reshape(3 * used.size, -1), (roots[:, None] * residuals[used]).ravel(), slice(first, None))
 
 
+def strayed(joint: ErringBelief, gate: FrameGate) -> BoolArray:
+    """Say which tracks (L,) have come to an error that the walk and the offset do not explain, by the gate's measure.
+
+    What moves slowly by itself passes the gate at every frame, and its track's error takes up all of it.
+    """
+    variance_px2 = correlated_noise.walked_variance(joint.noise, joint.ages)
+    return np.asarray((np.square(joint.track_errors_px) / variance_px2).sum(axis=1) > gate.bound(3))
+
+
 def _columns_each(joint: ErringBelief) -> IntArray:
     """Return the columns (L, 12) of the newest clone, of each landmark and of the error of its track."""
     newest = np.arange(joint.clone_columns.stop - 6, joint.clone_columns.stop)

@@ -13,7 +13,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -42,9 +42,13 @@ class StackedSightings(NamedTuple):
 
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
-    lost = ~np.isin(joint.landmark_ids, frame.track_ids)
-    memory.remember(joint.landmark_ids[lost], joint.points[lost])
-    joint.forget_landmarks(lost)
+    forget(joint, ~np.isin(joint.landmark_ids, frame.track_ids), memory)
+
+
+def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
+    """Marginalise landmarks (L,) of the state; the memory keeps their last value."""
+    memory.remember(joint.landmark_ids[which], joint.points[which])
+    joint.forget_landmarks(which)
 
 
 def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:

@@ -71,6 +71,7 @@ class SlidingWindowFilter:
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
         if isinstance(self._joint, ErringBelief):
             erring_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+            joint_landmarks.forget(self._joint, erring_landmarks.strayed(self._joint, gate), self._memory)
         else:
             joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
 

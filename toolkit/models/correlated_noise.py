@@ -25,6 +25,12 @@ def white_rig(noise: TrackNoise, rig: StereoRig) -> StereoRig:
     return replace(rig, cov_uv_px2=to_uv @ to_uv.T, track_noise=None)
 
 
+def walked_variance(noise: TrackNoise, ages: IntArray) -> Array:
+    """Return the variance (N, 3) px^2 that the walk and the offset have at ages (N,), with the least white noise."""
+    walked = np.square(noise.walk_px) * ages[:, None].astype(float)
+    return np.asarray(np.square(noise.offset_px) + walked + LEAST_WHITE_PX**2)
+
+
 def decorrelation(noise: TrackNoise, rig: StereoRig, ages: IntArray, seen: BoolArray) -> Array:
     """Return what makes the residuals of F tracks independent, (F, 3 W, 3 W), of sightings (F, W) of given ages.
 
