@@ -144,9 +144,9 @@ def table(options: argparse.Namespace) -> None:
                 found[line["estimator"], line["model"], output][line["drive"]].append(line)
     reference = found["dead-reckoning", "white", "causal"]
     print(f"{'':44s}over dead reckoning's ATE      {LONG_DRIVE}")
-    print(f"{'':44s}SE(3)  yaw    none   NEES ori  SE(3) m KITTI %  bad  CPU s")
+    print(f"{'':44s}SE(3)  yaw    none   NEES ori  SE(3) m KITTI %  bad  CPU s  drives runs")
     for (name, model, output), by_drive in sorted(found.items()):
-        short = [drive for drive in by_drive if drive != LONG_DRIVE]
+        short = [drive for drive in by_drive if drive != LONG_DRIVE and drive in reference]
         ratios = [_geometric([_ratio(by_drive[d], reference[d], output, key) for d in short]) for key in METRICS[:3]]
         nees = [_mean(by_drive[d], output, "nees_ori_mean") for d in short]
         of_long = [_mean(by_drive.get(LONG_DRIVE, []), output, key) for key in ("ate_se3_m", "kitti_t_percent")]
@@ -155,7 +155,7 @@ def table(options: argparse.Namespace) -> None:
         figures = "  ".join(f"{ratio:5.3f}" for ratio in ratios)
         print(
             f"{name:14s} {model:22s} {output:6s} {figures} {_geometric(nees):7.2f}   {of_long[0]:7.2f} "
-            f"{of_long[1]:7.2f}  {bad:3d}  {cpu_s:5.0f}"
+            f"{of_long[1]:7.2f}  {bad:3d}  {cpu_s:5.0f}  {len(short):6d} {sum(len(by_drive[d]) for d in short):4d}"
         )
 
 
