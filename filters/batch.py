@@ -4,6 +4,9 @@ What it approximates: nothing but the noise; every measurement is relinearised a
 Kaess 2017, "Factor Graphs for Robot Perception", chapter 2). It starts from the trajectory of msckf-fej and the
 landmarks mapped along it, for a start that has diverged, dead-reckoned or with too small a covariance, ends in poor
 minima.
+
+Where the rig states noise of tracks, the solves of the schedule are followed by two along the tracks, which are Markov
+chains of sightings (``filters/smoothing/track_chain.py``).
 """
 
 import gtsam

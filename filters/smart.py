@@ -5,6 +5,9 @@ is never a variable (Carlone et al. 2014; Forster et al. 2017, section VI). When
 marginalised with it as they were linearised then; one that lives on starts anew, so no landmark is remembered beyond
 the window. Its causal answer is the newest state, its final answer each state as it left the window, with the
 covariance the window had for it.
+
+Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses: a Markov chain
+(:class:`toolkit.models.correlated_noise.Chain`). A track that starts anew does so at its age.
 """
 
 from collections.abc import Iterable

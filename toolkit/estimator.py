@@ -5,8 +5,8 @@ estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first li
 summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
 ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
 where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``IGNORES`` names the common rules
-("outliers", "window") that it does not obey, each with the reason; ``CITES`` is what ``vislam cite`` prints for it,
-keys of toolkit/report/references.bib or BibTeX itself.
+("outliers", "window", "tracks") that it does not obey, each with the reason; ``CITES`` is what ``vislam cite`` prints
+for it, keys of toolkit/report/references.bib or BibTeX itself.
 """
 
 import ast

@@ -133,7 +133,7 @@ def _tracks_worth_using(frames: list[StereoFrame]) -> IntArray:
 
 def _only(frame: StereoFrame, tracks: IntArray) -> StereoFrame:
     kept = np.isin(frame.track_ids, tracks) & (stereo.disparity_px(frame.uvs_px) > _LEAST_DISPARITY_PX)
-    return StereoFrame(frame.t_ns, frame.track_ids[kept], frame.uvs_px[kept])
+    return frame.select(kept)
 
 
 def _positions(frames: list[StereoFrame], attitudes: list[Array], rig: StereoRig) -> Array:

@@ -162,15 +162,19 @@ class Prior:
 # In both, ``noise_scale`` (n, 2) multiplies the noise of linear and angular samples; None where all was measured.
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px."""
+    """What the camera saw at one instant: stamp, track ids (N,), measurements (uL, uR, v) (N, 3) px, the tracks' ages.
+
+    An age (N,) is the number of the recording's frames since the first sighting of the track.
+    """
 
     t_ns: int
     track_ids: IntArray
     uvs_px: Array
+    ages: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "StereoFrame":
         """Return the frame with the sightings of a mask (N,) or an index (M,) only."""
-        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows])
+        return StereoFrame(self.t_ns, self.track_ids[rows], self.uvs_px[rows], self.ages[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,11 +252,12 @@ class Sequence:
         motion samples.
         """
         check_runnable(self)
-        first_row = np.searchsorted(self.visible.frame, np.arange(self.frame_count + 1))
+        seen, ages = self.visible, _ages(self.visible)
+        first_row = np.searchsorted(seen.frame, np.arange(self.frame_count + 1))
         motions = motions_between(self.motion, self.frames_t_ns, self.bridges)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
-            frame = StereoFrame(int(self.frames_t_ns[k]), self.visible.track_id[rows], self.visible.uv_px[rows])
+            frame = StereoFrame(int(self.frames_t_ns[k]), seen.track_id[rows], seen.uv_px[rows], ages[rows])
             yield Packet(k, next(motions) if k else None, frame)
 
     def truncated(self, max_frames: int) -> Self:
@@ -275,6 +280,12 @@ def is_held_out(track_ids: IntArray) -> BoolArray:
     """Say for each track id (N,) whether it is withheld: one in ten, by a fixed multiplicative hash."""
     mixed = track_ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.asarray((mixed >> np.uint64(33)) % np.uint64(HELD_OUT_ONE_IN) == 0)
+
+
+def _ages(seen: Observations) -> IntArray:
+    """Return for each sighting (N,) the number of frames since the first of its track."""
+    _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
+    return np.asarray(seen.frame - seen.frame[first][track], dtype=np.int64)
 
 
 def check_runnable(sequence: Sequence) -> None:

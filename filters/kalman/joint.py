@@ -93,12 +93,16 @@ class JointBelief:
 
         ``cov`` (3 N, 3 N) is the covariance of that noise, which must be independent of the state.
         """
-        cross = np.asarray(jacobian @ self._cov)
-        own = _symmetric(jacobian @ cross.T + cov)
-        self._cov = np.block([[self._cov, cross.T], [cross, own]])
+        self._add_rows(jacobian, cov)
         self.landmark_ids = np.concatenate([self.landmark_ids, track_ids])
         self.points = np.concatenate([self.points, points])
         self.first_points = np.concatenate([self.first_points, points])
+
+    def _add_rows(self, jacobian: Array | csr_array, cov: Array) -> None:
+        """Add to the end of the error state what is ``jacobian`` (m, n) times the state's error, plus noise."""
+        cross = np.asarray(jacobian @ self._cov)
+        own = _symmetric(jacobian @ cross.T + cov)
+        self._cov = np.block([[self._cov, cross.T], [cross, own]])
 
     def update(self, H: Array | csr_array, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
@@ -140,7 +144,7 @@ class JointBelief:
         d, clones = self._core.layout.size, self.clone_columns
         self._core = self._core.moved(delta[:d], self._core.cov)
         self.clones = self.clones @ se3_exp(delta[clones].reshape(-1, 6))
-        self.points = self.points + delta[clones.stop :].reshape(-1, 3)
+        self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)
 
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
         """Return Jacobians to the errors after a move by ``delta`` (n,) as Jacobians to ``delta``.

@@ -77,7 +77,10 @@ class JointEkf:
         joint = self._joint
         new = ~np.isin(frame.track_ids, joint.landmark_ids)
         sightings = TrackSightings(
-            frame.track_ids[new], frame.uvs_px[new][:, None], np.ones((int(new.sum()), 1), dtype=bool)
+            frame.track_ids[new],
+            frame.uvs_px[new][:, None],
+            np.ones((int(new.sum()), 1), dtype=bool),
+            frame.ages[new][:, None],
         )
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]

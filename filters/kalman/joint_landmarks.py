@@ -14,7 +14,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -51,13 +51,15 @@ class StackedSightings(NamedTuple):
 
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
-    if not len(joint.landmark_ids):
-        return
-    lost = ~np.isin(joint.landmark_ids, frame.track_ids)
-    if not lost.any():
-        return
-    memory.remember(joint.landmark_ids[lost], joint.points[lost])
-    joint.forget_landmarks(lost)
+    if len(joint.landmark_ids):
+        forget(joint, ~np.isin(joint.landmark_ids, frame.track_ids), memory)
+
+
+def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:
+    """Marginalise landmarks (L,) of the state; the memory keeps their last value."""
+    if which.any():
+        memory.remember(joint.landmark_ids[which], joint.points[which])
+        joint.forget_landmarks(which)
 
 
 def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
@@ -75,7 +77,12 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
     rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    sightings = TrackSightings(joint.landmark_ids, frame.uvs_px[rows][:, None], np.ones((len(rows), 1), dtype=bool))
+    sightings = TrackSightings(
+        joint.landmark_ids,
+        frame.uvs_px[rows][:, None],
+        np.ones((len(rows), 1), dtype=bool),
+        frame.ages[rows][:, None],
+    )
     newest = joint.clones[-1:]
     now = multiview.linearise(sightings, joint.points, newest, newest, rig)
     there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)

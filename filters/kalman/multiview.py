@@ -10,42 +10,71 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.models import stereo
+from toolkit.models import correlated_noise, stereo
 from toolkit.sequence import StereoRig
+
+_REFINEMENTS = 3
 
 
 class TrackSightings(NamedTuple):
-    """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W)."""
+    """F tracks seen from the W poses of a window: ids (F,), (uL, uR, v) (F, W, 3) px, and which were seen (F, W).
+
+    ``ages`` (F, W) are those of the sightings in frames, since the first one of the track in the recording.
+    """
 
     track_ids: IntArray
     uvs_px: Array
     seen: BoolArray
+    ages: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return some of the tracks."""
-        return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows])
+        return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
+
+    def joined(self, other: "TrackSightings") -> "TrackSightings":
+        """Return both together."""
+        track_ids, uvs_px = (
+            np.concatenate([self.track_ids, other.track_ids]),
+            np.concatenate([self.uvs_px, other.uvs_px]),
+        )
+        seen, ages = np.concatenate([self.seen, other.seen]), np.concatenate([self.ages, other.ages])
+        return TrackSightings(track_ids, uvs_px, seen, ages)
 
 
 class Linearised(NamedTuple):
-    """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3)."""
+    """Whitened residuals (F, W, 3) with Jacobians to each pose (F, W, 3, 6) and to the landmark (F, W, 3, 3).
+
+    ``decorrelation`` (F, 3W, 3W) makes the rows of a track independent of each other; None where they are.
+    """
 
     residuals: Array
     H_pose: Array
     H_point: Array
     depth_m: Array
+    decorrelation: Array | None = None
 
     def select(self, rows: BoolArray | IntArray) -> "Linearised":
         """Return those of some tracks."""
-        return Linearised(*[array[rows] for array in self])
+        mixing = None if self.decorrelation is None else self.decorrelation[rows]
+        residuals, H_pose, H_point, depth_m = (array[rows] for array in self._arrays())
+        return Linearised(residuals, H_pose, H_point, depth_m, mixing)
 
     def scaled(self, factors: Array) -> "Linearised":
         """Return all rows of each track multiplied by its factor (F,)."""
         by = factors[:, None, None]
-        return Linearised(by * self.residuals, by[..., None] * self.H_pose, by[..., None] * self.H_point, self.depth_m)
+        return self._replace(
+            residuals=by * self.residuals, H_pose=by[..., None] * self.H_pose, H_point=by[..., None] * self.H_point
+        )
 
     def joined(self, other: "Linearised") -> "Linearised":
         """Return both together."""
-        return Linearised(*[np.concatenate(pair) for pair in zip(self, other, strict=True)])
+        pairs = zip(self._arrays(), other._arrays(), strict=True)
+        residuals, H_pose, H_point, depth_m = (np.concatenate(pair) for pair in pairs)
+        mixings = [mixing for mixing in (self.decorrelation, other.decorrelation) if mixing is not None]
+        return Linearised(residuals, H_pose, H_point, depth_m, np.concatenate(mixings) if mixings else None)
+
+    def _arrays(self) -> tuple[Array, Array, Array, Array]:
+        return self.residuals, self.H_pose, self.H_point, self.depth_m
 
 
 def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
@@ -61,6 +90,32 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, now.depth_m, np.inf))
+
+
+def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
+    """Return tracks together with what makes their rows independent, where the rig's noise hangs together."""
+    if rig.track_noise is None:
+        return linearised
+    mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen)
+    return linearised._replace(decorrelation=mixing)
+
+
+def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
+    """Return the points (F, 3) that fit sightings best whose noise hangs together, from those of white noise.
+
+    Gauss-Newton, each step no longer than a fifth of the way to the newest pose that saw the point.
+    """
+    count, window = sightings.seen.shape
+    for _ in range(_REFINEMENTS):
+        here = decorrelated(linearise(sightings, points, poses, poses, rig), sightings, rig)
+        assert here.decorrelation is not None
+        H = here.decorrelation @ here.H_point.reshape(count, 3 * window, 3)
+        residual = here.decorrelation @ here.residuals.reshape(count, 3 * window, 1)
+        H_transposed = np.swapaxes(H, 1, 2)
+        step = np.linalg.solve(H_transposed @ H, H_transposed @ residual)[..., 0]
+        most = 0.2 * here.depth_m.min(axis=1)
+        points = points + step * np.minimum(1.0, most / np.maximum(np.linalg.norm(step, axis=1), 1e-9))[:, None]
+    return points
 
 
 def _seen_from(poses: Array, points: Array, rig: StereoRig) -> stereo.StereoPrediction:
@@ -95,14 +150,19 @@ class Constraints(NamedTuple):
 def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
     """Project the measurements onto the left null space of the landmark's Jacobian (MSCKF, eqs. 23-24)."""
     tracks, window = seen.shape
-    vectors, weighted = _reflectors(linearised)
+    dof = 3 * seen.sum(axis=1) - 3
     stacked = linearised.residuals.reshape(tracks, 3 * window, 1)
+    if linearised.decorrelation is not None:
+        basis = null_space(linearised)
+        H = np.swapaxes(by_pose(basis) @ linearised.H_pose, 1, 2).reshape(tracks, 3 * window - 3, 6 * window)
+        return Constraints((basis @ stacked)[..., 0], H, dof)
+    vectors, weighted = _reflectors(linearised)
     residuals = (stacked - vectors @ (weighted @ stacked))[:, 3:, 0]
     reached = np.swapaxes(by_pose(weighted) @ linearised.H_pose, 1, 2).reshape(tracks, 3, 6 * window)
     H = vectors @ -reached
     own_poses = np.einsum("fwiwj->fwij", H.reshape(tracks, window, 3, window, 6))
     own_poses += linearised.H_pose
-    return Constraints(residuals, H[:, 3:], 3 * seen.sum(axis=1) - 3)
+    return Constraints(residuals, H[:, 3:], dof)
 
 
 def by_pose(rows: Array) -> Array:
@@ -112,9 +172,18 @@ def by_pose(rows: Array) -> Array:
 
 
 def null_space(linearised: Linearised) -> Array:
-    """Return rows (F, 3W - 3, 3W) that span what the landmark's Jacobian does not reach."""
-    vectors, weighted = _reflectors(linearised)
-    return np.asarray((np.eye(vectors.shape[1]) - vectors @ weighted)[:, 3:])
+    """Return rows (F, 3W - 3, 3W) that span what the landmark's Jacobian does not reach.
+
+    What they make of a track's residuals is independent and of unit variance. With rows that are not, decorrelated by
+    M, they are N^T M, the rows of N^T spanning what ``M H_point`` does not reach.
+    """
+    mixing = linearised.decorrelation
+    if mixing is None:
+        vectors, weighted = _reflectors(linearised)
+        return np.asarray((np.eye(vectors.shape[1]) - vectors @ weighted)[:, 3:])
+    H_point = linearised.H_point.reshape(*mixing.shape[:2], 3)
+    q, _ = np.linalg.qr(mixing @ H_point, mode="complete")
+    return np.asarray(np.swapaxes(q[:, :, 3:], 1, 2) @ mixing)
 
 
 def _reflectors(linearised: Linearised) -> tuple[Array, Array]:

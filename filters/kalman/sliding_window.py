@@ -5,11 +5,16 @@ the window are never corrected again (Mourikis & Roumeliotis 2007). A pose leave
 reaches, as a state does in the smoothers. With ``landmarks`` the tracks that span the window stay in the state, up to
 that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for vision-aided
 inertial navigation").
+
+Where the rig states noise of tracks, the sightings of a track correct with their whole covariance, and a landmark in
+the state has the error of its track beside it. What is approximated: a track that lives on after it was used starts
+anew at its age, and the error it has come to by then is taken for drawn anew.
 """
 
 import numpy as np
 
-from filters.kalman import joint_landmarks, multiview
+from filters.kalman import erring_landmarks, joint_landmarks, multiview
+from filters.kalman.erring_landmarks import ErringBelief
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
@@ -21,8 +26,10 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
+from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
+from toolkit.track_noise import TrackNoise
 
 
 class SlidingWindowFilter:
@@ -38,7 +45,7 @@ class SlidingWindowFilter:
         window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
-        self._joint = JointBelief(self._motion.initial_belief(setup.prior))
+        self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
         self._tracks = WindowTracks()
         self._memory = LandmarkMemory()
 
@@ -49,7 +56,7 @@ class SlidingWindowFilter:
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
-        joint_landmarks.correct(self._joint, packet.frame, self._at, self._rig, gate)
+        self._correct_by_landmarks(packet.frame, gate)
         self._tracks.add_frame(_without(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
@@ -60,6 +67,13 @@ class SlidingWindowFilter:
         """Return every landmark that was ever triangulated, as last known."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
+
+    def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
+        if isinstance(self._joint, ErringBelief):
+            erring_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+            joint_landmarks.forget(self._joint, erring_landmarks.strayed(self._joint, gate), self._memory)
+        else:
+            joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
@@ -85,10 +99,12 @@ class SlidingWindowFilter:
         accepted = TrackGate(joint, self._at, self._rig).accepted(sightings, gate)
         if not len(accepted.points):
             return
-        self._memory.remember(accepted.track_ids, accepted.points)
-        kept = accepted.select(np.flatnonzero(accepted.seen[:, -1])[: self._room])
-        if len(kept.points):
-            joint_landmarks.add_tracks(joint, kept.track_ids, kept.points, kept.linearised)
+        self._memory.remember(accepted.sightings.track_ids, accepted.points)
+        kept = accepted.select(np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room])
+        if len(kept.points) and isinstance(joint, ErringBelief):
+            erring_landmarks.add_tracks(joint, kept.sightings, kept.points, kept.linearised)
+        elif len(kept.points):
+            joint_landmarks.add_tracks(joint, kept.sightings.track_ids, kept.points, kept.linearised)
         H, residuals = multiview.compressed(*_stacked(accepted.constraints))
         joint.update(H, residuals, joint.clone_columns)
 
@@ -106,6 +122,7 @@ class WindowTracks:
         self._ids: IntArray = np.empty(0, dtype=np.int64)
         self._uvs_px = np.empty((0, 0, 3))
         self._seen = np.empty((0, 0), dtype=bool)
+        self._ages: IntArray = np.empty((0, 0), dtype=np.int64)
 
     def add_frame(self, frame: StereoFrame) -> None:
         """Append the frame's sightings as a new column; ids unknown so far start new tracks."""
@@ -113,15 +130,17 @@ class WindowTracks:
         ids = np.concatenate([self._ids, new])
         count, window = len(ids), self._seen.shape[1] + 1
         uvs_px, seen = np.zeros((count, window, 3)), np.zeros((count, window), dtype=bool)
-        uvs_px[: len(self._ids), :-1], seen[: len(self._ids), :-1] = self._uvs_px, self._seen
+        ages = np.zeros((count, window), dtype=np.int64)
+        known = slice(len(self._ids))
+        uvs_px[known, :-1], seen[known, :-1], ages[known, :-1] = self._uvs_px, self._seen, self._ages
         order = np.argsort(ids)
         rows = order[np.searchsorted(ids, frame.track_ids, sorter=order)]
-        uvs_px[rows, -1], seen[rows, -1] = frame.uvs_px, True
-        self._ids, self._uvs_px, self._seen = ids, uvs_px, seen
+        uvs_px[rows, -1], seen[rows, -1], ages[rows, -1] = frame.uvs_px, True, frame.ages
+        self._ids, self._uvs_px, self._seen, self._ages = ids, uvs_px, seen, ages
 
     def drop_columns(self, which: BoolArray) -> None:
         """Forget what was seen from some poses (W,)."""
-        self._uvs_px, self._seen = self._uvs_px[:, ~which], self._seen[:, ~which]
+        self._uvs_px, self._seen, self._ages = self._uvs_px[:, ~which], self._seen[:, ~which], self._ages[:, ~which]
         self._keep(np.asarray(self._seen.any(axis=1)))
 
     def ended(self) -> BoolArray:
@@ -134,12 +153,17 @@ class WindowTracks:
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
-        taken = TrackSightings(self._ids[rows], self._uvs_px[rows], self._seen[rows])
+        taken = TrackSightings(self._ids[rows], self._uvs_px[rows], self._seen[rows], self._ages[rows])
         self._keep(np.logical_not(rows))
         return taken
 
     def _keep(self, rows: BoolArray) -> None:
-        self._ids, self._uvs_px, self._seen = self._ids[rows], self._uvs_px[rows], self._seen[rows]
+        self._ids, self._uvs_px = self._ids[rows], self._uvs_px[rows]
+        self._seen, self._ages = self._seen[rows], self._ages[rows]
+
+
+def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
+    return JointBelief(core) if noise is None else ErringBelief(core, noise)
 
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:

@@ -22,10 +22,9 @@ from toolkit.sequence import StereoRig
 
 
 class AcceptedTracks(NamedTuple):
-    """F tracks that passed: ids (F,), by which poses (F, W), points (F, 3), and their constraints on the window."""
+    """F tracks that passed: the sightings that count, points (F, 3), and their constraints on the window."""
 
-    track_ids: IntArray
-    seen: BoolArray
+    sightings: TrackSightings
     points: Array
     linearised: Linearised
     constraints: Constraints
@@ -33,7 +32,7 @@ class AcceptedTracks(NamedTuple):
     def select(self, rows: BoolArray | IntArray) -> "AcceptedTracks":
         """Return some of the tracks."""
         linearised, constraints = self.linearised.select(rows), self.constraints.select(rows)
-        return AcceptedTracks(self.track_ids[rows], self.seen[rows], self.points[rows], linearised, constraints)
+        return AcceptedTracks(self.sightings.select(rows), self.points[rows], linearised, constraints)
 
     def weighed(self, weights: Array) -> "AcceptedTracks":
         """Return the tracks as if their noise were larger, each by its weight (F,)."""
@@ -43,8 +42,7 @@ class AcceptedTracks(NamedTuple):
     def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
         """Return both together."""
         return AcceptedTracks(
-            np.concatenate([self.track_ids, other.track_ids]),
-            np.concatenate([self.seen, other.seen]),
+            self.sightings.joined(other.sightings),
             np.concatenate([self.points, other.points]),
             self.linearised.joined(other.linearised),
             self.constraints.joined(other.constraints),
@@ -71,13 +69,16 @@ class TrackGate:
         joint = self._joint
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
+        if self._rig.track_noise is not None:
+            points = multiview.refined(sightings, points, joint.clones, self._rig)
         linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
+        linearised = multiview.decorrelated(linearised, sightings, self._rig)
         constraints = multiview.without_landmark(linearised, sightings.seen)
         covs = self._covs(constraints)
         nis = mahalanobis_squared(constraints.residuals, covs)
         accepted = gate.accepts(nis, constraints.dof)
         weights = gate.weights(nis, constraints.dof, accepted)
-        tracks = AcceptedTracks(sightings.track_ids, sightings.seen, points, linearised, constraints)
+        tracks = AcceptedTracks(sightings, points, linearised, constraints)
         mismatched = np.asarray(nis > MISMATCHED_TRACK_FACTOR * gate.bound(constraints.dof))
         seen = sightings.seen[mismatched]
         if len(seen):
@@ -101,7 +102,7 @@ def _worst_sighting(tracks: AcceptedTracks, covs: Array) -> IntArray:
     with ``W`` the precision of all coordinates and ``r`` their residuals, the NIS falls by
     ``(W r)_j^T W_jj^-1 (W r)_j``.
     """
-    seen = tracks.seen
+    seen = tracks.sightings.seen
     count, window = seen.shape
     basis = multiview.null_space(tracks.linearised)
     informed = np.linalg.solve(covs, np.concatenate([basis, tracks.constraints.residuals[..., None]], axis=2))

@@ -8,7 +8,7 @@ identity: a tenth of it after a step that lowered the error, ten times as much a
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -24,10 +24,21 @@ _LEAST_DECREASE = 1e-12
 
 @dataclass(frozen=True)
 class Stopping:
-    """When to stop: a relative decrease of the error that is small, or too many iterations."""
+    """When to stop: a decrease of the error that is small, in itself or relative to it, or too many iterations."""
 
     relative_decrease: float = 1e-5
     max_iterations: int = 50
+    decrease: float = _LEAST_DECREASE
+
+
+class Beside(Protocol):
+    """Measurements beside the graph, evaluated and linearised in Python for all at once."""
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return half the sum of squares, or of a loss."""
+
+    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+        """Return linear factors about the values."""
 
 
 class Solution(NamedTuple):
@@ -45,21 +56,22 @@ def solve(
     stopping: Stopping,
     progress: Progress = SILENT,
     stage: str = "solving",
+    beside: Beside | None = None,
 ) -> Solution:
     """Minimise the error of a graph from a start; ``progress`` hears of every iteration, under the stage's name.
 
     Where no step, however short, lowers the error, the start is a minimum. Raises EstimatorError where the error at the
     start is not finite: some measurement or initial value is NaN.
     """
-    error = graph.error(start)
+    error = graph.error(start) + (0.0 if beside is None else beside.error(start))
     if not np.isfinite(error):
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
-    solver = _Solver(graph, start)
+    solver = _Solver(graph, start, beside)
     here = solver.at(start, error, _FIRST_DAMPING)
     for iteration in range(1, stopping.max_iterations + 1):
         progress.advance(iteration - 1, stopping.max_iterations, stage)
         before, here = here.error, solver.advanced(here)
-        if before - here.error <= max(stopping.relative_decrease * here.error, _LEAST_DECREASE):
+        if before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease):
             return Solution(here.values(), here.error, iteration, converged=True)
     return Solution(here.values(), here.error, stopping.max_iterations, converged=False)
 
@@ -78,9 +90,9 @@ class _Reached(NamedTuple):
 class _Solver:
     """Takes the steps of one solve."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> None:
-        self._graph, self._native = graph, gtsam.NonlinearFactorGraph(graph)
-        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, beside: Beside | None) -> None:
+        self._graph, self._native, self._beside = graph, gtsam.NonlinearFactorGraph(graph), beside
+        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(_together(graph, beside, start))
         self._python = {place: old.factor for place, old in cached_linearisations(graph, start.extract).items()}
         for place in self._python:
             self._native.remove(place)
@@ -89,6 +101,7 @@ class _Solver:
         """Return an optimizer that goes on from some values, the Python factors linearised there."""
         cached = {place: CachedLinearisation(f, values.extract(f.keys())) for place, f in self._python.items()}
         linearised = with_linearisations(self._graph, cached) if cached else self._graph
+        linearised = _together(linearised, self._beside, values)
         return _Reached(gtsam.LevenbergMarquardtOptimizer(linearised, values, self._params(damping)), error)
 
     def _params(self, damping: float) -> gtsam.LevenbergMarquardtParams:
@@ -103,7 +116,7 @@ class _Solver:
 
     def advanced(self, here: _Reached) -> _Reached:
         """Return where the next step that lowers the error leads; the same place, where none does."""
-        if not self._python:
+        if not self._python and self._beside is None:
             here.optimizer.iterate()
             return _Reached(here.optimizer, here.optimizer.error())
         values, tried = here.values(), here.optimizer.lambda_()
@@ -120,4 +133,15 @@ class _Solver:
 
     def _error(self, values: gtsam.Values) -> float:
         own = sum(factor.error(values.extract(factor.keys())) for factor in self._python.values())
-        return self._native.error(values) + own
+        beside = 0.0 if self._beside is None else self._beside.error(values)
+        return self._native.error(values) + own + beside
+
+
+def _together(
+    graph: gtsam.NonlinearFactorGraph, beside: Beside | None, values: gtsam.Values
+) -> gtsam.NonlinearFactorGraph:
+    if beside is None:
+        return graph
+    whole = gtsam.NonlinearFactorGraph(graph)
+    whole.push_back(beside.linearised(values))
+    return whole

@@ -13,6 +13,8 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
+from filters.smoothing.robust_loss import Cauchy, Squares
+from filters.smoothing.track_chain import ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
@@ -24,6 +26,9 @@ from toolkit.settings import Outliers
 
 # Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go. The last solve
 # starts where these end.
+# Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
+# and to the last solve what is gained counts in itself, not by the whole.
+_JUMPS_STOPPING, _CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
 
 
@@ -54,12 +59,46 @@ def solve_robustly(
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
         values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
         frames = _without_those_behind(frames, values, rig)
-    cut = outliers.batch_cut_probability
-    bound = chi2_bound(3, None if cut is None else 1.0 - cut)
+    if rig.track_noise is not None:
+        return _solve_chained(motion, frames, rig, values, outliers, progress)
+    bound = _cut_bound(outliers)
     frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
     graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
     last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
     return Smoothed(last, graph, frames)
+
+
+def _solve_chained(
+    motion: gtsam.NonlinearFactorGraph,
+    frames: list[StereoFrame],
+    rig: StereoRig,
+    start: gtsam.Values,
+    outliers: Outliers,
+    progress: Progress,
+) -> Smoothed:
+    """Solve with sightings whose errors hang together along their tracks, from the answer of those that do not.
+
+    First under Cauchy's loss of what is new in each sighting; then without those innovations that chance does not
+    explain there, at full weight: after such a jump a track may be anywhere, and its next steps still count.
+    """
+    values = _only_seen(start, frames)
+    sightings = ChainedSightings.of(frames, rig)
+    loss = Squares() if outliers.batch_cauchy is None else Cauchy(outliers.batch_cauchy)
+    robust = ChainedFactors(sightings, rig, loss)
+    values = solve(motion, values, _JUMPS_STOPPING, progress, "solving along the tracks", robust).values
+    jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers)
+    sightings, frames = without_jumps(sightings, frames, jumped)
+    last = ChainedFactors(sightings, rig, Squares())
+    values = _only_seen(values, frames)
+    solution = solve(motion, values, _CHAIN_STOPPING, progress, "solving without jumps", last)
+    graph = gtsam.NonlinearFactorGraph(motion)
+    graph.push_back(last.linearised(solution.values))
+    return Smoothed(solution, graph, frames)
+
+
+def _cut_bound(outliers: Outliers) -> Array:
+    cut = outliers.batch_cut_probability
+    return chi2_bound(3, None if cut is None else 1.0 - cut)
 
 
 def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Base, Stopping, str]]:

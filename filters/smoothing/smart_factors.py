@@ -6,6 +6,7 @@ complement, for all tracks at once. GTSAM's SmartStereoProjectionPoseFactor does
 and independent in uL, uR and v; this takes the rig's whole covariance and weighs each sighting by Huber's loss.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,7 +16,9 @@ from scipy.sparse import csc_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import stereo
+from toolkit.models.correlated_noise import Chain
 from toolkit.sequence import StereoRig
+from toolkit.track_noise import CHANNELS
 
 # A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
 _BEHIND_NORM = 100.0
@@ -40,16 +43,20 @@ class RobustCamera:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """N sightings: rows of their poses (N,), rows of their points (N,) and measurements (N, 3) px."""
+    """N sightings: rows of their poses (N,), of their points (N,), measurements (N, 3) px, ages (N,) of the tracks.
+
+    They are in the order of time.
+    """
 
     pose: IntArray
     point: IntArray
     uv_px: Array
+    ages: IntArray
 
     def of_points(self, points: IntArray) -> "Sightings":
         """Return the sightings of some points (M,), which keep their rows."""
         rows = np.isin(self.point, points)
-        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows])
+        return Sightings(self.pose[rows], self.point[rows], self.uv_px[rows], self.ages[rows])
 
 
 class PointsInView(NamedTuple):
@@ -102,7 +109,8 @@ class Vision:
     def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
         """Evaluate sightings at poses of the IMU in the world and points in the world."""
         seen = seen_from(poses, points, sightings, camera.rig)
-        return cls((len(poses), len(points)), sightings, seen, camera)
+        kind = cls if camera.rig.track_noise is None else ChainedVision
+        return kind((len(poses), len(points)), sightings, seen, camera)
 
     @property
     def loss(self) -> float:
@@ -114,11 +122,18 @@ class Vision:
 
     def reduced(self) -> Reduced:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
-        huber = self.camera.huber
-        weights = np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
+        weights = self._root_weights
         weighted = weights[:, None, None] * self.camera.rig.whitener
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
-        return _eliminated(weights[:, None] * self._residual, J_pose, J_point, self.sightings, self.counts)
+        seen, all_rows = self.sightings, np.arange(weights.size)
+        of_poses = [_OfPoses(all_rows, seen.pose, J_pose)]
+        return _eliminated(weights[:, None] * self._residual, of_poses, J_point, seen.point, self.counts)
+
+    @property
+    def _root_weights(self) -> Array:
+        """The roots of what Huber's loss makes of each residual (N,); 0 behind the camera."""
+        huber = self.camera.huber
+        return np.where(self.seen.in_front, np.sqrt(huber / np.maximum(self._norm, huber)), 0.0)
 
     @cached_property
     def _predicted(self) -> stereo.StereoPrediction:
@@ -137,25 +152,80 @@ class Vision:
         return np.asarray(np.linalg.norm(self._residual, axis=1))
 
 
-def _eliminated(residual: Array, J_pose: Array, J_point: Array, seen: Sightings, counts: tuple[int, int]) -> Reduced:
+class ChainedVision(Vision):
+    """Sightings whose errors hang together along their tracks: what is new in each is a residual of two poses.
+
+    Huber's loss is that of what is new.
+    """
+
+    def reduced(self) -> Reduced:
+        """Linearise and eliminate the points, as for sightings that stand each for itself."""
+        chain, weights = self._chain, self._root_weights[:, None, None]
+        to_pose, to_point = CHANNELS @ self._predicted.d_uv_d_pose, CHANNELS @ self._predicted.d_uv_d_point
+        own = weights * chain.whitened(to_pose, np.zeros_like(to_pose))
+        before = weights * chain.whitened(np.zeros_like(to_pose), to_pose[chain.before])
+        J_point = weights * chain.whitened(to_point, to_point[chain.before])
+        seen, follow = self.sightings, np.flatnonzero(chain.before >= 0)
+        of_poses = [
+            _OfPoses(np.arange(seen.pose.size), seen.pose, own),
+            _OfPoses(follow, seen.pose[chain.before[follow]], before[follow]),
+        ]
+        return _eliminated(weights[..., 0] * self._residual, of_poses, J_point, seen.point, self.counts)
+
+    @cached_property
+    def _chain(self) -> Chain:
+        noise, seen = self.camera.rig.track_noise, self.sightings
+        assert noise is not None
+        return Chain.of(noise, seen.point, seen.ages)
+
+    @cached_property
+    def _residual(self) -> Array:
+        """What is new in measured less predicted, whitened (N, 3)."""
+        return self._chain.innovations(self.sightings.uv_px - self._predicted.uv_px)
+
+
+class _OfPoses(NamedTuple):
+    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on."""
+
+    rows: IntArray
+    pose: IntArray
+    J_pose: Array
+
+
+def _eliminated(
+    residual: Array, of_poses: Sequence[_OfPoses], J_point: Array, point: IntArray, counts: tuple[int, int]
+) -> Reduced:
     pose_count, point_count = counts
     # Small matrix products are several times as fast on contiguous arrays.
-    to_pose, to_point = (np.ascontiguousarray(np.swapaxes(J, 1, 2)) for J in (J_pose, J_point))
-    per_pose, per_point = _summation(seen.pose, pose_count), _summation(seen.point, point_count)
+    to_point = np.ascontiguousarray(np.swapaxes(J_point, 1, 2))
+    per_point = _summation(point, point_count)
     information_point = (per_point @ (to_point @ J_point).reshape(-1, 9)).reshape(-1, 3, 3)
     information_point += _LEAST_INFORMATION_PER_M2 * np.eye(3)
     vector_point = per_point @ (to_point @ residual[..., None])[..., 0]
     root = np.ascontiguousarray(np.swapaxes(np.linalg.inv(np.linalg.cholesky(information_point)), 1, 2))
     whitened_vector = (np.swapaxes(root, 1, 2) @ vector_point[..., None])[..., 0]
-    coupling = np.zeros((pose_count, 6, point_count, 3))
-    coupling[seen.pose, :, seen.point, :] = to_pose @ (J_point @ root[seen.point])
+    coupling, vector = np.zeros((pose_count, 6, point_count, 3)), np.zeros((pose_count, 6))
+    J_whitened = J_point @ root[point]
+    for rows, pose, J_pose in of_poses:
+        to_pose = np.ascontiguousarray(np.swapaxes(J_pose, 1, 2))
+        coupling[pose, :, point[rows], :] += to_pose @ J_whitened[rows]
+        vector += _summation(pose, pose_count) @ (to_pose @ residual[rows, :, None])[..., 0]
     across = coupling.reshape(6 * pose_count, 3 * point_count)
     information = -(across @ across.T)
-    diagonal = information.reshape(pose_count, 6, pose_count, 6)
-    blocks = (per_pose @ (to_pose @ J_pose).reshape(-1, 36)).reshape(-1, 6, 6)
-    diagonal[np.arange(pose_count), :, np.arange(pose_count), :] += blocks
-    vector = per_pose @ (to_pose @ residual[..., None])[..., 0]
+    _add_of_poses(information.reshape(pose_count, 6, pose_count, 6), of_poses)
     return Reduced(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
+
+
+def _add_of_poses(information: Array, of_poses: Sequence[_OfPoses]) -> None:
+    """Add what residuals say of their poses to the information (K, 6, K, 6) on all of them."""
+    count = len(information)
+    for one in of_poses:
+        for other in of_poses:
+            both, of_one, of_other = np.intersect1d(one.rows, other.rows, assume_unique=True, return_indices=True)
+            blocks = np.swapaxes(one.J_pose[of_one], 1, 2) @ other.J_pose[of_other]
+            pairs = count * one.pose[of_one] + other.pose[of_other]
+            summed = (_summation(pairs, count**2) @ blocks.reshape(both.size, 36)).reshape(count, count, 6, 6)
+            information += np.swapaxes(summed, 1, 2)
 
 
 def _summation(groups: IntArray, count: int) -> csc_array:

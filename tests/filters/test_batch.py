@@ -54,7 +54,7 @@ def test_it_knows_no_answer_before_the_end(run_estimator):
 
 def frame_of(sightings: dict[int, float]) -> StereoFrame:
     uvs_px = np.array([[400.0, 400.0 - disparity, 150.0] for disparity in sightings.values()]).reshape(-1, 3)
-    return StereoFrame(0, np.array(list(sightings), dtype=np.int64), uvs_px)
+    return StereoFrame(0, np.array(list(sightings), dtype=np.int64), uvs_px, np.zeros(len(sightings), dtype=np.int64))
 
 
 def test_only_known_landmarks_seen_twice_and_near_once_are_smoothed():

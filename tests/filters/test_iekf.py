@@ -72,7 +72,7 @@ def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) ->
     joint.move(disturbed * np.linalg.cholesky(joint.cov) @ drawn)
     joint.clone(frames)
     assert len(joint.points) > 5
-    return Scene(joint, StereoFrame(frame.t_ns, frame.track_ids[rows], frame.uvs_px[rows]), sequence.rig)
+    return Scene(joint, frame.select(rows), sequence.rig)
 
 
 def numerical(function, size: int, step: float = 1e-3) -> Array:

@@ -32,7 +32,7 @@ def scene():
     points = transform(RIG.T_imu_cam, points_cam)
     pose, point = (a.ravel() for a in np.meshgrid(np.arange(POSES), np.arange(POINTS), indexing="ij"))
     exact = stereo.predict(points[point], poses[pose], RIG).uv_px
-    return poses, points, Sightings(pose, point, exact + 0.5 * rng.standard_normal(exact.shape))
+    return poses, points, Sightings(pose, point, exact + 0.5 * rng.standard_normal(exact.shape), np.zeros_like(pose))
 
 
 def gtsam_values(poses, points):
@@ -56,7 +56,8 @@ def projection_factors(seen, huber=HUBER):
     graph, maker = gtsam.NonlinearFactorGraph(), StereoFactors(RIG, gtsam.noiseModel.mEstimator.Huber.Create(huber))
     for k in range(POSES):
         rows = seen.pose == k
-        for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows]), k):
+        ages = np.zeros(int(rows.sum()), dtype=np.int64)
+        for factor in maker.of(StereoFrame(0, seen.point[rows], seen.uv_px[rows], ages), k):
             graph.add(factor)
     return graph
 

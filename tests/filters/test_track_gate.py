@@ -18,6 +18,7 @@ from toolkit.models.motion import motion_model
 from toolkit.simulation import DRIVE, simulate
 
 WINDOW, TRACKS = 6, 12
+AGES = np.tile(np.arange(WINDOW), (TRACKS, 1))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def scene():
     points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]
     uvs_px = np.stack([stereo.predict(points, T, sequence.rig).uv_px for T in joint.clones], axis=1)
     uvs_px += rng.normal(size=uvs_px.shape) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T * 0.5
-    return joint, sequence.rig, TrackSightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool))
+    return joint, sequence.rig, TrackSightings(np.arange(TRACKS), uvs_px, np.ones((TRACKS, WINDOW), dtype=bool), AGES)
 
 
 def mismatched(sightings: TrackSightings, errors: dict[int, list[int]]) -> TrackSightings:
@@ -53,7 +54,7 @@ def gated(scene, sightings: TrackSightings):
 
 def test_sound_tracks_all_pass_as_they_are(scene):
     accepted, gate = gated(scene, scene[2])
-    assert sorted(accepted.track_ids) == list(range(TRACKS))
+    assert sorted(accepted.sightings.track_ids) == list(range(TRACKS))
     assert gate.tested == gate.accepted == TRACKS
     assert (accepted.constraints.dof == 3 * WINDOW - 3).all()
 
@@ -61,7 +62,7 @@ def test_sound_tracks_all_pass_as_they_are(scene):
 @pytest.mark.parametrize("view", [0, 2, WINDOW - 1])
 def test_the_mismatched_sighting_is_the_one_left_out(scene, view):
     accepted, gate = gated(scene, mismatched(scene[2], {4: [view]}))
-    row = accepted.track_ids.tolist().index(4)
+    row = accepted.sightings.track_ids.tolist().index(4)
     assert accepted.constraints.dof[row] == 3 * (WINDOW - 1) - 3
     assert not accepted.linearised.H_pose[row, view].any()
     assert (gate.tested, gate.accepted) == (TRACKS + 1, TRACKS)
@@ -69,7 +70,7 @@ def test_the_mismatched_sighting_is_the_one_left_out(scene, view):
 
 def test_two_mismatches_cost_the_track(scene):
     accepted, gate = gated(scene, mismatched(scene[2], {7: [0, 3]}))
-    assert 7 not in accepted.track_ids
+    assert 7 not in accepted.sightings.track_ids
     assert (gate.tested, gate.accepted) == (TRACKS + 1, TRACKS - 1)
 
 
@@ -89,14 +90,14 @@ def test_the_fall_predicted_is_what_leaving_the_sighting_out_brings(scene):
 
     assert nis(with_it, np.ones((1, WINDOW), dtype=bool)) > 50.0 * nis(alone, without.seen)
     accepted, _ = gated(scene, bad)
-    assert accepted.points[accepted.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
+    assert accepted.points[accepted.sightings.track_ids.tolist().index(4)] == pytest.approx(points[0], abs=1e-6)
 
 
 def test_a_track_seen_twice_that_disagrees_is_rejected(scene):
     twice = scene[2]._replace(seen=np.tile(np.arange(WINDOW) < 2, (TRACKS, 1)))
     accepted, _ = gated(scene, mismatched(twice, {3: [1]}))
-    assert 3 not in accepted.track_ids
-    assert len(accepted.track_ids) == TRACKS - 1
+    assert 3 not in accepted.sightings.track_ids
+    assert len(accepted.sightings.track_ids) == TRACKS - 1
 
 
 def test_no_track_at_all_is_no_test(scene):

@@ -180,7 +180,7 @@ def test_model_equals_gtsams_factor_on_every_sighting_of_03(real: Callable[[str]
 
 
 def test_a_factor_has_the_covariance_of_the_rig():
-    frame = StereoFrame(0, np.array([4]), np.array([[300.0, 280.0, 200.0]]))
+    frame = StereoFrame(0, np.array([4]), np.array([[300.0, 280.0, 200.0]]), np.array([0]))
     (factor,) = StereoFactors(DRIVE.rig).of(frame, 7)
     assert list(factor.keys()) == [X(7), L(4)]
     # One inversion of a well-conditioned diagonal matrix.
@@ -190,7 +190,7 @@ def test_a_factor_has_the_covariance_of_the_rig():
 def test_the_residual_sign_is_the_opposite_of_gtsams(pose):
     point = in_world(np.array([[1.0, 0.5, 8.0]]), pose, DRIVE.rig)
     predicted_px = stereo.predict(point, pose, DRIVE.rig).uv_px
-    frame = StereoFrame(0, np.array([0]), predicted_px + np.array([1.0, 2.0, 3.0]))
+    frame = StereoFrame(0, np.array([0]), predicted_px + np.array([1.0, 2.0, 3.0]), np.array([0]))
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose3(pose))
     values.insert(L(0), point[0])

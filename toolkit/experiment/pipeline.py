@@ -269,11 +269,17 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
+        white={} if sequence.rig.track_noise is None else _told_white(entries),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
         card=case.prepared.card,
     )
+
+
+def _told_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
+    """Return which estimators take the noise of tracks for white whatever the rig states, and why."""
+    return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:

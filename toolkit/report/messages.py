@@ -137,6 +137,8 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     if not len(comparison.sequence.observations):
         yield _BLIND
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
+    for name, why in comparison.white.items():
+        yield f"{name} takes the noise of tracks for white: {why}"
     yield from _marks(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)

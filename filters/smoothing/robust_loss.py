@@ -1,0 +1,61 @@
+"""Losses of the lengths of whitened residuals, for many at once, by the formulas GTSAM has for one."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from toolkit.geometry import Array
+
+
+class Loss(Protocol):
+    """What residuals of given lengths (N,) cost, and what the squares of such ones count for there."""
+
+    def cost(self, norms: Array) -> Array:
+        """Return the costs (N,)."""
+
+    def weight(self, norms: Array) -> Array:
+        """Return the weights (N,) in (0, 1]: the slope of the cost over the length."""
+
+
+class Squares:
+    """No loss: half the square."""
+
+    def cost(self, norms: Array) -> Array:
+        """Return the costs (N,)."""
+        return np.asarray(0.5 * np.square(norms))
+
+    def weight(self, norms: Array) -> Array:
+        """Return ones (N,)."""
+        return np.ones_like(norms)
+
+
+@dataclass(frozen=True)
+class Huber:
+    """Linear beyond a threshold."""
+
+    threshold: float
+
+    def cost(self, norms: Array) -> Array:
+        """Return the costs (N,)."""
+        linear = self.threshold * (norms - 0.5 * self.threshold)
+        return np.where(norms <= self.threshold, 0.5 * np.square(norms), linear)
+
+    def weight(self, norms: Array) -> Array:
+        """Return the weights (N,)."""
+        return np.asarray(self.threshold / np.maximum(norms, self.threshold))
+
+
+@dataclass(frozen=True)
+class Cauchy:
+    """Logarithmic far beyond a scale: what is far off loses its pull."""
+
+    scale: float
+
+    def cost(self, norms: Array) -> Array:
+        """Return the costs (N,)."""
+        return np.asarray(0.5 * self.scale**2 * np.log1p(np.square(norms / self.scale)))
+
+    def weight(self, norms: Array) -> Array:
+        """Return the weights (N,)."""
+        return np.asarray(1.0 / (1.0 + np.square(norms / self.scale)))

@@ -1,0 +1,32 @@
+"""On tracks that walk and are offset, an estimator that is told so knows how far it is off; told white, it does not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters import msckf_fej, msckf_slam
+from toolkit.metrics import score_run
+from toolkit.runner import run
+from toolkit.settings import POLICIES, Settings
+from toolkit.simulation import FLIGHT
+from toolkit.track_noise import TrackNoise
+
+# Four times the noise of real tracks: told white, with half a pixel for every sighting, it shows in a few seconds.
+NOISE = TrackNoise(np.array([0.12, 0.24, 0.12]), np.full(3, 0.5), np.array([0.0, 2.8, 0.0]))
+SCENARIO = replace(FLIGHT, duration_s=3.0, camera=replace(FLIGHT.camera, max_tracks=30))
+SETTINGS = Settings(outliers=POLICIES["none"])
+
+
+@pytest.mark.parametrize("estimator", [msckf_fej, msckf_slam], ids=lambda module: module.__name__[8:])
+def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(estimator, oracle):
+    told, white = [], []
+    for seed in range(2):
+        sequence = oracle.with_track_errors(SCENARIO, NOISE, seed)
+        untold = replace(sequence, rig=replace(sequence.rig, track_noise=None))
+        for which, found in ((sequence, told), (untold, white)):
+            result = run("one", estimator.build, which, which.prior, settings=SETTINGS)
+            found.append(score_run(result, "causal", which).values["nees_pose_mean"])
+    # Errors of successive poses are nearly the same one: of two runs the mean is known to a third at best.
+    assert 0.5 < np.mean(told) < 1.6
+    assert np.mean(white) > 2.5
