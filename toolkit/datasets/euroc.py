@@ -38,6 +38,7 @@ from toolkit.progress import Progress
 from toolkit.sequence import Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation.filming import is_simulated
+from toolkit.simulation.scene_errors import with_scene_errors
 from toolkit.simulation.world import Camera
 
 CITES = ("burri2016euroc",)
@@ -113,16 +114,18 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         *(() if choice is None else (choice.reason,)),
         *(calibration.source, calibration.noise_source),
     )
-    return Sequence(
+    simulated = is_simulated(layout.root)
+    sequence = Sequence(
         name=layout.root.name,
         rig=rig_of(filmed.rig, calibration.T_imu_left),
         noise=calibration.noise,
         frames_t_ns=tracks.t_ns,
         observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
         motion=imu,
-        provenance=Provenance("euroc", f"{path}: {RENDERED if is_simulated(layout.root) else REAL}", facts),
+        provenance=Provenance("euroc", f"{path}: {RENDERED if simulated else REAL}", facts),
         truth=None if choice is None else truth_near(choice.truth, tracks.t_ns),
     )
+    return with_scene_errors(sequence) if simulated else sequence
 
 
 def load_with_seed(path: Path, seed: int) -> Sequence:
