@@ -63,6 +63,8 @@ def check_filmable(scenario: Scenario, directory: Path) -> None:
     """Raise SettingsError where a scenario has no surfaces, OutputError where the directory holds anything else."""
     if not (scenario.has_surfaces and isinstance(scenario.motion, Imu)):
         raise SettingsError(f"{scenario.name} has landmarks and no surfaces to take images of; flight has")
+    if scenario.varied:
+        raise SettingsError(f"{scenario.name}: a world that the seed draws cannot be filmed; leave it as it is")
     check_replaceable(directory, _written_by_us)
 
 
