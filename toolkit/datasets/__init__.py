@@ -198,7 +198,7 @@ def tracked_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> Image
         return None
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
-    return reader.images_of(path) if _of_images(reader, path, frontend) else None
+    return reader.images_of(path, frontend) if _of_images(reader, path, frontend) else None
 
 
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:
