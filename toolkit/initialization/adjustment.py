@@ -138,7 +138,7 @@ def _fit(frames: list[StereoFrame], values: gtsam.Values, sequence: Sequence) ->
 
     A track of n sightings has 3 n - 3 degrees of freedom, its landmark taken out.
     """
-    whitener = stereo.whitener(sequence.rig)
+    whitener = sequence.rig.whitener
     ids, squares = [], []
     for k, frame in enumerate(frames):
         points = np.array([values.atPoint3(L(i)) for i in frame.track_ids.tolist()]).reshape(-1, 3)
