@@ -29,9 +29,9 @@ from recordings import real
 
 from toolkit import Result, compare
 from toolkit.audit import Audit, audit, faults
-from toolkit.audit.parts.vision import camera_motion
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
+from toolkit.models.camera_motion import camera_motion
 from toolkit.report.terminal import audit_text
 from toolkit.sequence import Sequence
 

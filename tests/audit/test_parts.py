@@ -8,8 +8,8 @@ import pytest
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.audit.parts.robust import slope
 from toolkit.audit.parts.tracks import split
-from toolkit.audit.parts.vision import camera_motion
 from toolkit.geometry import se3_inverse, se3_log
+from toolkit.models.camera_motion import camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, noise_free, simulate

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.audit.parts.vision import camera_motion
 from toolkit.datasets import load_sequence
 from toolkit.measured_motion import TwistSamples
+from toolkit.models.camera_motion import camera_motion
 
 DATA = Path(os.environ.get("VISLAM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 

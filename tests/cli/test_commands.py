@@ -106,3 +106,24 @@ def test_directory_names_are_plain_and_differ() -> None:
         "sequence",
         "drive-3",
     ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (["--lens", "radtan"], "--lens is of images; add --images"),
+        (["--images", "--blur", "50"], "expected milliseconds from 0 to 40"),
+        (["--images", "--lens", "fov"], "fov"),
+    ],
+)
+def test_what_images_cannot_be_is_a_line(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], asked: list[str], told: str
+) -> None:
+    assert vislam("simulate", "flight", "--out", "filmed", *asked) == 2
+    assert told in capsys.readouterr().err
+    assert not Path("filmed").exists()
+
+
+def test_a_scenario_of_points_gives_no_images(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+    assert vislam("simulate", "drive", "--images", "--out", "filmed") == 2
+    assert "flight has" in capsys.readouterr().err

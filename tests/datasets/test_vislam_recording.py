@@ -42,6 +42,14 @@ def test_a_round_trip_changes_no_bit(drive: Sequence, flight: Sequence, tmp_path
         assert_same(vislam_recording.load(tmp_path / sequence.name / "recording.json"), sequence)
 
 
+def test_a_rig_that_was_used_is_saved_as_any(flight: Sequence, tmp_path: Path) -> None:
+    """It keeps its inverse and its whitener, which are no fields of a recording."""
+    used = replace(flight, rig=replace(flight.rig))
+    assert used.rig.whitener.shape == used.rig.T_cam_imu[:3, :3].shape
+    vislam_recording.save(used, tmp_path / "used")
+    assert_same(vislam_recording.load(tmp_path / "used"), flight)
+
+
 def test_what_is_optional_may_be_absent(flight: Sequence, tmp_path: Path) -> None:
     assert flight.truth is not None
     poses_only = replace(flight, prior=None, truth=replace(flight.truth, v_world=None, bias=None, independent=False))

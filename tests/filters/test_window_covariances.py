@@ -147,7 +147,9 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
     values, keys = gtsam.Values(), tuple((gtsam.symbol("x", k),) for k in range(3))
     for (key,) in keys:
         values.insert(key, gtsam.Pose3())
-    none = Sightings(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64))
+    none = Sightings(
+        np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64)
+    )
     window = SmartWindow(keys, values, (), MarginalPrior.nothing(), none, np.empty((0, 3)))
     inverse = np.linalg.inv(root @ root.T)
     for i in range(3):

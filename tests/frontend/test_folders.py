@@ -1,5 +1,6 @@
 """ASL folders with images, from end to end: the choice of tracks, what is left out and named, what is refused."""
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from toolkit.cli import main
 from toolkit.datasets import is_drawn_from_a_seed, load_sequence
 from toolkit.datasets.io.euroc_calibration import read_calibration
 from toolkit.datasets.io.image_pairs import pairs_of_asl
-from toolkit.errors import DataError
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.frontend import rectified, track_images, tracking
 from toolkit.frontend.cameras import Image
@@ -141,6 +142,21 @@ def exchange(one: Path, other: Path) -> None:
     aside.rename(other)
 
 
+def reverse_rows(path: Path) -> None:
+    head, *rows = path.read_text().splitlines()
+    path.write_text("\n".join([head, *rows[::-1]]) + "\n")
+
+
+def turn_extrinsic(path: Path) -> None:
+    """Turn a camera by a right angle about its optical axis, in its calibration alone."""
+    text = path.read_text()
+    data = re.search(r"data: \[([^]]*)\]", text)
+    assert data is not None
+    T_body_sensor = np.array([float(x) for x in data[1].split(",")]).reshape(4, 4)
+    T_body_sensor[:3, :3] = T_body_sensor[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    path.write_text(text.replace(data[1], ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel())))
+
+
 LEFT_OUT: list[tuple[str, Callable[[Path], object], str]] = [
     ("truncated", lambda d: images(d, 0)[7].write_bytes(images(d, 0)[7].read_bytes()[:900]), "damaged or truncated"),
     ("empty", lambda d: images(d, 1)[7].write_bytes(b""), "it is empty"),
@@ -172,6 +188,8 @@ USED: list[tuple[str, Callable[[Path], object]]] = [
     ("one colour, one grey", lambda d: every(d, 0, lambda i: cv2.merge([i, i, i]))),
     ("16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 256) for c in (0, 1)]),
     ("12 of 16 bit", lambda d: [every(d, c, lambda i: i.astype(np.uint16) * 16) for c in (0, 1)]),
+    ("8 against 16 bit", lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256)),
+    ("rows backwards", lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)]),
     ("no table", lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)]),
     ("crlf", lambda d: edit(d / "mav0/cam0/data.csv", "\n", "\r\n")),
 ]
@@ -184,11 +202,6 @@ def test_the_same_images_in_another_guise_give_the_same_tracks(asl: Path, change
     after = load_sequence(str(asl), 0, Frontend(tracks="images"))
     np.testing.assert_array_equal(after.observations.uv_px, before.observations.uv_px)
     np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
-
-
-def reverse_rows(path: Path) -> None:
-    head, *rows = path.read_text().splitlines()
-    path.write_text("\n".join([head, *rows[::-1]]) + "\n")
 
 
 def test_stamps_out_of_order_are_sorted_and_said(asl: Path) -> None:
@@ -227,6 +240,12 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("cut yaml", lambda d: (d / YAML.format(0)).write_text("T_BS:\n  data: [1, 2"), "no YAML, or truncated"),
     ("no yaml", lambda d: (d / YAML.format(0)).write_bytes(b"\x89PNG\r\n\x1a\n\xff"), "not a text file"),
     ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
+    ("all of another size", lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
+    ("no left images", lambda d: shutil.rmtree(d / IMAGES.format(0)), "missing or cannot be read"),
+    ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam1/sensor.yaml: cannot be read"),
+    ("no extrinsic", lambda d: edit(d / YAML.format(1), "T_BS", "T_SB"), "T_BS"),
+    ("one turned", lambda d: turn_extrinsic(d / YAML.format(1)), "deg apart|not to the right of cam0"),
+    ("empty imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").write_text("%YAML:1.0\n"), "imu0/sensor.yaml"),
     ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "0 frame"),
     ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
     ("stamps in seconds", lambda d: edit(d / "mav0/cam0/data.csv", "\n14", "\n1.4"), "not in whole nanoseconds"),
@@ -237,12 +256,22 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
 
 @pytest.mark.parametrize(("spoil", "complaint"), [m[1:] for m in REFUSED], ids=[m[0] for m in REFUSED])
 def test_a_folder_that_cannot_be_used_is_one_clear_line(
-    asl: Path, spoil: Callable[[Path], object], complaint: str
+    asl: Path, spoil: Callable[[Path], object], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """From end to end: status 3, one line that names the fault, and nothing written."""
     spoil(asl)
-    with pytest.raises(DataError, match=complaint) as raised:
-        load_sequence(str(asl), 0, Frontend(tracks="images"))
-    assert "\n" not in str(raised.value)
+    before = sorted(asl.parent.iterdir())
+    asked = ("--tracks", "images", "--estimators", "dead-reckoning", "--out", str(asl.parent / "run"))
+    assert main(["compare", str(asl), *asked]) == 3
+    told = capsys.readouterr().err
+    assert told.startswith("vislam: error: ")
+    assert told.count("\n") == 1
+    assert re.search(complaint, told)
+    assert sorted(asl.parent.iterdir()) == before
+
+
+def test_there_are_forty_faulty_folders() -> None:
+    assert len(LEFT_OUT) + len(USED) + len(REFUSED) >= 40
 
 
 def kalibr(root: Path, rows: Callable[[int], str], model: str = "radtan") -> None:

@@ -57,7 +57,8 @@ def test_a_track_stays_on_its_point_of_the_scene(filmed: Filmed) -> None:
             )
             moved.append(np.linalg.norm((here - there)[0, :2]) * filmed.rig.fx_px / plane)
     assert len(moved) > 30
-    assert np.median(moved) < 0.3  # the sum of the errors of up to nine steps, in pixels
+    # The sum of the errors of five or nine steps is no more than that of one; of steps alone it was up to 0.11.
+    assert np.median(moved) < 0.08
 
 
 def test_an_id_that_ends_is_never_used_again(plain: Filmed) -> None:

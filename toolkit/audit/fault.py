@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
-from toolkit.audit.parts.vision import CameraMotion, camera_motion
+from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, own_one_step_px
-from toolkit.audit.parts.vision import camera_motion
 from toolkit.geometry import Array
+from toolkit.models.camera_motion import camera_motion
 from toolkit.sequence import Sequence, StereoRig
 
 # Quantiles of the sightings that are their range: tracks may slide out of the image.

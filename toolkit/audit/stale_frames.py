@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.tracks import Neighbours, by_track, neighbours, split
+from toolkit.audit.parts.tracks import by_track, split
 from toolkit.geometry import Array, BoolArray
+from toolkit.models.camera_motion import Neighbours, neighbours
 from toolkit.sequence import Observations, Sequence
 
 # Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale

@@ -189,6 +189,18 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
     return reader.images_of(path, frontend)
 
 
+def tracked_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRecording | None:
+    """Return the image pairs that a recording's tracks are made of, None where they are made of something else.
+
+    Raises DataError where the source cannot be read.
+    """
+    if source in built_ins():
+        return None
+    path = Path(source).expanduser()
+    reader = _reader_of(path, source)
+    return reader.images_of(path, frontend) if _of_images(reader, path, frontend) else None
+
+
 def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) -> bool:
     """Say whether a source is another recording under another seed, as simulations are.
 

@@ -37,10 +37,13 @@ from toolkit.measured_motion import ImuSamples
 from toolkit.progress import Progress
 from toolkit.sequence import Provenance, Sequence
 from toolkit.settings import Frontend, Tracks
+from toolkit.simulation.filming import is_simulated
+from toolkit.simulation.scene_errors import with_scene_errors
 from toolkit.simulation.world import Camera
 
 CITES = ("burri2016euroc",)
 REAL = "real IMU, stereo tracks from the images"
+RENDERED = "simulated IMU, stereo tracks from rendered images"
 SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
@@ -111,16 +114,18 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
         *(() if choice is None else (choice.reason,)),
         *(calibration.source, calibration.noise_source),
     )
-    return Sequence(
+    simulated = is_simulated(layout.root)
+    sequence = Sequence(
         name=layout.root.name,
         rig=rig_of(filmed.rig, calibration.T_imu_left),
         noise=calibration.noise,
         frames_t_ns=tracks.t_ns,
         observations=observations(tracks.frame, tracks.track_id, tracks.corners_px),
         motion=imu,
-        provenance=Provenance("euroc", f"{path}: {REAL}", facts),
+        provenance=Provenance("euroc", f"{path}: {RENDERED if simulated else REAL}", facts),
         truth=None if choice is None else truth_near(choice.truth, tracks.t_ns),
     )
+    return with_scene_errors(sequence) if simulated else sequence
 
 
 def load_with_seed(path: Path, seed: int) -> Sequence:

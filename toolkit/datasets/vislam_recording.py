@@ -6,7 +6,7 @@ origin. The arrays are compressed and never pickled. A folder is written beside 
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -127,13 +127,15 @@ def _counts(sequence: Sequence) -> dict[str, int]:
 
 def _rig_to_text(rig: StereoRig) -> Text:
     """Return a rig, with the noise of its tracks where it is not white."""
-    fields = {name: x for name, x in _plain(rig).items() if name != "track_noise"}
-    return fields if rig.track_noise is None else {**fields, "track_noise": _plain(rig.track_noise)}
+    stated = {name: x for name, x in _plain(rig).items() if name != "track_noise"}
+    return stated if rig.track_noise is None else {**stated, "track_noise": _plain(rig.track_noise)}
 
 
 def _plain(value: StereoRig | MotionNoise | TrackNoise) -> Text:
     """Return the fields of a value with arrays as nested lists; Python writes floats so that they come back whole."""
-    return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in vars(value).items()}
+    # What a value has worked out of its fields, and keeps, is none of them.
+    parts = {field.name: getattr(value, field.name) for field in fields(value)}
+    return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in parts.items()}
 
 
 def _to_arrays(sequence: Sequence) -> dict[str, Any]:

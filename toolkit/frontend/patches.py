@@ -1,8 +1,9 @@
 """Does a track still show what it began with? Its first patch, fitted into today's image by an affine warp.
 
 Frame-to-frame tracking drifts from one structure to the next in small steps that look right one by one; against the
-first patch the sum of them shows (Shi & Tomasi 1994). Inverse compositional (Baker & Matthews 2004) on patches of zero
-mean and unit norm, which takes out gain and bias of the exposure; the gradients of the first patch serve for all time.
+first patch the sum of them shows (Shi & Tomasi 1994), and can be taken out. Inverse compositional (Baker & Matthews
+2004) on patches of zero mean and unit norm, which takes out gain and bias of the exposure; the gradients of the first
+patch serve for all time.
 """
 
 from dataclasses import dataclass

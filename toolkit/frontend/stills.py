@@ -8,8 +8,8 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.files import replaced_directory
 from toolkit.frontend.cameras import Image
-from toolkit.frontend.images import Unusable, bit_depth
-from toolkit.frontend.tracking import ImageRecording, ImageTracks, read_pair
+from toolkit.frontend.images import Unusable
+from toolkit.frontend.tracking import ImageRecording, ImageTracks, read_pairs
 from toolkit.geometry import Array, IntArray
 from toolkit.progress import SILENT, Progress
 
@@ -64,10 +64,8 @@ def _drawn(
     recording: ImageRecording, tracks: ImageTracks, frames: IntArray, progress: Progress
 ) -> Iterator[tuple[int, Image]]:
     pair_at = {pair.t_ns: pair for pair in recording.pairs}
-    ends = [recording.pairs[i] for i in sorted({0, len(recording.pairs) // 2, len(recording.pairs) - 1})]
-    bits = bit_depth(path for pair in ends for path in (pair.left, pair.right))
-    for done, k in enumerate(frames.tolist(), start=1):
-        images = read_pair(pair_at[int(tracks.t_ns[k])], recording.rig, bits)
+    asked = [pair_at[t_ns] for t_ns in tracks.t_ns[frames].tolist()]
+    for done, (k, images) in enumerate(zip(frames.tolist(), read_pairs(recording, asked), strict=True), start=1):
         if isinstance(images, Unusable):
             raise DataError(f"{images}: it was there when the tracks were made; copy it again")
         yield k, _still(images, tracks, k)

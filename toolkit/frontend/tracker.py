@@ -112,9 +112,10 @@ class Tracker:
         patches, fitted_px, correlation = before.patches.select(rows).fitted(floats, left_px[rows])
         off_px = np.linalg.norm(fitted_px - left_px[rows], axis=1)
         same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
-        rows, patches = rows[same], patches.select(same)
-        shift_px = left_px[rows] - before.left_px[rows]
-        return _Tracks(before.ids[rows], left_px[rows], before.right_px[rows] + shift_px, patches), motion
+        # Where the first patch fits is where the track is: KLT's small errors, added up, would walk away from it.
+        rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
+        shift_px = here_px - before.left_px[rows]
+        return _Tracks(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches), motion
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
         """Return the tracks found in the right image, near where they are in ``right_px``."""

@@ -4,7 +4,7 @@ A pair that cannot be used is named and left out; the tracks go on behind it. Be
 left and right are what they are called, and that the calibration is theirs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,8 +63,7 @@ def track_images(
     kept = cache.load(key)
     if kept is not None:
         return ImageTracks(**kept)
-    ends = [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
-    bits = bit_depth(path for pair in ends for path in (pair.left, pair.right))
+    bits = _bits_of(pairs)
     _check_sides(pairs, rig, settings, bits)
     found = _tracked(pairs, rig, settings, bits, progress)
     cache.save(key, vars(found))
@@ -85,6 +84,18 @@ def read_pair(
             return image
         images.append(rig.apply(image, side))
     return images[0], images[1]
+
+
+def read_pairs(recording: ImageRecording, pairs: Sequence[StampedPair]) -> Iterator[tuple[Image, Image] | Unusable]:
+    """Yield some rectified pairs of a recording, grey values as its tracks were made of, or what is wrong with one."""
+    bits = _bits_of(recording.pairs)
+    yield from (read_pair(pair, recording.rig, bits) for pair in pairs)
+
+
+def _bits_of(pairs: Sequence[StampedPair]) -> int:
+    """Return the bits that the images' values fill, by the first, the middle and the last pair."""
+    some = [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
+    return bit_depth(path for pair in some for path in (pair.left, pair.right))
 
 
 def _tracked(

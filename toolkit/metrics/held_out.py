@@ -3,12 +3,10 @@
 Needs no ground truth, and overfitting does not lower it: the points come from the estimated poses alone.
 """
 
-import numpy as np
-
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.leave_one_out import predict_left_out
-from toolkit.metrics._shared.residuals import median_px, reprojection_errors_px, rmse_px, scored_remark
+from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS, errors_left_out
+from toolkit.metrics._shared.residuals import median_px, rmse_px, scored_remark
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 60
@@ -33,8 +31,6 @@ METRICS = (
         in_contract=True,
     ),
 )
-# Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
-FEWEST_VIEWS = 3
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -49,13 +45,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 def errors(evaluation: Evaluation) -> Array:
     """Return the leave-one-view-out error (N,) px of every sighting of a withheld track with enough posed views."""
-    posed = evaluation.sequence.held_out.select(evaluation.has_pose[evaluation.sequence.held_out.frame])
-    by_track = posed.select(np.lexsort((posed.frame, posed.track_id)))
-    _, track, views = np.unique(by_track.track_id, return_inverse=True, return_counts=True)
-    enough = by_track.select(views[track] >= FEWEST_VIEWS)
-    if not len(enough):
+    _, errors_px = errors_left_out(evaluation.sequence.held_out, evaluation)
+    if not errors_px.size:
         raise Unavailable(f"no withheld track has {FEWEST_VIEWS} views from frames with a pose")
-    rig = evaluation.sequence.rig
-    T_world_cam = evaluation.poses_of_frames[enough.frame] @ rig.T_imu_cam
-    predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
-    return reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
+    return errors_px

@@ -27,6 +27,7 @@ from toolkit.report.messages import (
 )
 from toolkit.report.records.report import (
     AuditWords,
+    CameraFrame,
     DrawnMap,
     DrawnOverSeeds,
     DrawnRun,
@@ -63,8 +64,8 @@ def landmarks_file(estimator: str) -> str:
     return f"landmarks/{plain_name(estimator)}.csv"
 
 
-def report_document(comparison: Comparison) -> Report:
-    """Return what the report of a comparison draws and says; what is not finite becomes null."""
+def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()) -> Report:
+    """Return what the report of a comparison draws and says, with some images' tracks; not finite becomes null."""
     curves = error_curves(comparison)
     return Report(
         schema="vislam.report/1",
@@ -77,6 +78,7 @@ def report_document(comparison: Comparison) -> Report:
         maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
         words=_words(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
+        frames=frames or UNSET,
     )
 
 
@@ -155,7 +157,7 @@ def _vector(values: Array) -> Vector:
 
 def _errors(errors: Errors, start_ns: int) -> ErrorSeries:
     return ErrorSeries(
-        t_s=_seconds(errors.t_ns, start_ns),
+        t_s=seconds(errors.t_ns, start_ns),
         path_m=numbers(errors.path_m),
         position_m=numbers(errors.position_m),
         heading_deg=numbers(errors.heading_deg),
@@ -176,7 +178,7 @@ def _told_or_why(series: Callable[[Row, Comparison], Series], row: Row, comparis
 def _nees(row: Row, comparison: Comparison) -> NeesSeries:
     nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
     return NeesSeries(
-        t_s=_seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
+        t_s=seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
         pose=numbers(nees.pose),
         orientation=numbers(nees.orientation),
         position=numbers(nees.position),
@@ -192,7 +194,7 @@ def _nis(row: Row, comparison: Comparison) -> NisSeries:
     bands = {d: nees_band(d) for d in np.unique(found.dof).tolist()}
     low, high = np.array([bands[d] for d in found.dof.tolist()]).T
     return NisSeries(
-        t_s=_seconds(causal.t_ns[found.rows], int(comparison.sequence.frames_t_ns[0])),
+        t_s=seconds(causal.t_ns[found.rows], int(comparison.sequence.frames_t_ns[0])),
         per_dof=numbers(found.nis / found.expected),
         low=numbers(low),
         high=numbers(high),
@@ -206,7 +208,7 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
             t_ns = frames_t_ns[: run.timings.step_s.size]
             yield StepTimes(
                 estimator=run.estimator,
-                t_s=_seconds(t_ns, int(frames_t_ns[0])),
+                t_s=seconds(t_ns, int(frames_t_ns[0])),
                 step_ms=numbers(1e3 * run.timings.step_s),
                 finish_s=number(run.timings.finish_s),
             )
@@ -237,7 +239,8 @@ def _rms_over_runs(errors: Array) -> Array:
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
 
 
-def _seconds(t_ns: IntArray, start_ns: int) -> tuple[float, ...]:
+def seconds(t_ns: IntArray, start_ns: int) -> tuple[float, ...]:
+    """Return stamps (N,) as seconds from a stamp, to the microsecond."""
     return tuple(round(t / NS_PER_S, _MICROSECONDS) for t in (t_ns - start_ns).tolist())
 
 

@@ -18,10 +18,12 @@ from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.pipeline import Case
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
+from toolkit.report.camera_frames import camera_frames
 from toolkit.report.figures import FigureFormat, drawn, save
 from toolkit.report.figures.alignment import truth_during
 from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest, read_manifest
+from toolkit.report.records.report import CameraFrame
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import metrics_document, seeds_document
 
@@ -142,7 +144,8 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
                 _write_truth(comparison, directory)
         else:
             _write_text(directory / METRICS, to_text(metrics_document(comparison)))
-            _write_text(directory / REPORT, to_line(report_json.report_document(comparison)))
+            frames = _written_frames(comparison, directory)
+            _write_text(directory / REPORT, to_line(report_json.report_document(comparison, frames)))
             _write_trajectories(comparison, directory)
         (directory / "figures").mkdir()
         captions = save(drawn(comparison), directory / "figures", made_by.figures)
@@ -167,6 +170,16 @@ def _files_in(directory: Path) -> tuple[str, ...]:
     """Return the files of a run, and its manifest, by their relative paths."""
     written = [path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()]
     return tuple(sorted([*written, MANIFEST]))
+
+
+def _written_frames(comparison: Comparison, directory: Path) -> tuple[CameraFrame, ...]:
+    """Write the images that the report shows, where the recording has any, and return what is told of them."""
+    seen = camera_frames(comparison)
+    for one in seen:
+        place = directory / one.frame.image
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes(one.jpeg)
+    return tuple(one.frame for one in seen)
 
 
 def _write_trajectories(comparison: Comparison, directory: Path) -> None:

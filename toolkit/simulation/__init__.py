@@ -2,7 +2,8 @@
 
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
 ``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` and ``track_faults``
-plant what goes wrong.
+plant what goes wrong. ``filming`` takes images instead of tracks, with ``surfaces`` (what there is to see) and
+``renderer``.
 """
 
 from toolkit.simulation import faults, track_faults

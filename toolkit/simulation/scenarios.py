@@ -39,7 +39,8 @@ class Scenario:
 
     ``scene`` builds the trajectory and the world for a duration; ``varied`` lets every seed draw its own.
     ``noise_scale`` multiplies every drawn error (pixels, motion, biases, prior) and leaves the stated noise as it is,
-    so that 0 gives exact measurements an estimator can still weigh.
+    so that 0 gives exact measurements an estimator can still weigh. ``has_surfaces`` says that its world has not only
+    landmarks and can be filmed (:mod:`~toolkit.simulation.filming`).
     Where there is a ``track_noise``, the errors of tracks are drawn from it and not from the rig's covariance, which is
     what a data sheet would state; a ``slip_share`` of the tracks slips to another point and stays there.
     """
@@ -55,6 +56,7 @@ class Scenario:
     track_noise: TrackNoise | None = None
     slip_share: float = 0.0
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
+    has_surfaces: bool = False
 
 
 def noise_free(scenario: Scenario) -> Scenario:
@@ -232,6 +234,7 @@ FLIGHT = Scenario(
     rig=_flight_rig(),
     camera=Camera(rate_hz=20.0, size_px=(752, 480), depth_m=(0.8, 7.0), max_tracks=100, loss_per_frame=0.02),
     motion=_EUROC_IMU,
+    has_surfaces=True,
 )
 # What the fit finds on real drives and on EuRoC's images, and what their tracks are like (docs/tracks.md).
 DRIVE_REALISTIC = replace(

@@ -29,7 +29,7 @@ _ROAD_LANDMARKS_PER_POSE = 14
 _ROAD_POSE_SPACING_M = 2.0
 _CORNER_EVERY_S = 20.0
 
-_HALL_LOWER_M, _HALL_UPPER_M = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 4.5])
+HALL_LOWER_M, HALL_UPPER_M = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 4.5])
 _HALL_LANDMARKS = 1500
 # The IMU of EuRoC's sensor stands on its side: x up, z ahead.
 _R_LEVEL_IMU = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -117,7 +117,7 @@ def hall(duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
     tilt = so3_exp(np.stack([zero, pitch, zero], axis=-1)) @ so3_exp(np.stack([roll, zero, zero], axis=-1))
     rotation = about_z(yaw) @ tilt @ _R_LEVEL_IMU
     trajectory = FreeTrajectory(VectorSpline(knots, position), RotationSpline(knots, rotation))
-    return Scene(trajectory, world.room(_HALL_LOWER_M, _HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
+    return Scene(trajectory, world.room(HALL_LOWER_M, HALL_UPPER_M, _HALL_LANDMARKS, _landmark_rng(drawn)))
 
 
 def _landmark_rng(drawn: np.random.Generator | None) -> np.random.Generator:

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.vision import CameraMotion, camera_motion
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log
 from toolkit.measured_motion import ImuSamples, TwistSamples
+from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
 from toolkit.track_errors.likelihood import Tailed

@@ -10,9 +10,9 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, slope
-from toolkit.audit.parts.tracks import neighbours
 from toolkit.geometry import Array, BoolArray, se3_inverse, se3_log
 from toolkit.measured_motion import TwistSamples
+from toolkit.models.camera_motion import neighbours
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px
 from toolkit.resampling import NS_PER_S

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.intervals import median_one_step_px, own_one_step_px
-from toolkit.audit.parts.vision import CameraMotion, usable_pairs
 from toolkit.measured_motion import TwistChangeNoise, TwistNoise
+from toolkit.models.camera_motion import CameraMotion, usable_pairs
 from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

@@ -11,8 +11,8 @@ from scipy.ndimage import median_filter, minimum_filter
 
 from toolkit.audit.parts.intervals import Intervals, interval_means
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
-from toolkit.audit.parts.vision import CameraMotion
 from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
+from toolkit.models.camera_motion import CameraMotion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.vision import CameraMotion, usable_pairs
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
 from toolkit.measured_motion import NoSamples, TwistSamples
+from toolkit.models.camera_motion import CameraMotion, usable_pairs
 from toolkit.models.stereo import project, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable

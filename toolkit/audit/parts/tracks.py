@@ -1,6 +1,4 @@
-"""Sightings track by track: pairs in successive frames, and a new track where an id no longer follows one point."""
-
-from typing import NamedTuple
+"""Sightings track by track, and a new track where an id no longer follows one point."""
 
 import numpy as np
 
@@ -27,29 +25,3 @@ def split(observations: Observations, starts: BoolArray) -> IntArray:
     renamed = np.empty_like(track_id)
     renamed[order] = np.where(part > part_at_first, track_id.max(initial=-1) + part, track_id)
     return renamed
-
-
-class Neighbours(NamedTuple):
-    """Rows into the observations: ``before`` (P,) seen in frame k, ``after`` (P,) the same track in k + 1.
-
-    Sorted by frame; ``interval`` (P,) is k.
-    """
-
-    before: IntArray
-    after: IntArray
-    interval: IntArray
-
-    def select(self, rows: BoolArray) -> "Neighbours":
-        """Return the pairs of a mask (P,)."""
-        return Neighbours(self.before[rows], self.after[rows], self.interval[rows])
-
-
-def neighbours(observations: Observations) -> Neighbours:
-    """Pair each sighting with the same track's sighting in the next frame, where there is one."""
-    frame, track_id = observations.frame, observations.track_id
-    by_track = np.lexsort((frame, track_id))
-    follows = (np.diff(track_id[by_track]) == 0) & (np.diff(frame[by_track]) == 1)
-    before, after = by_track[:-1][follows], by_track[1:][follows]
-    in_time = np.argsort(frame[before], kind="stable")
-    before, after = before[in_time], after[in_time]
-    return Neighbours(before, after, frame[before])

@@ -8,7 +8,7 @@ with the truth that the tracks are simulated on, rotation and velocity scatter a
 and 3 to 9 times (accelerometer) the stated ones on V1_01_easy and V2_01_easy: rotor vibration, scale and axis errors,
 and the error of the truth. With the stated noise the smoother ends 0.14 m off on V2_01_easy, and the pose NEES of a
 filter on V1_01_easy is 25. So every recording's white densities are multiplied by the same two numbers, near the upper
-ends of those ranges; the walks stay as stated.
+ends of those ranges; the walks stay as stated. A simulated IMU errs as it states.
 """
 
 from dataclasses import dataclass, replace
@@ -24,6 +24,7 @@ from toolkit.frontend import Camera, Pinhole
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import ImuNoise
 from toolkit.sequence import StereoRig
+from toolkit.simulation.filming import is_simulated
 from toolkit.simulation.scenarios import stereo_cov_px2
 
 PIXEL_SIGMA_PX = 0.5
@@ -32,6 +33,7 @@ _INFLATED = (
     f"white noise of the accelerometer and the gyro taken as {ACCEL_FACTOR:g} and {GYRO_FACTOR:g} times the stated "
     "one, as measured in flight against the truth"
 )
+_AS_STATED = "the noise of the IMU is as its file states it"
 _DENSITIES = {
     "accel_noise_density": "accelerometer_noise_density",
     "gyro_noise_density": "gyroscope_noise_density",
@@ -95,17 +97,18 @@ def read_calibration(root: Path, mav0: Path) -> Calibration:
     right camera is not right of the left one.
     """
     chain = next((path for path in _chains(root, mav0)), None)
-    return _of_sensor_files(mav0) if chain is None else _of_kalibr(chain, root, mav0)
+    return _of_sensor_files(mav0, is_simulated(root)) if chain is None else _of_kalibr(chain, root, mav0)
 
 
-def _of_sensor_files(mav0: Path) -> Calibration:
+def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
     left, right, imu = (read_fields(mav0 / sensor / "sensor.yaml") for sensor in ("cam0", "cam1", "imu0"))
     left.require("T_BS.data", "intrinsics", "resolution")
     stated = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
     sides = _Sides(left, right, T_imu_left, T_left_right)
-    return _calibration(sides, _in_flight(stated), "the folder's sensor.yaml files", _INFLATED)
+    noise, noise_source = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
+    return _calibration(sides, noise, "the folder's sensor.yaml files", noise_source)
 
 
 def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
@@ -122,7 +125,7 @@ def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
     )
     source = str(chain.relative_to(root))
     sides = _Sides(left, right, T_imu_left, se3_inverse(T_right_left))
-    return _calibration(sides, noise, source, "the noise of the IMU is as its file states it")
+    return _calibration(sides, noise, source, _AS_STATED)
 
 
 def kalibr_noise(folder: Path) -> ImuNoise | None:

@@ -16,8 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.sequence import StereoRig
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.residuals import reprojection_errors_px
+from toolkit.sequence import Observations, StereoRig
 
+# Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
+FEWEST_VIEWS = 3
 # 95 % quantile of the length of three whitened residuals: sqrt(chi2(3, 0.95)).
 _HUBER_SIGMAS = 2.796
 # Whitened residual of a view that has the point behind it: worse than any visible error, yet finite.
@@ -108,6 +112,23 @@ class Views:
     def summed(self, shares: Array) -> Array:
         """Add up the views' shares (N, ...) to one a track (M, ...)."""
         return np.add.reduceat(shares, self.first, axis=0)
+
+
+def errors_left_out(observations: Observations, evaluation: Evaluation) -> tuple[IntArray, Array]:
+    """Return which sightings (M,) have enough views with a pose, and their leave-one-view-out errors (M,) px.
+
+    They are in the order of tracks, each track's by frame.
+    """
+    posed = np.flatnonzero(evaluation.has_pose[observations.frame])
+    by_track = posed[np.lexsort((observations.frame[posed], observations.track_id[posed]))]
+    _, track, views = np.unique(observations.track_id[by_track], return_inverse=True, return_counts=True)
+    rows = by_track[views[track] >= FEWEST_VIEWS]
+    enough, rig = observations.select(rows), evaluation.sequence.rig
+    if not rows.size:
+        return rows, np.empty(0)
+    T_world_cam = evaluation.poses_of_frames[enough.frame] @ rig.T_imu_cam
+    predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
+    return rows, reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
 
 
 def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> Prediction:

@@ -24,6 +24,7 @@ SCRIPTS = (
     "chart",
     "charts",
     "seeds",
+    "frames",
     "words",
     "case",
     "main",

@@ -1,5 +1,6 @@
 """Everything the page shows, as one JSON value; its numbers are those of the run directories' own documents."""
 
+import base64
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +15,7 @@ from toolkit.report.html.highlights import highlights
 from toolkit.report.html.run_files import RunFiles, SeedsFiles, Track
 from toolkit.report.html.seeds_payload import mark_of, seeds_case
 from toolkit.report.html.thinning import MOST_LANDMARKS, MOST_POSES, coordinates, evenly, running_median, thinned
-from toolkit.report.records.report import DrawnMap, DrawnRun, NeesSeries
+from toolkit.report.records.report import CameraFrame, DrawnMap, DrawnRun, NeesSeries
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -74,8 +75,36 @@ def _case(files: RunFiles, case_id: str, title: str, colours: dict[str, int]) ->
             | _with_median({"t_s": one.t_s, "step_ms": one.step_ms}, "step_ms")
             for one in report.steps
         ],
+        "frames": [_frame(frame, files, rows) for frame in files.report.frames or ()],
         "manifest": to_builtins(files.manifest),
     }
+
+
+def _frame(frame: CameraFrame, files: RunFiles, rows: list[Json]) -> Json:
+    """Return an image, which the page holds itself, with the tracks on it and their errors by the rows' ids."""
+    ids = {(row["estimator"], "causal" if row["output"] == "both" else row["output"]): row["id"] for row in rows}
+    errors = {
+        ids[one.estimator, one.output]: [_hundredths(px) for px in one.off_px]
+        for one in frame.errors
+        if (one.estimator, one.output) in ids
+    }
+    content = base64.b64encode(files.images[frame.image]).decode("ascii")
+    return {
+        "t_s": frame.t_s,
+        "image": f"data:image/jpeg;base64,{content}",
+        "size": [frame.width_px, frame.height_px],
+        "u": [_tenths(u) for u in frame.u_px],
+        "v": [_tenths(v) for v in frame.v_px],
+        "off": errors,
+    }
+
+
+def _tenths(value: float | None) -> float | None:
+    return None if value is None else round(value, 1)
+
+
+def _hundredths(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
 
 
 def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec import UNSET
 
 from toolkit.errors import DataError
 from toolkit.estimate import Output
@@ -41,7 +42,7 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class RunFiles:
-    """The run directory of one seed; trajectories and landmarks (M, 3) by the names the report gives them."""
+    """The run directory of one seed; trajectories, landmarks (M, 3) and images by the names the report gives them."""
 
     directory: Path
     scores: Metrics
@@ -49,6 +50,7 @@ class RunFiles:
     manifest: Manifest
     tracks: dict[str, Track]
     landmarks: dict[str, Array]
+    images: dict[str, bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,16 @@ def _one_seed(directory: Path, manifest: Manifest) -> RunFiles:
     names = [report.truth, *(run.trajectory for run in report.runs)]
     tracks = {name: _track(directory / name, report.start_ns) for name in names if name is not None}
     landmarks = {one.landmarks: _landmarks(directory / one.landmarks) for one in report.maps}
-    return RunFiles(directory, scores, report, manifest, tracks, landmarks)
+    frames = () if report.frames is UNSET else report.frames
+    images = {frame.image: _inside(directory, frame.image) for frame in frames}
+    return RunFiles(directory, scores, report, manifest, tracks, landmarks, images)
+
+
+def _inside(directory: Path, name: str) -> bytes:
+    """Return the content of a file that a report names; raises DataError for a name that leads out of its directory."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise DataError(f"{directory / REPORT} names {name}, which is not in the run directory; repeat the comparison")
+    return read_input(directory / name)
 
 
 def _over_seeds(directory: Path, manifest: Manifest) -> SeedsFiles:

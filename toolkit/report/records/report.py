@@ -103,6 +103,31 @@ class DrawnMap(Struct, frozen=True, kw_only=True):
     output: Annotated[Output, Meta(description="with whose alignment they move")]
 
 
+class TrackErrors(Struct, frozen=True, kw_only=True):
+    """How far the sightings of a frame are from where an output's poses and their tracks' other sightings say."""
+
+    estimator: str
+    output: Output
+    off_px: Annotated[Numbers, Meta(description="null where a track has fewer than three posed sightings")]
+
+
+class CameraFrame(Struct, frozen=True, kw_only=True):
+    """A left image, rectified, with the sightings that are in it."""
+
+    t_s: Annotated[float, Meta(description="seconds from the first frame")]
+    image: Annotated[str, Meta(description="its JPEG file in the run directory")]
+    width_px: int
+    height_px: int
+    u_px: Numbers
+    v_px: Numbers
+    errors: tuple[TrackErrors, ...]
+
+    def __post_init__(self) -> None:
+        _check_lengths({"u_px": self.u_px, "v_px": self.v_px})
+        for one in self.errors:
+            _check_lengths({"u_px": self.u_px, f"off_px of {one.estimator}": one.off_px})
+
+
 class AuditWords(Struct, frozen=True, kw_only=True):
     """A fault of the recording and what became of it."""
 
@@ -138,6 +163,9 @@ class Report(Struct, frozen=True, kw_only=True):
     maps: tuple[DrawnMap, ...]
     words: Words
     card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where asked for")] = UNSET
+    frames: Annotated[
+        tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
+    ] = UNSET
 
 
 class MeanNeesSeries(_Columns, frozen=True, kw_only=True):

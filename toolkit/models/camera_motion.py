@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.tracks import Neighbours, neighbours
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log, skew
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Observations, Sequence, StereoRig
 
 # After so many the median interval of a real drive is within 2e-4 rad/s and 0.02 m/s of where it would end.
 ITERATIONS = 6
@@ -49,6 +48,32 @@ class CameraMotion(NamedTuple):
     w_radps: Array
     v_mps: Array
     known: BoolArray
+
+
+class Neighbours(NamedTuple):
+    """Rows into the observations: ``before`` (P,) seen in frame k, ``after`` (P,) the same track in k + 1.
+
+    Sorted by frame; ``interval`` (P,) is k.
+    """
+
+    before: IntArray
+    after: IntArray
+    interval: IntArray
+
+    def select(self, rows: BoolArray) -> "Neighbours":
+        """Return the pairs of a mask (P,)."""
+        return Neighbours(self.before[rows], self.after[rows], self.interval[rows])
+
+
+def neighbours(observations: Observations) -> Neighbours:
+    """Pair each sighting with the same track's sighting in the next frame, where there is one."""
+    frame, track_id = observations.frame, observations.track_id
+    by_track = np.lexsort((frame, track_id))
+    follows = (np.diff(track_id[by_track]) == 0) & (np.diff(frame[by_track]) == 1)
+    before, after = by_track[:-1][follows], by_track[1:][follows]
+    in_time = np.argsort(frame[before], kind="stable")
+    before, after = before[in_time], after[in_time]
+    return Neighbours(before, after, frame[before])
 
 
 class _TwoViews(NamedTuple):

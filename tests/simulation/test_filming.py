@@ -1,0 +1,197 @@
+"""Rendered images show the scene where it is, and a folder of them is the scenario's recording."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from toolkit.datasets import load_sequence
+from toolkit.errors import OutputError
+from toolkit.geometry import Array, se3_inverse
+from toolkit.sequence import Observations
+from toolkit.settings import Frontend, SettingsError
+from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
+from toolkit.simulation.filming import Filming, LensModel, film
+from toolkit.simulation.renderer import Eye, Floats, Sensor, exposed, light
+from toolkit.simulation.scene_errors import errors_px
+from toolkit.simulation.surfaces import Panel, furnished_hall
+
+SHORT = replace(FLIGHT, duration_s=0.2)
+FRAMES = 5
+
+
+def pose_at(t_s: float) -> Array:
+    """Return where the left camera is in the world (4, 4)."""
+    T_world_imu = FLIGHT.scene(10.0).trajectory.at(np.array([t_s])).T_world_imu[0]
+    return np.asarray(T_world_imu @ FLIGHT.rig.T_imu_cam)
+
+
+def first_hit(panels: tuple[Panel, ...], origin: Array, towards: Array) -> Array:
+    """Return the point of the nearest panel on a ray, or NaN: plane by plane, with nothing shared with the renderer."""
+    nearest, hit = np.inf, np.full(3, np.nan)
+    for panel in panels:
+        corner, normal = panel.T_world_panel[:3, 3], panel.T_world_panel[:3, 2]
+        slope = normal @ towards
+        if slope >= 0.0 or normal @ (origin - corner) <= 0.0:
+            continue
+        reach = normal @ (corner - origin) / slope
+        x, y = panel.T_world_panel[:3, :2].T @ (origin + reach * towards - corner)
+        if reach < nearest and 0.0 <= x <= panel.size_m[0] and 0.0 <= y <= panel.size_m[1]:
+            nearest, hit = reach, origin + reach * towards
+    return hit
+
+
+def pixel_of(point_cam: Array, lens: LensModel, K: Array, coefficients: Array) -> Array:
+    """Return where a camera shows a point (3,), by OpenCV's own projection."""
+    zero, point = np.zeros(3), point_cam.reshape(1, 1, 3)
+    if lens == "equidistant":
+        return np.ravel(cv2.fisheye.projectPoints(point, zero, zero, K, coefficients)[0])
+    return np.ravel(cv2.projectPoints(point, zero, zero, K, coefficients)[0])
+
+
+@pytest.mark.parametrize("model", ["none", "radtan", "equidistant"])
+def test_what_two_cameras_see_at_two_times_are_the_same_points(model: LensModel) -> None:
+    """A point seen in one image has its grey value where the other shows it, unless something stands before it."""
+    pair, panels = filming._Pair.of(FLIGHT, model), furnished_hall().at(0.0)
+    poses = pose_at(2.0), pose_at(2.1) @ se3_inverse(FLIGHT.rig.T_imu_cam) @ pair.T_imu_cams[1]
+    eyes = [Eye.of(lens) for lens in pair.lenses]
+    images = [light(panels, eye, pose) for eye, pose in zip(eyes, poses, strict=True)]
+    fx, fy, cx, cy = pair.lenses[1].pinhole_px
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    rng, differences, hidden = np.random.default_rng(1), [], 0
+    for column, row in zip(rng.integers(100, 650, 160), rng.integers(60, 420, 160), strict=True):
+        ray = poses[0][:3, :3] @ np.array([eyes[0].x[row, column], eyes[0].y[row, column], 1.0])
+        point = first_hit(panels, poses[0][:3, 3], ray)
+        towards = point - poses[1][:3, 3]
+        if np.linalg.norm(first_hit(panels, poses[1][:3, 3], towards) - point) > 0.01:
+            hidden += 1
+            continue
+        u, v = pixel_of(poses[1][:3, :3].T @ towards, model, K, pair.lenses[1].coefficients)
+        if 1.0 < u < 750.0 and 1.0 < v < 478.0:
+            differences.append(float(sampled(images[1], u, v)) - float(images[0][row, column]))
+    assert len(differences) > 100
+    assert hidden > 0
+    # Grey values of 20 to 240; prints have edges, beside which half a pixel is a difference of many.
+    assert np.median(np.abs(differences)) < 2.0
+    assert np.mean(np.abs(differences) < 15.0) > 0.9
+
+
+def sampled(image: Floats, u: float, v: float) -> float:
+    place = np.array([[u]], dtype=np.float32), np.array([[v]], dtype=np.float32)
+    return float(np.asarray(cv2.remap(image, *place, cv2.INTER_LINEAR))[0, 0])
+
+
+def test_the_camera_is_surrounded_and_nothing_stands_in_its_way() -> None:
+    trajectory, panels, eye = (
+        FLIGHT.scene(60.0).trajectory,
+        furnished_hall(4),
+        Eye.of(filming._Pair.of(FLIGHT, "none").lenses[0]),
+    )
+    for t_s in np.arange(0.0, 60.0, 0.5):
+        T_world_cam = trajectory.at(np.array([t_s])).T_world_imu[0] @ FLIGHT.rig.T_imu_cam
+        place, ahead = T_world_cam[:3, 3], T_world_cam[:3, 2]
+        assert np.linalg.norm(first_hit(panels.at(t_s), place, ahead) - place) > 0.6
+    assert (light(panels.at(60.0), eye, T_world_cam) > 0.0).all()
+
+
+def test_only_what_flies_about_moves() -> None:
+    eye, pose = Eye.of(filming._Pair.of(FLIGHT, "none").lenses[0]), pose_at(0.0)
+    still, moving = furnished_hall(), furnished_hall(8)
+    np.testing.assert_array_equal(light(still.at(0.0), eye, pose), light(still.at(1.0), eye, pose))
+    changed = light(moving.at(0.0), eye, pose) != light(moving.at(1.0), eye, pose)
+    assert 0.01 < changed.mean() < 0.6
+
+
+def test_an_exposure_is_the_mean_over_its_time() -> None:
+    ramp: Callable[[float], Floats] = lambda t_s: np.full((2, 2), 100.0 * t_s, dtype=np.float32)  # noqa: E731
+    np.testing.assert_allclose(exposed(ramp, 1.0, 0.0, 5), 100.0)
+    np.testing.assert_allclose(exposed(lambda t_s: ramp(t_s) ** 2, 1.0, 0.2, 5), 1e4 * (1.0 + 0.08**2 / 2.0), rtol=1e-5)
+
+
+def test_the_sensors_noise_is_as_stated() -> None:
+    grey = np.full((400, 400), 100.0, dtype=np.float32)
+    image = Sensor(dark_sigma=1.0, variance_per_grey=0.08).developed(grey, 1.25, np.random.default_rng(0))
+    assert image.mean() == pytest.approx(125.0, abs=0.05)
+    # 1 in the dark, 10 of the light, and a twelfth of the rounding; 160000 pixels tell it to 0.4 %
+    assert image.astype(float).var() == pytest.approx(11.0 + 1.0 / 12.0, rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("filmed") / "hall"
+    film(SHORT, 3, directory, Filming("radtan"))
+    return directory
+
+
+def image_bytes(directory: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(directory.glob("mav0/cam?/data/*.png"))]
+
+
+def test_the_folder_is_the_scenarios_recording(filmed: Path) -> None:
+    mine, read = simulate(SHORT, 3), load_sequence(str(filmed), 0, Frontend(tracks="images"))
+    np.testing.assert_array_equal(read.frames_t_ns, mine.frames_t_ns)
+    np.testing.assert_allclose(read.motion.values, mine.motion.values, rtol=1e-12)
+    assert read.noise == mine.noise
+    assert read.truth is not None
+    assert mine.truth is not None
+    np.testing.assert_allclose(read.truth.T_world_imu, mine.truth.T_world_imu, atol=1e-12)
+    np.testing.assert_allclose(read.truth.bias, mine.truth.bias, rtol=1e-12)
+    assert read.rig.baseline_m == pytest.approx(mine.rig.baseline_m, rel=1e-6)
+    assert "rendered images" in read.provenance.source
+    assert np.bincount(read.observations.frame).min() > 100
+    # KLT reaches a tenth of a pixel in time, and a third from left to right, where a window sees two depths.
+    off_px = errors_px(read)
+    assert np.isfinite(off_px).all()
+    assert (np.median(np.abs(off_px), axis=0) < [0.1, 0.4, 0.15]).all()
+    assert read.provenance.facts[1].startswith("against the rendered scene")
+
+
+def test_errors_against_the_scene_are_those_planted(filmed: Path) -> None:
+    read = load_sequence(str(filmed), 0, Frontend(tracks="images"))
+    before, seen = errors_px(read), read.observations
+    later = np.isin(seen.frame, [3, 4]) & np.isin(seen.track_id, seen.track_id[seen.frame == 0])
+    shifted = Observations(seen.frame, seen.track_id, seen.uv_px + later[:, None] * [1.5, 0.0, -0.5])
+    moved = errors_px(replace(read, observations=shifted)) - before
+    np.testing.assert_allclose(moved[later], np.tile([1.5, 0.0, -0.5], (int(later.sum()), 1)), atol=1e-9)
+    np.testing.assert_allclose(moved[~later], 0.0, atol=1e-9)
+
+
+def test_the_same_seed_gives_the_same_images(filmed: Path, tmp_path: Path) -> None:
+    assert len(image_bytes(filmed)) == 2 * FRAMES
+    begun = replace(SHORT, duration_s=0.05)
+    film(begun, 3, tmp_path / "again", Filming("radtan"))
+    film(begun, 4, tmp_path / "other", Filming("radtan"))
+    for side in (0, 1):
+        first = image_bytes(filmed)[side * FRAMES : side * FRAMES + 2]
+        assert image_bytes(tmp_path / "again")[2 * side : 2 * side + 2] == first
+        assert image_bytes(tmp_path / "other")[2 * side : 2 * side + 2] != first
+
+
+def test_a_folder_of_ours_is_replaced_and_no_other(filmed: Path, tmp_path: Path) -> None:
+    filming.check_filmable(SHORT, filmed)
+    real = tmp_path / "MH_01"
+    (real / "mav0/cam0").mkdir(parents=True)
+    (real / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n")
+    with pytest.raises(OutputError, match="mav0"):
+        film(SHORT, 0, real)
+    assert (real / "mav0/cam0/data.csv").is_file()
+
+
+def test_what_fails_on_the_way_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: object, k: int, t_ns: int, side: int) -> bytes:
+        if k == 1:
+            raise OSError(28, "No space left on device")
+        return b"image"
+
+    monkeypatch.setattr(filming._Crew, "png", refuse)
+    with pytest.raises(OutputError, match="No space left"):
+        film(SHORT, 0, tmp_path / "full")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_world_of_points_cannot_be_filmed(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no surfaces to take images of; flight has"):
+        film(DRIVE_IMU, 0, tmp_path / "drive")

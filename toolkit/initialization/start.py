@@ -1,0 +1,159 @@
+"""The state every estimator starts from, found without truth: from the first stereo frames and the motion samples.
+
+A twist needs none of it: the world is the first IMU frame. So it is where no motion was measured; velocity and turn
+rate then come from a short bundle adjustment over the first frames, with the motion model of the smoothers. With raw
+IMU samples roll, pitch, velocity and biases come from such an adjustment, visual-inertial, whose first guess is linear:
+no standstill is needed, and no gentle motion. Heading and position are the gauge and start at zero.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.errors import DataError
+from toolkit.geometry import Array, IntArray, se3, so3_exp
+from toolkit.initialization.adjustment import (
+    ACCEL_BIAS_SIGMA,
+    GAUGE_SIGMA,
+    GYRO_BIAS_SIGMA,
+    TURN_SIGMA,
+    Adjusted,
+    NoSoundStartError,
+    adjusted,
+)
+from toolkit.initialization.first_guess import guess_from_vision, guess_with_imu, levelling
+from toolkit.measured_motion import ImuMotion, TwistChangeNoise, TwistNoise
+from toolkit.models import stereo
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Observations, Packet, Prior, Sequence, StereoFrame
+
+WINDOW_S, FEWEST_FRAMES, MOST_FRAMES, FEWEST_TRACKS = 1.5, 4, 30, 6
+# Without enough vision: unknown speed (m/s), and the tilt (rad) an acceleration of 1 m/s^2 feigns.
+_BLIND_VELOCITY_SIGMA, _BLIND_TILT_SIGMA = 10.0, 0.1
+_SOURCE = {"imu": "the specific force and stereo of the first", "none": "stereo alone, of the first"}
+# The start's own, whatever the estimators use: each frame is triangulated by itself, so its landmarks need a depth that
+# is known to half itself at a pixel of noise.
+_LEAST_DISPARITY_PX = 2.0
+_PRIOR_SIZE = 15
+
+
+def start_from_measurements(sequence: Sequence) -> Prior:
+    """Return the state at the first frame from about the first second and a half of the recording.
+
+    A recording that brings its own prior, as a simulated one does, is started from that. Where the first frames do not
+    tell the velocity, it is unknown, and ``source`` says for what reason.
+    """
+    if sequence.prior is not None:
+        return sequence.prior
+    if isinstance(sequence.noise, TwistNoise):
+        return _own_frame()
+    packets = _first_packets(sequence)
+    try:
+        found = _adjusted(packets, sequence)
+    except NoSoundStartError as reason:
+        measured = [packet.motion for packet in packets if isinstance(packet.motion, ImuMotion)]
+        return _blind(_level_attitude(measured), str(reason), sequence)
+    first, cov = found.first, found.cov
+    assert first.v_world is not None
+    assert first.bias is not None
+    whole = cov if len(cov) == _PRIOR_SIZE else _with_accel_bias(cov)
+    source = f"{_SOURCE[sequence.motion_kind]} {len(packets)} frames"
+    return Prior(first.T_world_imu, first.v_world, first.bias, whole, source)
+
+
+def _adjusted(packets: list[Packet], sequence: Sequence) -> Adjusted:
+    """Adjust the first frames, each unknown guessed linearly; raises NoSoundStartError where they do not tell."""
+    tracks = _tracks_worth_using([packet.frame for packet in packets])
+    if len(packets) < FEWEST_FRAMES or tracks.size < FEWEST_TRACKS:
+        raise NoSoundStartError("there are too few tracks in the first frames")
+    motions = [packet.motion for packet in packets if packet.motion is not None]
+    measured = [motion for motion in motions if isinstance(motion, ImuMotion)]
+    seen = replace(sequence.truncated(len(packets)), observations=_visible(sequence, len(packets)))
+    guess = guess_with_imu(seen, measured) if measured else guess_from_vision(seen)
+    if guess.contradiction is not None:
+        raise NoSoundStartError(guess.contradiction)
+    return adjusted([_only(packet.frame, tracks) for packet in packets], motions, guess, sequence)
+
+
+def _visible(sequence: Sequence, frames: int) -> Observations:
+    return sequence.visible.select(sequence.visible.frame < frames)
+
+
+def start_from_truth(sequence: Sequence) -> Prior:
+    """Return the truth at the first frame as the state to start from, known to 0.01 rad, 0.01 m and 0.05 m/s.
+
+    Raises DataError where there is no truth at the first frame.
+    """
+    truth, first_ns = sequence.truth, sequence.frames_t_ns[0]
+    near = np.empty(0) if truth is None else np.flatnonzero(np.abs(truth.t_ns - first_ns) < NS_PER_S // 1000)
+    if truth is None or near.size == 0:
+        raise DataError(f"{sequence.name}: no truth at the first frame to start from; start from the measurements")
+    row = int(near[0])
+    if truth.v_world is not None:
+        v_world = truth.v_world[row]
+    else:
+        neighbours = slice(max(row - 1, 0), row + 2)
+        t_s, positions = truth.t_ns[neighbours] / NS_PER_S, truth.T_world_imu[neighbours, :3, 3]
+        v_world = (positions[-1] - positions[0]) / (t_s[-1] - t_s[0])
+    cov = np.diag(np.repeat([0.01, 0.01, 0.05, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
+    return Prior(truth.T_world_imu[row], v_world, np.zeros(6), cov, "the truth at the first frame, as asked for")
+
+
+def _own_frame() -> Prior:
+    cov = np.diag(np.repeat([GAUGE_SIGMA, GAUGE_SIGMA, 1.0, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
+    return Prior(np.eye(4), np.zeros(3), np.zeros(6), cov, "the first IMU frame as the world, no gyro bias")
+
+
+def _first_packets(sequence: Sequence) -> list[Packet]:
+    packets: list[Packet] = []
+    for packet in sequence.packets():
+        elapsed_s = (packet.frame.t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+        if len(packets) >= FEWEST_FRAMES and (elapsed_s > WINDOW_S or len(packets) >= MOST_FRAMES):
+            break
+        packets.append(packet)
+    return packets
+
+
+def _level_attitude(motions: list[ImuMotion]) -> Array:
+    """Return the attitude (3, 3) of the first frame, levelled by the mean specific force; without one the identity."""
+    turn, force = np.eye(3), np.zeros(3)
+    for motion in motions:
+        for dt_s, accel, gyro in zip(motion.dt_s, motion.accel_mps2, motion.gyro_radps, strict=True):
+            turn = turn @ so3_exp(0.5 * dt_s * gyro)
+            force = force + dt_s * (turn @ accel)
+            turn = turn @ so3_exp(0.5 * dt_s * gyro)
+    return levelling(force) if motions else np.eye(3)
+
+
+def _blind(attitude: Array, why: str, sequence: Sequence) -> Prior:
+    """Return the start from the specific force alone, if there is any, and in its source why vision was not used."""
+    if isinstance(sequence.noise, TwistChangeNoise):
+        sigmas = [GAUGE_SIGMA, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, TURN_SIGMA]
+        source = f"the first frame as the world; velocity and turn rate unknown and taken for zero, for {why}"
+        return Prior(np.eye(4), np.zeros(3), np.zeros(6), np.diag(np.repeat(sigmas, 3) ** 2), source)
+    tilt_cov = np.diag([_BLIND_TILT_SIGMA**2, _BLIND_TILT_SIGMA**2, GAUGE_SIGMA**2])
+    cov = np.diag(np.repeat([0.0, GAUGE_SIGMA, _BLIND_VELOCITY_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA], 3) ** 2)
+    cov[:3, :3] = attitude.T @ tilt_cov @ attitude
+    cov = 0.5 * (cov + cov.T)
+    source = f"the specific force; velocity unknown and taken for zero, for {why}"
+    return Prior(se3(attitude, np.zeros(3)), np.zeros(3), np.zeros(6), cov, source)
+
+
+def _tracks_worth_using(frames: list[StereoFrame]) -> IntArray:
+    """Return the ids of the tracks with two good sightings or more."""
+    good = [f.track_ids[stereo.disparity_px(f.uvs_px) > _LEAST_DISPARITY_PX] for f in frames]
+    ids, counts = np.unique(np.concatenate(good), return_counts=True)
+    return ids[counts >= 2]
+
+
+def _only(frame: StereoFrame, tracks: IntArray) -> StereoFrame:
+    kept = np.isin(frame.track_ids, tracks) & (stereo.disparity_px(frame.uvs_px) > _LEAST_DISPARITY_PX)
+    return frame.select(kept)
+
+
+def _with_accel_bias(cov: Array) -> Array:
+    """Return the covariance (15, 15) of a prior from that of pose, velocity and turn rate (12, 12)."""
+    whole = np.diag(np.full(_PRIOR_SIZE, ACCEL_BIAS_SIGMA**2))
+    kept = np.r_[0:9, 12:15]
+    whole[np.ix_(kept, kept)] = cov
+    return whole

@@ -1,0 +1,103 @@
+"""A few images of a recording with the tracks that were made of them, and how well each estimator explains each track.
+
+What is told of a sighting is its leave-one-view-out error: how far it lies from where the track's other sightings, from
+the estimated poses, say. It asks nothing of an estimator but poses, and is small where pose and track are good.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from toolkit.datasets import tracked_images
+from toolkit.errors import DataError
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.frontend import ImageRecording
+from toolkit.frontend.cameras import Image
+from toolkit.frontend.images import Unusable
+from toolkit.frontend.tracking import read_pairs
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.leave_one_out import errors_left_out
+from toolkit.report.records.report import CameraFrame, TrackErrors
+from toolkit.report.report_json import numbers, seconds
+from toolkit.sequence import Sequence
+
+FOLDER = "frames"
+_COUNT = 4
+_JPEG_QUALITY = 80
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A frame as the report has it, and the content of its JPEG file."""
+
+    frame: CameraFrame
+    jpeg: bytes
+
+
+def camera_frames(comparison: Comparison) -> tuple[SeenFrame, ...]:
+    """Return some frames, spread over the recording, where its tracks are made of images; else none."""
+    recording = None if comparison.over_seeds else _images(comparison)
+    if recording is None:
+        return ()
+    sequence = comparison.sequence
+    shown = np.unique(np.linspace(0, sequence.frame_count - 1, _COUNT + 2)[1:-1].astype(np.int64))
+    seen = np.isin(sequence.observations.frame, shown)
+    errors_px = {row: found for row in comparison.rows if (found := _errors_px(row, sequence, seen)) is not None}
+    frames = []
+    for k, image in _left_images(recording, sequence.frames_t_ns, shown):
+        here = np.flatnonzero(sequence.observations.frame == k)
+        uv_px = sequence.observations.uv_px[here]
+        frame = CameraFrame(
+            t_s=seconds(sequence.frames_t_ns[[k]], int(sequence.frames_t_ns[0]))[0],
+            image=f"{FOLDER}/{int(sequence.frames_t_ns[k])}.jpg",
+            width_px=image.shape[1],
+            height_px=image.shape[0],
+            u_px=numbers(uv_px[:, 0]),
+            v_px=numbers(uv_px[:, 2]),
+            errors=tuple(
+                TrackErrors(estimator=row.estimator, output=row.output, off_px=numbers(of_all[here]))
+                for row, of_all in errors_px.items()
+            ),
+        )
+        frames.append(SeenFrame(frame, _jpeg(image)))
+    return tuple(frames)
+
+
+def _images(comparison: Comparison) -> ImageRecording | None:
+    try:
+        return tracked_images(comparison.source, comparison.settings.frontend)
+    except DataError:  # a sequence out of memory has a name and no path
+        return None
+
+
+def _errors_px(row: Row, sequence: Sequence, asked: BoolArray) -> Array | None:
+    """Return the error (N,) px of every sighting whose track has one that is asked for (N,); NaN where there is none.
+
+    None where the row has no poses of its own.
+    """
+    if row.repeats_causal or row.run.trajectory(row.output) is None:
+        return None
+    observations = sequence.observations
+    wanted = np.flatnonzero(np.isin(observations.track_id, observations.track_id[asked]))
+    with np.errstate(all="ignore"):  # a diverged run overflows; that becomes null
+        found, found_px = errors_left_out(observations.select(wanted), Evaluation(row.run, row.output, sequence))
+    errors_px = np.full(len(observations), np.nan)
+    errors_px[wanted[found]] = found_px
+    return errors_px
+
+
+def _left_images(recording: ImageRecording, frames_t_ns: IntArray, shown: IntArray) -> Iterator[tuple[int, Image]]:
+    """Yield the left images of frames; one that is gone since the tracks were made is left out."""
+    pair_at = {pair.t_ns: pair for pair in recording.pairs}
+    there = [(k, pair_at[t]) for k, t in zip(shown.tolist(), frames_t_ns[shown].tolist(), strict=True) if t in pair_at]
+    for (k, _), images in zip(there, read_pairs(recording, [pair for _, pair in there]), strict=True):
+        if not isinstance(images, Unusable):
+            yield k, images[0]
+
+
+def _jpeg(image: Image) -> bytes:
+    import cv2
+
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()

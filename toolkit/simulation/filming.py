@@ -1,0 +1,260 @@
+"""A simulated recording as the stereo images a pair of cameras takes of it, in the layout of EuRoC's recordings.
+
+Motion, IMU and truth are those of the scenario under the same seed: what differs from its simulated tracks is that
+somebody has to find them. The seed draws the noise of each image, too.
+"""
+
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from toolkit.files import check_replaceable, replaced_directory
+from toolkit.geometry import Array, quaternion_from_rotation, se3, so3_exp
+from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.progress import SILENT, Progress
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, StereoRig
+from toolkit.settings import SettingsError
+from toolkit.simulation.renderer import Eye, Lens, LensModel, Sensor, exposed, light
+from toolkit.simulation.scenarios import START_NS, Scenario, simulate
+from toolkit.simulation.sensors import Imu
+from toolkit.simulation.surfaces import Floats, Surfaces, atlas, furnished_hall
+from toolkit.simulation.trajectory import SmoothTrajectory
+
+# Says that a folder in the layout of real recordings is none, and what was simulated.
+ABOUT, SCHEMA = "simulation.json", "vislam.simulation/1"
+_CAMERAS = ("cam0", "cam1")
+_TRUTH = "state_groundtruth_estimate0"
+_IMAGES_STREAM = 5  # of the seed; simulate() has the first five
+# The exposure follows the light: the gain of both images swings by a share over some seconds; the right is brighter.
+_SWING, _SWING_S, _RIGHT_GAIN = 0.12, 7.0, 1.04
+_SHOTS = 5  # in an exposure that blurs
+# No pair is mounted perfectly: what lenses come with, the right camera turned against the left one (rad).
+_TURNED_RAD = np.array([0.008, -0.005, 0.006])
+_COEFFICIENTS: dict[LensModel, tuple[float, ...]] = {
+    "none": (0.0, 0.0, 0.0, 0.0),
+    "radtan": (-0.28, 0.07, 2e-4, 1e-4),
+    "equidistant": (3e-3, 7e-4, -2e-3, 2e-4),
+}
+# A fisheye sees more on the same sensor.
+_FISHEYE_FOCAL = 0.72
+_EUROC_NAMES: dict[LensModel, str] = {
+    "none": "none",
+    "radtan": "radial-tangential",
+    "equidistant": "equidistant",
+}
+
+
+@dataclass(frozen=True)
+class Filming:
+    """How images are taken: lenses, the time of an exposure (s, 0: no blur), and how many crates fly about."""
+
+    lens: LensModel = "none"
+    exposure_s: float = 0.0
+    moving: int = 0
+
+
+def check_filmable(scenario: Scenario, directory: Path) -> None:
+    """Raise SettingsError where a scenario has no surfaces, OutputError where the directory holds anything else."""
+    if not (scenario.has_surfaces and isinstance(scenario.motion, Imu)):
+        raise SettingsError(f"{scenario.name} has landmarks and no surfaces to take images of; flight has")
+    if scenario.varied:
+        raise SettingsError(f"{scenario.name}: a world that the seed draws cannot be filmed; leave it as it is")
+    check_replaceable(directory, _written_by_us)
+
+
+def film(
+    scenario: Scenario, seed: int, directory: Path, filming: Filming | None = None, progress: Progress = SILENT
+) -> Sequence:
+    """Write a scenario under one seed as a folder of images, whole or not at all, and return its simulated recording.
+
+    The folder has EuRoC's layout: both cameras' images, IMU, truth at the frames and sensor.yaml files. The same
+    arguments give the same images. Raises as :func:`check_filmable`.
+    """
+    filming = filming or Filming()
+    check_filmable(scenario, directory)
+    sequence = simulate(scenario, seed)
+    pair = _Pair.of(scenario, filming.lens)
+    with replaced_directory(directory, _written_by_us) as partial:
+        about = {"schema": SCHEMA, "scenario": scenario.name, "seed": seed, "duration_s": scenario.duration_s}
+        (partial / ABOUT).write_text(json.dumps(about | asdict(filming), indent=2) + "\n")
+        _write_tables(sequence, pair, scenario, partial / "mav0")
+        crew = _Crew(
+            scenario.scene(scenario.duration_s).trajectory, furnished_hall(filming.moving), pair, filming, seed
+        )
+        _shoot_all(crew, sequence.frames_t_ns.tolist(), partial / "mav0", progress)
+    return sequence
+
+
+def _shoot_all(crew: "_Crew", frames_t_ns: list[int], mav0: Path, progress: Progress) -> None:
+    """Write all images, some at a time."""
+    done = count(1)
+
+    def shoot(k: int) -> None:
+        for side, camera in enumerate(_CAMERAS):
+            (mav0 / camera / "data" / f"{frames_t_ns[k]}.png").write_bytes(crew.png(k, frames_t_ns[k], side))
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for _ in pool.map(shoot, range(len(frames_t_ns))):
+                progress.advance(next(done), len(frames_t_ns), "rendering")
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+# The cameras --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two cameras: lenses, and where they are mounted (4, 4)."""
+
+    lenses: tuple[Lens, Lens]
+    T_imu_cams: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, scenario: Scenario, model: LensModel) -> "_Pair":
+        """Return the cameras of a scenario: its rectified pair, or lenses, whose right one looks a little aside."""
+        rig, coefficients = scenario.rig, np.array(_COEFFICIENTS[model])
+        scale = _FISHEYE_FOCAL if model == "equidistant" else 1.0
+        pinhole_px = (scale * rig.fx_px, scale * rig.fy_px, rig.cx_px, rig.cy_px)
+        lens = Lens(pinhole_px, model, coefficients, scenario.camera.size_px)
+        turned = np.eye(3) if model == "none" else so3_exp(_TURNED_RAD)
+        return cls((lens, lens), (rig.T_imu_cam, _right_of(rig, turned)))
+
+
+def _right_of(rig: StereoRig, turned: Array) -> Array:
+    return rig.T_imu_cam @ se3(turned, np.array([rig.baseline_m, 0.0, 0.0]))
+
+
+class _Crew:
+    """Takes any image of a recording, in any order: each has its noise from a stream of its own."""
+
+    def __init__(
+        self, trajectory: SmoothTrajectory, surfaces: Surfaces, pair: _Pair, filming: Filming, seed: int
+    ) -> None:
+        self._trajectory, self._surfaces, self._pair, self._seed = trajectory, surfaces, pair, seed
+        self._filming, self._sensor = filming, Sensor()
+        atlas()  # before any thread asks for it
+        self._eyes = tuple(Eye.of(lens) for lens in pair.lenses)
+        self._swing_rad = 2.0 * np.pi * float(self._rng(0, 2).uniform())
+
+    def png(self, k: int, t_ns: int, side: int) -> bytes:
+        """Return the image of the left (0) or right (1) camera at frame k, whose stamp is the middle of exposure."""
+        import cv2
+
+        t_s = (t_ns - START_NS) / NS_PER_S
+
+        def shot(at_s: float) -> Floats:
+            T_world_imu = self._trajectory.at(np.array([at_s])).T_world_imu[0]
+            return light(self._surfaces.at(at_s), self._eyes[side], T_world_imu @ self._pair.T_imu_cams[side])
+
+        gain = (1.0 + _SWING * np.sin(2.0 * np.pi * t_s / _SWING_S + self._swing_rad)) * (_RIGHT_GAIN if side else 1.0)
+        seen = exposed(shot, t_s, self._filming.exposure_s, _SHOTS)
+        image = self._sensor.developed(seen, gain, self._rng(k, side))
+        return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+    def _rng(self, k: int, what: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(_IMAGES_STREAM, k, what)))
+
+
+# The folder ---------------------------------------------------------------------------------------------------------
+
+
+def _write_tables(sequence: Sequence, pair: _Pair, scenario: Scenario, mav0: Path) -> None:
+    """Write everything of a folder but its images."""
+    stamps = sequence.frames_t_ns.tolist()
+    names = "".join(f"{t},{t}.png\n" for t in stamps)
+    for camera, lens, T_imu_cam in zip(_CAMERAS, pair.lenses, pair.T_imu_cams, strict=True):
+        (mav0 / camera / "data").mkdir(parents=True)
+        (mav0 / camera / "data.csv").write_text(f"#timestamp [ns],filename\n{names}")
+        (mav0 / camera / "sensor.yaml").write_text(_camera_yaml(lens, T_imu_cam, scenario.camera.rate_hz))
+    imu, sensor, truth = sequence.motion, scenario.motion, sequence.truth
+    assert isinstance(imu, ImuSamples)
+    assert isinstance(sensor, Imu)
+    assert truth is not None
+    assert truth.v_world is not None
+    assert truth.bias is not None
+    (mav0 / "imu0").mkdir()
+    (mav0 / "imu0/data.csv").write_text(
+        _table(
+            imu.t_ns.tolist(), _columns(w_RS_S="rad s^-1", a_RS_S="m s^-2"), np.hstack([imu.gyro_radps, imu.accel_mps2])
+        )
+    )
+    (mav0 / "imu0/sensor.yaml").write_text(_imu_yaml(sensor.noise, sensor.rate_hz))
+    poses = truth.T_world_imu
+    q_wxyz = np.roll(quaternion_from_rotation(poses[:, :3, :3]), 1, axis=1)
+    values = np.hstack([poses[:, :3, 3], q_wxyz, truth.v_world, truth.bias[:, 3:], truth.bias[:, :3]])
+    heading = (
+        _columns(p_RS_R="m")
+        + "".join(f",q_RS_{axis} []" for axis in "wxyz")
+        + _columns(v_RS_R="m s^-1", b_w_RS_S="rad s^-1", b_a_RS_S="m s^-2")
+    )
+    (mav0 / _TRUTH).mkdir()
+    (mav0 / _TRUTH / "data.csv").write_text(_table(truth.t_ns.tolist(), heading, values))
+    (mav0 / _TRUTH / "sensor.yaml").write_text(_sensor_yaml("ground truth", np.eye(4)))
+
+
+def _columns(**units: str) -> str:
+    return "".join(f",{name}_{axis} [{unit}]" for name, unit in units.items() for axis in "xyz")
+
+
+def _table(t_ns: list[int], heading: str, values: Array) -> str:
+    rows = (f"{t},{','.join(f'{x:.15g}' for x in row)}\n" for t, row in zip(t_ns, values.tolist(), strict=True))
+    return f"#timestamp{heading}\n{''.join(rows)}"
+
+
+def _sensor_yaml(kind: str, T_imu_sensor: Array) -> str:
+    data = ", ".join(f"{x:.15g}" for x in T_imu_sensor.ravel())
+    return f"%YAML:1.0\nsensor_type: {kind}\ncomment: simulated\nT_BS:\n  cols: 4\n  rows: 4\n  data: [{data}]\n"
+
+
+def _camera_yaml(lens: Lens, T_imu_cam: Array, rate_hz: float) -> str:
+    return _sensor_yaml("camera", T_imu_cam) + (
+        f"rate_hz: {rate_hz:g}\nresolution: [{lens.size_px[0]}, {lens.size_px[1]}]\ncamera_model: pinhole\n"
+        f"intrinsics: {list(lens.pinhole_px)}\ndistortion_model: {_EUROC_NAMES[lens.model]}\n"
+        f"distortion_coefficients: {lens.coefficients.tolist()}\n"
+    )
+
+
+def _imu_yaml(noise: ImuNoise, rate_hz: float) -> str:
+    return _sensor_yaml("imu", np.eye(4)) + (
+        f"rate_hz: {rate_hz:g}\n"
+        f"gyroscope_noise_density: {noise.gyro_noise_density:g}\n"
+        f"gyroscope_random_walk: {noise.gyro_random_walk:g}\n"
+        f"accelerometer_noise_density: {noise.accel_noise_density:g}\n"
+        f"accelerometer_random_walk: {noise.accel_random_walk:g}\n"
+    )
+
+
+def is_simulated(root: Path) -> bool:
+    """Say whether a folder in EuRoC's layout was written here."""
+    try:
+        return SCHEMA in (root / ABOUT).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _written_by_us(directory: Path) -> frozenset[str]:
+    """Return the names a folder of ours has; of a folder without our mark, which may be a real recording, none."""
+    if not is_simulated(directory):
+        return frozenset()
+    tables = [f"mav0/{sensor}/{name}" for sensor in (*_CAMERAS, "imu0", _TRUTH) for name in ("data.csv", "sensor.yaml")]
+    folders = [
+        "mav0/",
+        *(f"mav0/{sensor}/" for sensor in (*_CAMERAS, "imu0", _TRUTH)),
+        *(f"mav0/{c}/data/" for c in _CAMERAS),
+    ]
+    images = [
+        path.relative_to(directory).as_posix()
+        for camera in _CAMERAS
+        for path in (directory / "mav0" / camera / "data").glob("*.png")
+        if path.stem.isdecimal()
+    ]
+    return frozenset({ABOUT, *tables, *folders, *images})
