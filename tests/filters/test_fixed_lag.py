@@ -171,7 +171,7 @@ def with_a_first_sighting_too_far(sequence: Sequence, track_id: int, disparity_p
 def test_a_landmark_first_seen_far_too_far_begins_anew_before_it_is_linearised_behind_the_camera():
     """The step from a small disparity to the right one passes the camera; the next sighting is as good a start."""
     clean = simulate(replace(FLIGHT, duration_s=1.0), 0)
-    log, point = log_and_point(with_a_first_sighting_too_far(clean, 5, disparity_px=1.5), 8)
+    log, point = log_and_point(with_a_first_sighting_too_far(clean, 8, disparity_px=1.5), 8)
     assert log == ("frame 1: landmark 8 fell behind the camera and was dropped",)
     seen = clean.observations
     later = replace(clean, observations=seen.select((seen.track_id != 8) | (seen.frame > 1)))

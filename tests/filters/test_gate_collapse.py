@@ -24,7 +24,7 @@ CENTIMETRES = 0.05
 @pytest.fixture(scope="module")
 def recording():
     """Return the flight started from its measurements, as a real recording is."""
-    blind = audit(replace(simulate(ROUGH, 0), prior=None)).sequence
+    blind = audit(replace(simulate(ROUGH, 5), prior=None)).sequence
     return replace(blind, prior=start_from_measurements(blind))
 
 
