@@ -1,20 +1,12 @@
-"""Every option of a comparison in one typed record: what it is, its unit, its default and its range.
+"""The records of settings, section by section: what each is, its unit, its default and its range."""
 
-An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
-runs carry the same one. A threshold that nobody should have to choose is no setting: it stands in the code, once, with
-its source.
-"""
-
-import tomllib
-from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.errors import DataError, VislamError, did_you_mean, no_such
-from toolkit.inputs import read_text_input
+from toolkit.errors import VislamError
 
 _NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
@@ -265,41 +257,6 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 DEFAULTS = Settings()
-_POLICY = "outliers.policy"
-
-
-class Described(NamedTuple):
-    """One setting as documentation shows it: key, unit, default, range in words, what it is."""
-
-    key: str
-    unit: str
-    default: str
-    range: str
-    meaning: str
-
-
-def settings_of(given: Mapping[str, Any], place: str) -> Settings:
-    """Return the record of nested values, the defaults where nothing is given.
-
-    Raises SettingsError for a key that does not exist, naming the nearest that does, and for a value of another type
-    or out of range; ``place`` says where the values come from.
-    """
-    _check_keys(given, Settings, "", place)
-    try:
-        return msgspec.convert(_with_policy(given, place), Settings)
-    except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {_in_words(str(error))}") from error
-
-
-def _with_policy(given: Mapping[str, Any], place: str) -> dict[str, Any]:
-    """Return nested values with what a named outlier policy consists of, where they do not say otherwise."""
-    values, outliers = dict(given), given.get("outliers")
-    if isinstance(outliers, Mapping) and "policy" in outliers:
-        policy = outliers["policy"]
-        if policy not in POLICIES:
-            raise SettingsError(f"{place}: {no_such('outlier policy', str(policy), POLICIES)}")
-        values["outliers"] = {**msgspec.to_builtins(POLICIES[policy]), **outliers}
-    return values
 
 
 def outliers_in_words(outliers: Outliers) -> str:
@@ -307,36 +264,6 @@ def outliers_in_words(outliers: Outliers) -> str:
     named = msgspec.to_builtins(POLICIES[outliers.policy])
     changed = {key: value for key, value in msgspec.to_builtins(outliers).items() if value != named[key]}
     return f"{outliers.policy}{''.join(f', {key} {value}' for key, value in changed.items())}"
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return the nested values of a TOML file; raise SettingsError where it cannot be read."""
-    try:
-        return tomllib.loads(read_text_input(path, "settings are TOML"))
-    except DataError as error:
-        raise SettingsError(str(error)) from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise SettingsError(f"{path}: is not TOML ({error})") from error
-
-
-def with_assignments(given: Mapping[str, Any], assignments: Iterable[str]) -> dict[str, Any]:
-    """Return nested values with ``section.key=value`` put in, the value as TOML writes it or a bare word."""
-    result: dict[str, Any] = {key: dict(v) if isinstance(v, Mapping) else v for key, v in given.items()}
-    for text in assignments:
-        key, equals, value = text.partition("=")
-        if not equals or not key.strip():
-            raise SettingsError(f"--set takes KEY=VALUE, as in window.lag_s=3, not {text!r}")
-        *sections, name = key.strip().split(".")
-        at = result
-        for section in sections:
-            at = at.setdefault(section, {})
-            if not isinstance(at, dict):
-                raise SettingsError(f"--set {text}: {section} is a value and has no keys of its own")
-        at[name] = _value(value.strip())
-        if key.strip() == _POLICY:
-            # A policy is named whole: what was set of another is no part of it.
-            result["outliers"] = {"policy": at[name]}
-    return result
 
 
 def as_values(settings: Settings) -> dict[str, Any]:
@@ -355,72 +282,3 @@ def changes_of(settings: Settings) -> dict[str, Any]:
         if differs != ({} if section else defaults[key]):
             changed[key] = differs
     return changed
-
-
-def describe() -> tuple[Described, ...]:
-    """Return every setting, in the order of the record."""
-    return tuple(_described(Settings, ""))
-
-
-def _value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, place: str) -> None:
-    hints = get_type_hints(record)
-    for key, value in given.items():
-        if key not in hints:
-            known = [described.key for described in describe()] + ["estimators"]
-            raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
-        if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
-            _check_keys(value, hints[key], f"{key}.", place)
-
-
-def _in_words(message: str) -> str:
-    """Return what msgspec says of a value, the setting by its own name first."""
-    what, _, where = message.partition(" - at `$.")
-    return f"{where.rstrip('`')}: {what[0].lower()}{what[1:]}" if where else what
-
-
-def _described(record: type[Struct], prefix: str) -> Iterator[Described]:
-    hints = get_type_hints(record, include_extras=True)
-    for field in msgspec.structs.fields(record):
-        hint = hints[field.name]
-        if isinstance(hint, type) and issubclass(hint, Struct):
-            yield from _described(hint, f"{field.name}.")
-        elif field.name != "estimators":
-            yield _one(f"{prefix}{field.name}", hint, field.default)
-
-
-def _one(key: str, hint: Any, default: Any) -> Described:
-    metas = list(_metas(hint))
-    extra = {name: text for meta in metas for name, text in (meta.extra or {}).items()}
-    bounds = {name: getattr(meta, name) for meta in metas for name in _BOUNDS if getattr(meta, name) is not None}
-    words = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
-    words += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
-    meaning = next(meta.description for meta in metas if meta.description)
-    shown = extra.get("none", "none") if default is None else _shown(default)
-    return Described(key, extra.get("unit", ""), shown, ", ".join(words), meaning)
-
-
-_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-
-
-def _shown(default: Any) -> str:
-    return f"{default:.4g}" if isinstance(default, float) else str(default)
-
-
-def _parts(hint: Any) -> Iterator[Any]:
-    """Yield a type annotation and all it is made of."""
-    yield hint
-    for part in get_args(hint):
-        if not isinstance(part, Meta):
-            yield from _parts(part)
-
-
-def _metas(hint: Any) -> Iterator[Meta]:
-    for part in _parts(hint):
-        yield from (meta for meta in getattr(part, "__metadata__", ()) if isinstance(meta, Meta))

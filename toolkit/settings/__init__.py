@@ -1,0 +1,51 @@
+"""Every option of a comparison in one typed record: what it is, its unit, its default and its range.
+
+An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
+runs carry the same one. A threshold that nobody should have to choose is no setting: it stands in the code, once, with
+its source. Read ``records``, then ``reading``, which makes one of what somebody wrote; ``described`` is for the pages.
+"""
+
+from toolkit.settings.described import Described, describe
+from toolkit.settings.reading import read_toml, settings_of, with_assignments
+from toolkit.settings.records import (
+    DEFAULTS,
+    POLICIES,
+    Frontend,
+    Metrics,
+    Noise,
+    Outliers,
+    PolicyName,
+    Scalar,
+    Settings,
+    SettingsError,
+    Tracks,
+    Varied,
+    Window,
+    as_values,
+    changes_of,
+    outliers_in_words,
+)
+
+__all__ = [
+    "DEFAULTS",
+    "POLICIES",
+    "Described",
+    "Frontend",
+    "Metrics",
+    "Noise",
+    "Outliers",
+    "PolicyName",
+    "Scalar",
+    "Settings",
+    "SettingsError",
+    "Tracks",
+    "Varied",
+    "Window",
+    "as_values",
+    "changes_of",
+    "describe",
+    "outliers_in_words",
+    "read_toml",
+    "settings_of",
+    "with_assignments",
+]
