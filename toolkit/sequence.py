@@ -285,7 +285,8 @@ def is_held_out(track_ids: IntArray) -> BoolArray:
 def _ages(seen: Observations) -> IntArray:
     """Return for each sighting (N,) the number of frames since the first of its track."""
     _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
-    return np.asarray(seen.frame - seen.frame[first][track], dtype=np.int64)
+    ages: IntArray = read_only(seen.frame - seen.frame[first][track], np.int64)
+    return ages
 
 
 def check_runnable(sequence: Sequence) -> None:

@@ -27,7 +27,7 @@ def test_bash_completes_commands_options_and_choices(capsys) -> None:
     assert completed(text, "comp") == ["compare", "completion"]
     assert completed(text, "evaluate", "--max") == ["--max-dt"]
     assert completed(text, "evaluate", "--format", "m") == ["markdown"]
-    assert completed(text, "simulate", "dr") == ["drive", "drive-imu"]
+    assert completed(text, "simulate", "dr") == ["drive", "drive-imu", "drive-realistic"]
     assert completed(text, "report", "runs/") == []  # files, which bash itself completes
 
 
