@@ -100,6 +100,7 @@ every_case = pytest.mark.parametrize(
 def test_the_fault_is_named_with_the_right_verdict(case: Case, scenario: str) -> None:
     outcome = audited(case, scenario)
     if case.verdict == "undecided":
+        assert {finding.fault for finding in outcome.findings if finding.warning} <= {"thin-vision"}
         assert all(finding.warning for finding in outcome.findings)
         assert case.in_detail in outcome.undecided[case.found]
         return
