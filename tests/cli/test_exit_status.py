@@ -196,6 +196,21 @@ def test_signals_leave_no_file_and_no_process(
     _wait_until(lambda: not _group(running.pid))
 
 
+def test_an_interrupt_inside_text_that_is_executed_is_130_as_well(tmp_path: Path) -> None:
+    """As where a dataclass is being made: CPython would then end ``python -m`` by the signal, caught or not."""
+    (tmp_path / "interrupted.py").write_text(
+        "import sys\n"
+        "from toolkit.cli import main\n"
+        "from toolkit.cli.arguments import Parser\n"
+        "Parser.parse_args = lambda *_: exec('raise KeyboardInterrupt')\n"
+        "sys.exit(main())\n"
+    )
+    search = {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    command = [sys.executable, "-m", "interrupted", "list"]
+    ended = subprocess.run(command, env={**os.environ, **search}, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr.count("\n")) == (130, 1)
+
+
 def _group(group: int) -> list[int]:
     """Return the living processes of a group."""
     found = []

@@ -80,6 +80,7 @@ def _guarded(given: list[str]) -> int:
     except VislamError as error:
         return _told(str(error), error.exit_status)
     except KeyboardInterrupt:
+        _forget_where_interrupted()
         return _told("interrupted; what was not finished is not written", _INTERRUPTED)
     except BrokenPipeError:
         # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
@@ -128,6 +129,15 @@ def _unexpected(error: Exception) -> int:
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
     return _told(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
+
+
+def _forget_where_interrupted() -> None:
+    """Have ``python -m toolkit.cli`` end with our status wherever the interrupt came.
+
+    CPython notes that one was raised in source text it had been handed, as the making of a dataclass is, and ends by
+    SIGINT though we caught it; it forgets the note when it is handed the next text.
+    """
+    exec("")
 
 
 def _give_up_output() -> None:
