@@ -77,6 +77,13 @@ def holds_much(unit, progress):
 
 kept = []
 
+def names_its_process(unit, progress):
+    time.sleep(0.02 * (unit.estimator == "ekf"))
+    return os.getpid()
+
+def naps(unit, progress):
+    time.sleep(0.2)
+
 def goes_on(unit, progress):
     for done in range(4):
         progress.advance(done, 4)
@@ -202,6 +209,26 @@ def test_a_process_that_holds_much_memory_goes_on_without_a_word(
     assert not recwarn.list
 
 
+def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_have_other_work(
+    jobs: Jobs, work: ModuleType
+) -> None:
+    """Two processes, six seeds: only at the end may both have worked on one seed."""
+    asked = jobs(tuple(range(6)), ("batch", "ekf", "riekf"))
+    found = dict(results_of(asked, 2, work.names_its_process, SILENT, lambda job: job.seed))
+    processes = [{found[place] for place, job in enumerate(asked) if job.seed == seed} for seed in range(6)]
+    assert sorted(map(len, processes))[:5] == [1] * 5
+
+
+def test_processes_go_on_while_the_reader_of_their_results_is_busy(jobs: Jobs, work: ModuleType) -> None:
+    began = time.monotonic()
+    coming = results_of(jobs(tuple(range(20)), ("ekf",)), 2, work.naps, SILENT)
+    next(coming)
+    time.sleep(3.0)  # of work there are 2 s, and 18 units more than processes
+    resumed = time.monotonic()
+    assert len(list(coming)) == 19
+    assert time.monotonic() - resumed < 0.5 * (resumed - began)
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: ModuleType, workers: int) -> None:
     heard: list[tuple[int, int]] = []
@@ -253,9 +280,9 @@ def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: St
     program = textwrap.dedent("""
         import time
         from toolkit.experiment.workers import Workers
+        from toolkit.progress import SILENT
         workers = Workers(2)
-        for answer in [workers.submit(abs, number) for number in (1, 2)]:
-            answer.result()
+        list(workers.results([1, 2], lambda unit, progress: unit, SILENT))
         print("started", flush=True)
         time.sleep(60)
     """)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from toolkit.errors import VislamError
 from toolkit.experiment.code_version import code_digest, numeric_versions
-from toolkit.experiment.workers import Lost, Work
+from toolkit.experiment.workers import Lost, Needs, Work, nothing_kept
 from toolkit.progress import SILENT, Progress
 
 T = TypeVar("T")
@@ -51,9 +51,9 @@ class Cluster:
         self._client.close()
 
     def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress
+        self, units: Sequence[T], work: Work[T, R], progress: Progress, _needs: Needs[T] = nothing_kept
     ) -> Generator[tuple[int, R | Lost], None, None]:
-        """Yield the place and the result of every unit as each is there.
+        """Yield the place and the result of every unit as each is there; the scheduler chooses the workers.
 
         An error that the work raises ends everything and is raised here. Raises ClusterError where the scheduler goes
         away or a worker of another version joins.

@@ -17,7 +17,7 @@ from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
-from toolkit.experiment.units import Outcome, Unit, outcome_of, run_unit
+from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
@@ -190,7 +190,7 @@ def comparisons(
     missing, shown = Counter(owner), 0
     with (
         progress_for(_label(cases, len(units), sum(map(len, outcomes)))) as progress,
-        closing(workers.results(units, run_unit, progress)) as coming,
+        closing(workers.results(units, run_unit, progress, recording_to_prepare)) as coming,
     ):
         for place, result in coming:
             case = owner[place]

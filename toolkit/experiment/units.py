@@ -96,6 +96,11 @@ def prepared_of(unit: Unit) -> Prepared:
     return unit.recording if isinstance(unit.recording, Prepared) else prepare_once(unit.recording)
 
 
+def recording_to_prepare(unit: Unit) -> Recording | None:
+    """Return the recording that has to be prepared for a unit, which the units of other estimators share."""
+    return None if isinstance(unit.recording, Prepared) else unit.recording
+
+
 def run_estimator(unit: Unit, prepared: Prepared, progress: Progress) -> Run:
     """Run a unit's estimator over its prepared recording."""
     build = find(unit.estimator).load() if unit.build is None else unit.build

@@ -1,45 +1,36 @@
-"""Units of work side by side, in processes of one numeric thread each (loky's).
+"""Units of work side by side, in processes of their own (:mod:`toolkit.experiment.processes`).
 
-A process that dies takes the unit it was busy with along and nothing else: the units that were under way are tried once
-more, each alone, and one that dies again is lost. An interrupt is the parent's alone to handle: it ends the processes
-it started, and where it is itself killed they end by themselves. Loky's processes do not run the caller's main module
-again, so a script needs no guard.
+A process that dies takes the unit it was busy with along and nothing else: that unit is tried once more when all others
+are done, with nothing beside it, and is lost where its process dies again. Units that need the same recording go to
+the process that has it ready, as long as there is other work for the others.
 """
 
 import os
-import re
-import signal
 import tempfile
 import threading
-import time
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Hashable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing import resource_tracker
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
-from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
+from toolkit.experiment.processes import WorkerProcess, how_it_ended
 from toolkit.progress import Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T, Progress], R]
+# What a process keeps ready for the units for which this is equal; None where it is nothing.
+Needs = Callable[[T], Hashable]
 
-# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
-    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
-}
-_POLL_S, _PARENT_POLL_S = 0.1, 1.0
+_POLL_S = 0.1
 # How far a unit has come, as its process writes it and the parent reads it.
-_ENTRY = np.dtype(
-    [("begun", np.int64), ("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")]
-)
+_ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
 _STEPS = 100
 
@@ -56,12 +47,17 @@ def usable_cpus() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def nothing_kept(_unit: object) -> Hashable:
+    """Return that units need nothing which one leaves ready for the next."""
+    return None
+
+
 def results_of(
-    units: Sequence[T], workers: int, work: Work[T, R], progress: Progress
+    units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
 ) -> Generator[tuple[int, R | Lost], None, None]:
     """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
     with Workers(workers) as pool:
-        yield from pool.results(units, work, progress)
+        yield from pool.results(units, work, progress, needs)
 
 
 class Pool(Protocol):
@@ -76,7 +72,7 @@ class Pool(Protocol):
         """End what was started."""
 
     def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress
+        self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
     ) -> Generator[tuple[int, R | Lost], None, None]:
         """Yield the place and the result of every unit as each is there; an error of the work is raised."""
 
@@ -89,7 +85,7 @@ class Workers:
 
     def __init__(self, count: int) -> None:
         self.count = count
-        self._executor: ProcessPoolExecutor | None = None
+        self._processes = [WorkerProcess() for _ in range(count)] if count > 1 else []
 
     def __enter__(self) -> Self:
         return self
@@ -99,28 +95,17 @@ class Workers:
 
     def end(self) -> None:
         """End the processes, whatever they are doing."""
-        if self._executor is not None:
-            self._executor.shutdown(wait=True, kill_workers=True)
-            self._executor = None
+        if self._processes:
+            with ThreadPoolExecutor(len(self._processes)) as threads:
+                list(threads.map(WorkerProcess.end, self._processes))
 
     def warm_up(self, module: str) -> None:
         """Start the processes and have them import a module, while the caller does something else."""
-        if self.count > 1:
-            for _ in range(self.count):
-                self.submit(import_module, module)
-
-    def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
-        """Have a process do some work."""
-        # Started with the first process, Python's own tracker would let interrupts through to it again.
-        resource_tracker.ensure_running()
-        with _interrupts_held_back():
-            if self._executor is None:
-                self._executor = _executor(self.count)
-            future: Future[R] = self._executor.submit(work, *arguments)
-        return future
+        for process in self._processes:
+            process.submit(import_module, module)
 
     def results(
-        self, units: Sequence[T], work: Work[T, R], progress: Progress
+        self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
     ) -> Generator[tuple[int, R | Lost], None, None]:
         """Yield the place and the result of every unit as each is there.
 
@@ -131,7 +116,17 @@ class Workers:
                 yield place, work(unit, _Share(progress, place, len(units)))
             return
         with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
-            yield from _Watch(self, units, work, Path(folder) / "progress").results(progress)
+            board = _Board(Path(folder) / "progress", len(units))
+            tasks = [(_do, work, unit, board.path, place) for place, unit in enumerate(units)]
+            handing_out: _HandingOut[R] = _HandingOut(self._processes, tasks, [needs(unit) for unit in units])
+            progress.advance(0, board.total)
+            try:
+                for place, result in handing_out.results(lambda: progress.advance(*board.told())):
+                    board.finish(place)
+                    progress.advance(*board.told())
+                    yield place, result
+            finally:
+                handing_out.stop()
 
 
 class _Share:
@@ -145,14 +140,14 @@ class _Share:
         """Pass on how far the unit has come."""
         if stage and stage not in self._stages:
             self._stages.append(stage)
-        steps = _share_done(len(self._stages), done, total)
+        steps = int(_share_done(len(self._stages), done, total))
         self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count, _in_words(stage, done))
 
 
-def _share_done(stages: int, done: int, total: int) -> int:
+def _share_done(stages: Any, done: Any, total: Any) -> Any:
+    """Return how many of its steps a unit has done, or units (n,)."""
     half = _STEPS // 2
-    part = half * done // max(total, 1)
-    return part if stages == 0 else half + part
+    return half * done // np.maximum(total, 1) + half * (np.asarray(stages) > 0)
 
 
 def _in_words(stage: str, done: int) -> str:
@@ -160,86 +155,121 @@ def _in_words(stage: str, done: int) -> str:
     return f"{stage}, iteration {done + 1}" if stage else ""
 
 
-class _Watch(Generic[T, R]):
-    """Some units under way, how far each has come, and which are finished."""
+class _HandingOut(Generic[R]):
+    """Gives each process its next task as soon as it is free, however busy the reader of the results is (a thread).
 
-    def __init__(self, workers: Workers, units: Sequence[T], work: Work[T, R], board: Path) -> None:
-        self._workers, self._units, self._work, self._board = workers, units, work, board
-        self._entries = np.memmap(board, dtype=_ENTRY, mode="w+", shape=(max(len(units), 1),))
-        self._finished: set[int] = set()
+    ``tasks`` are functions with their arguments, ``needs`` what a process keeps ready for each.
+    """
 
-    def results(self, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
-        """Yield the place and the result of every unit."""
-        progress.advance(0, _STEPS * len(self._units))
-        while len(self._finished) < len(self._units):
-            waiting = [place for place in range(len(self._units)) if place not in self._finished]
+    def __init__(
+        self, processes: list[WorkerProcess], tasks: Sequence[tuple[Any, ...]], needs: Sequence[Hashable]
+    ) -> None:
+        self._processes, self._tasks, self._needs = processes, tasks, needs
+        self._waiting = list(range(len(tasks)))
+        self._ready: dict[WorkerProcess, Hashable] = {}
+        self._answers: SimpleQueue[tuple[int, Future[R]] | Exception] = SimpleQueue()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._give, name="vislam-workers", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Hand out nothing more."""
+        self._stopped.set()
+        self._thread.join()
+
+    def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | Lost], None, None]:
+        """Yield the place and the result of each task as it is there, and call ``meanwhile`` while there is none."""
+        died = []
+        for _ in self._tasks:
+            place, future = self._next_answer(meanwhile)
             try:
-                yield from self._side_by_side(waiting, self._workers, progress)
-            except BrokenProcessPool:
-                self._workers.end()
-                suspects = [place for place in waiting if self._entries["begun"][place] and place not in self._finished]
-                for place in suspects:
-                    yield from self._alone(place, progress)
-
-    def _side_by_side(self, places: list[int], workers: Workers, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
-        pending = {self._submitted(workers, place): place for place in places}
-        while pending:
-            done, _ = wait(pending, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            for future in done:
-                place = pending.pop(future)
                 result = future.result()
-                self._finished.add(place)
+            except BrokenProcessPool:
+                died.append(place)
+            else:
                 yield place, result
-            progress.advance(self._steps_done(), _STEPS * len(self._units), self._stage())
+        for place in died:
+            yield place, self._alone(place, meanwhile)
 
-    def _alone(self, place: int, progress: Progress) -> Iterator[tuple[int, R | Lost]]:
-        """Try a unit once more in a process of its own."""
+    def _next_answer(self, meanwhile: Callable[[], None]) -> tuple[int, "Future[R]"]:
+        while True:
+            try:
+                answer = self._answers.get(timeout=_POLL_S)
+            except Empty:
+                meanwhile()
+                continue
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+    def _alone(self, place: int, meanwhile: Callable[[], None]) -> R | Lost:
+        """Try a task once more, in a process of its own."""
+        process = WorkerProcess()
         try:
-            with Workers(1) as one:
-                yield from self._side_by_side([place], one, progress)
+            future: Future[R] = process.submit(*self._tasks[place])
+            while not wait([future], timeout=_POLL_S).done:
+                meanwhile()
+            return future.result()
         except BrokenProcessPool as error:
-            self._finished.add(place)
-            yield place, Lost(f"its process {_how_it_ended(error)} before it answered")
+            return Lost(f"its process {how_it_ended(error)} before it answered")
+        finally:
+            process.end()
 
-    def _submitted(self, workers: Workers, place: int) -> "Future[R]":
-        future: Future[R] = workers.submit(_do, self._work, self._units[place], self._board, place)
-        return future
+    def _give(self) -> None:
+        """Hand out the tasks and pass their answers on, until all are there or this is stopped."""
+        busy: dict[Future[R], tuple[int, WorkerProcess]] = {}
+        free = list(self._processes)
+        try:
+            while (self._waiting or busy) and not self._stopped.is_set():
+                while free and self._waiting:
+                    process = free.pop()
+                    place = self._next_for(process)
+                    busy[process.submit(*self._tasks[place])] = (place, process)
+                done, _ = wait(busy, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    place, process = busy.pop(future)
+                    free.append(process)
+                    self._answers.put((place, future))
+        except Exception as error:  # whatever it is, the reader of the results is to meet it
+            self._answers.put(error)
 
-    def _steps_done(self) -> int:
-        shares = [_share_done(int(one["stages"]), int(one["done"]), int(one["total"])) for one in self._under_way()]
-        return _STEPS * len(self._finished) + sum(shares)
-
-    def _stage(self) -> str:
-        """Return what the first of the smoothers that have come to their end does there."""
-        stages = (_in_words(one["stage"].decode(), int(one["done"])) for one in self._under_way())
-        return next(filter(None, stages), "")
-
-    def _under_way(self) -> list[Any]:
-        """Return the entries of the units that are not finished."""
-        return [self._entries[place] for place in range(len(self._units)) if place not in self._finished]
+    def _next_for(self, process: WorkerProcess) -> int:
+        """Take the next task for a process: one it is ready for, else one that no process is, else any."""
+        mine, elsewhere = self._ready.get(process), set(self._ready.values())
+        place = next(
+            (one for one in self._waiting if mine is not None and self._needs[one] == mine),
+            next((one for one in self._waiting if self._needs[one] not in elsewhere - {None}), self._waiting[0]),
+        )
+        self._waiting.remove(place)
+        self._ready[process] = self._needs[place]
+        return place
 
 
-def _executor(count: int) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(),), env=_ENVIRONMENT)
+class _Board:
+    """How far each unit has come, in a file that the processes write."""
 
+    def __init__(self, path: Path, count: int) -> None:
+        self.path, self.total = path, _STEPS * count
+        self._entries = np.memmap(path, dtype=_ENTRY, mode="w+", shape=(max(count, 1),))
+        self._under_way = np.ones(count, dtype=bool)
 
-def _begin(parent: int) -> None:
-    """Leave interrupts to the parent, and end where it ends; the whole of a process' preparation."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    def finish(self, place: int) -> None:
+        """Count a unit as done."""
+        self._under_way[place] = False
 
-
-def _end_with(parent: int) -> None:
-    """End this process when its parent is gone: one that was killed could not tell it to."""
-    while os.getppid() == parent:
-        time.sleep(_PARENT_POLL_S)
-    os._exit(1)
+    def told(self) -> tuple[int, int, str]:
+        """Return the steps that are done, of how many, and what the first smoother that has come to its end does."""
+        entries = np.array(self._entries[: self._under_way.size])[self._under_way]
+        shares = _share_done(entries["stages"], entries["done"], entries["total"])
+        ending = entries[entries["stage"] != b""][:1]
+        stage = "".join(_in_words(one["stage"].decode(), int(one["done"])) for one in ending)
+        return self.total - _STEPS * entries.size + int(shares.sum()), self.total, stage
 
 
 def _do(work: Work[T, R], unit: T, board: Path, place: int) -> R:
     """Do a unit of work in a process of its own."""
     entries = np.memmap(board, dtype=_ENTRY, mode="r+")
-    entries[place] = (1, 0, 1, 0, b"")
+    entries[place] = (0, 1, 0, b"")
     try:
         return work(unit, _Entry(entries, place))
     except MemoryError:
@@ -257,22 +287,4 @@ class _Entry:
         """Write how far the unit has come."""
         if stage and stage not in self._stages:
             self._stages.append(stage)
-        self._entries[self._place] = (1, done, total, len(self._stages), stage.encode("ascii", "replace"))
-
-
-def _how_it_ended(error: BrokenProcessPool) -> str:
-    """Return how a process ended, of what loky says of it."""
-    named = re.search(r"exit codes of the workers are \{(\w+)\((-?\d+)\)", str(error))
-    if named is None:
-        return "ended"
-    return f"was ended by signal {-int(named[2])}" if int(named[2]) < 0 else f"ended with status {named[2]}"
-
-
-@contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """Have processes started here ignore Ctrl-C from their start; one that comes meanwhile is delivered afterwards."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        self._entries[self._place] = (done, total, len(self._stages), stage.encode("ascii", "replace"))

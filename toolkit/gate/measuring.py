@@ -12,7 +12,15 @@ from toolkit.errors import EstimatorError, VislamError
 from toolkit.estimate import Output, Run, Status
 from toolkit.estimator import find
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, prepared_of, run_estimator
+from toolkit.experiment.units import (
+    OUTPUTS,
+    Outcome,
+    Unit,
+    outcome_of,
+    prepared_of,
+    recording_to_prepare,
+    run_estimator,
+)
 from toolkit.experiment.workers import Lost, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
 from toolkit.gate.reference import reference_s
@@ -76,7 +84,7 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
     try:
         if units:
             prepare(recordings[0])
-        with closing(results_of(units, workers, timed, progress)) as coming:
+        with closing(results_of(units, workers, timed, progress, recording_to_prepare)) as coming:
             found = [_timed(result, units[place]) for place, result in coming]
     except EstimatorError:
         raise
