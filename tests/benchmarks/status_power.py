@@ -4,8 +4,9 @@ A scenario is a fault of toolkit.simulation.faults in a stretch of a simulated r
 away. The recording is audited and run as a user would; then the truth is put back for the error: the RMS of the
 position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
 that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
-overconfident, or where the audit found something in its recording, repaired or not; faults that could not be judged do
-not count. In a sound recording all of that is a false alarm, and so is the mark timid.
+overconfident, where a note says that its gate refused much, or where the audit found something in its recording,
+repaired or not; faults that could not be judged do not count. In a sound recording all of that is a false alarm, and so
+is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
 thresholds may be chosen, and `score`, which is not to be looked at while they are.
@@ -34,7 +35,8 @@ from toolkit.estimate import Output, Run, Status
 from toolkit.experiment.consistency import consistency_of
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Unit, outcome_of, run_estimator
-from toolkit.metrics import Evaluation, ate
+from toolkit.metrics import Evaluation, ate, score_run
+from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.progress import SILENT
 from toolkit.resampling import NS_PER_S
 from toolkit.runner import judged
@@ -142,11 +144,12 @@ class Ended:
     mark: str = ""
     found: Sequence[str] = ()
     log: Sequence[str] = ()
+    refuses: bool = False
 
     @property
     def is_told(self) -> bool:
-        """Say whether the run's status, its mark or the audit says that something is wrong."""
-        return bool(self.found) or self.status != "ok" or self.mark == "overconfident"
+        """Say whether the run's status, its mark, the note on its gate or the audit says that something is wrong."""
+        return bool(self.found) or self.status != "ok" or self.mark == "overconfident" or self.refuses
 
     @property
     def is_alarm(self) -> bool:
@@ -241,7 +244,13 @@ def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> E
         mark=next((verdict for verdict in verdicts if verdict != "consistent"), ""),
         found=tuple(sorted(finding.fault for finding in prepared.findings)),
         log=run.log,
+        refuses=refuses_much(accepted) if (accepted := _accepted(run, prepared)) is not None else False,
     )
+
+
+def _accepted(run: Run, prepared: Prepared) -> float | None:
+    """Return how much of what it tested the gate of a run accepted (percent), None where it has no gate."""
+    return score_run(run, "causal", prepared.sequence).values.get(ACCEPTED)
 
 
 def _error_m(run: Run, sequence: Recorded) -> float | None:
@@ -283,8 +292,10 @@ def print_table(lines: list[Ended]) -> bool:
     print(f"{len(sound)} sound runs: {len(alarms)} raise a false alarm ({_percent(alarms, sound)})")
     warned = [one for one in harmless if one.is_told]
     print(f"{len(harmless)} runs that a fault cost less: {len(warned)} tell of it ({_percent(warned, harmless)})")
-    by = Counter("audit" if one.found else "status" if one.status != "ok" else "mark" for one in told)
-    print(f"the bad say so by the audit, else by the status, else by the mark: {dict(by)}")
+    by = Counter(
+        "audit" if one.found else "status" if one.status != "ok" else "mark" if one.mark else "gate" for one in told
+    )
+    print(f"the bad say so by the audit, else by the status, else by the mark, else by the gate: {dict(by)}")
     for key in ("estimator", "fault"):
         for name in sorted({getattr(one, key) for one in bad}):
             of_name = [one for one in bad if getattr(one, key) == name]
@@ -295,6 +306,14 @@ def print_table(lines: list[Ended]) -> bool:
             f"{what}, {one.recording} {one.seed}, {one.estimator}: {one.error_m} m, {one.status} {one.mark} {one.found}"
         )
     return len(told) >= 0.95 * len(bad) and len(alarms) <= 0.02 * len(sound)
+
+
+def _first_to_tell(run: Ended) -> str:
+    if run.found:
+        return "audit"
+    if run.status != "ok":
+        return "status"
+    return "mark" if run.mark == "overconfident" else "gate"
 
 
 def _percent(part: Sized, whole: Sized) -> str:

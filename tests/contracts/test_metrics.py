@@ -46,6 +46,7 @@ CONTRACT = [
 _BLOCKS = ("variance", "pose", "vel", "bias")
 ADDED = {
     "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"],
+    "nis_mean": ["gate_accepted_percent"],
     "pairs": [
         "efficiency_percent",
         "bound_position_m",

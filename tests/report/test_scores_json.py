@@ -84,6 +84,17 @@ def test_the_verdict_on_the_stated_uncertainty_is_told_with_its_figures(
     )
 
 
+def test_a_gate_that_refuses_much_is_told_with_its_share(comparison: Comparison, rescored: Rescored) -> None:
+    def words(accepted: float) -> list[str]:
+        told = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
+        return [line for line in note_lines(told) if "outlier gate" in line]
+
+    assert words(81.0) == []
+    (line,) = words(55.0)
+    assert "steady 45 %" in line
+    assert "calibration, time stamps or noise" in line
+
+
 def test_a_value_that_is_not_finite_becomes_null_with_a_note(comparison: Comparison, rescored: Rescored) -> None:
     scores = Scores(dict.fromkeys(describe(), float("nan")), {})
     built = metrics_document(rescored(comparison, lambda _: scores))

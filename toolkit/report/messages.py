@@ -9,6 +9,7 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Paired, paired
 from toolkit.experiment.units import OUTPUTS
 from toolkit.metrics import Metric, metrics_called, unavailable
+from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
@@ -140,6 +141,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     for name, why in comparison.white.items():
         yield f"{name} takes the noise of tracks for white: {why}"
     yield from _marks(comparison)
+    yield from _refusals(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -199,6 +201,18 @@ def _marks(comparison: Comparison) -> Iterator[str]:
                 f"{whose} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
                 f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
             )
+
+
+def _refusals(comparison: Comparison) -> Iterator[str]:
+    """Yield a line where outlier gates refused far more than of a consistent estimator's innovations they do."""
+    accepted = {row.estimator: row.value(ACCEPTED) for row in comparison.rows if row.output == "causal"}
+    refused = {name: 100.0 - share for name, share in accepted.items() if share is not None and refuses_much(share)}
+    if refused:
+        told = ", ".join(f"{name} {share:.0f} %" for name, share in refused.items())
+        yield (
+            f"the outlier gate refused much of what it tested ({told}): many mismatches, or a model that does not "
+            "hold, as of calibration, time stamps or noise"
+        )
 
 
 def _figure(value: float) -> str:
