@@ -183,8 +183,11 @@ def _robust(design: Array, observed: Array) -> tuple[Array, Array]:
 
 
 def levelling(up: Array) -> Array:
-    """Return the least rotation (3, 3) that takes a direction (3,) to the z-axis; of straight down a half turn."""
-    up = up / np.linalg.norm(up)
+    """Return the least rotation (3, 3) that takes a direction (3,) to the z-axis; of straight down a half turn.
+
+    No direction at all, as where an accelerometer reads zeros, is left as it is.
+    """
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     half_turn = np.array([np.pi, 0.0, 0.0]) if up[2] < 0.0 else np.zeros(3)

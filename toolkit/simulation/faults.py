@@ -135,6 +135,22 @@ def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence
     return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
 
 
+def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Repeat the last motion sample for so many seconds: a driver that hangs."""
+    begin_s, end_s = _span_s(sequence, dose, seed)
+    t_s, values = _samples_s(sequence), sequence.motion.values.copy()
+    stuck = (t_s > begin_s) & (t_s < end_s)
+    values[stuck] = values[max(int(np.argmax(stuck)) - 1, 0)]
+    return _with_values(sequence, values)
+
+
+def saturated_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Cut the motion samples off at this share of the largest on each axis: a sensor of too small a range."""
+    values = sequence.motion.values
+    largest = dose * np.abs(values).max(axis=0, initial=0.0)
+    return _with_values(sequence, np.clip(values, -largest, largest))
+
+
 def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
     """Give one motion sample the value of the dose on one axis: a flipped bit, a failed parse."""
     rng, values = np.random.default_rng(seed), sequence.motion.values.copy()

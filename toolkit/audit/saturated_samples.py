@@ -1,0 +1,56 @@
+"""An accelerometer or a gyro at the end of its range: what was faster or harder is cut off, and lost.
+
+Cut-off samples pile up at the largest value of an axis, where samples of a sensor in its range grow ever fewer.
+Nothing is repaired, for nobody knows what they were.
+"""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.geometry import Array, BoolArray
+
+# So many samples at the very end of an axis' values, and so many times as many as at the value next to it: a sensor of
+# coarse steps has several at its largest value, too, but more at the one before.
+LEAST_COUNT, LEAST_RATIO = 10, 3.0
+AXES = tuple(f"{sensor} {axis}" for sensor in ("accelerometer", "gyro") for axis in "xyz")
+UNITS = ("m/s^2", "m/s^2", "m/s^2", "rad/s", "rad/s", "rad/s")
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Name the axes whose samples pile up at an end, how many there are, and at which value."""
+    if evidence.sequence.motion_kind != "imu":
+        return None
+    values = evidence.sequence.motion.values
+    told, rows = list[str](), np.zeros(len(values), dtype=bool)
+    for name, unit, column in zip(AXES, UNITS, values.T, strict=True):
+        for sign in (1.0, -1.0):
+            at_end = _piled_up(sign * column)
+            if at_end.any():
+                rows |= at_end
+                told.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
+    if not told:
+        return None
+    return Symptom(
+        count=int(rows.sum()),
+        detail=f"samples pile up at the end of a range: {', '.join(told)}",
+        treatment="what was beyond is lost: use a sensor of a larger range",
+        remedy=None,
+        harmful=False,
+        warns=True,
+    )
+
+
+def _piled_up(column: Array) -> BoolArray:
+    """Say which samples (S,) are at the largest value, if they are too many to be the largest by chance."""
+    distinct, counts = np.unique(column, return_counts=True)
+    if distinct.size < 2 or counts[-1] < max(LEAST_COUNT, LEAST_RATIO * counts[-2]):
+        return np.zeros(column.size, dtype=bool)
+    return np.asarray(column == distinct[-1])
+
+
+FAULT = Fault(
+    "saturated-samples",
+    "an accelerometer or a gyro at the end of its range",
+    check,
+    after=("not-finite", "implausible", "stuck-samples"),
+)

@@ -1,0 +1,66 @@
+"""An accelerometer or a gyro that repeats one value: a driver that hangs, a sensor that is not connected.
+
+Real samples carry noise, and three axes of it are never equal again and again. Odometry may well repeat itself (a wheel
+that stands still gives zeros), so only an IMU is judged.
+"""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.subsets import keep_samples
+from toolkit.geometry import Array, BoolArray
+from toolkit.resampling import NS_PER_S
+
+# So many equal samples in a row, over so long, are no chance, nor a sensor that is read more often than it measures.
+LEAST_RUN, LEAST_S = 10, 0.1
+# Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
+MOST_REPEATED = 0.2
+SENSORS = {"accelerometer": np.s_[:, :3], "gyro": np.s_[:, 3:]}
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Count the samples that repeat the one before in a long run; drop them."""
+    sequence = evidence.sequence
+    if sequence.motion_kind != "imu":
+        return None
+    values, t_ns = sequence.motion.values, sequence.motion.t_ns
+    step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
+    least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
+    repeated = {name: _in_long_runs(values[columns], least) for name, columns in SENSORS.items()}
+    stuck = np.logical_or.reduce(list(repeated.values()))
+    if not stuck.any():
+        return None
+    seconds = {name: float(rows.sum()) * step_s for name, rows in repeated.items()}
+    too_many = stuck.mean() > MOST_REPEATED
+    return Symptom(
+        count=int(stuck.sum()),
+        detail=", ".join(f"the {name} repeats one value for {time:.3g} s" for name, time in seconds.items() if time),
+        treatment=(
+            "too much to be bridged: look at the driver and the cables"
+            if too_many
+            else "repeated samples are dropped; the others bridge the gap"
+        ),
+        remedy=None if too_many else keep_samples(sequence, ~stuck),
+        spoils_vision=bool(too_many),
+    )
+
+
+def _in_long_runs(values: Array, least: int) -> BoolArray:
+    """Say which samples (S, 3) repeat the one before, within a run of at least so many equal ones."""
+    if not len(values):
+        return np.zeros(0, dtype=bool)
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    begins = np.flatnonzero(~same)
+    lengths = np.diff(np.append(begins, same.size))
+    long = np.repeat(lengths >= least, lengths)
+    # Outside such runs, too, neighbours are equal more often than not: the sensor is coarse and not stuck.
+    is_coarse = (~long).any() and same[~long].mean() > 0.5
+    return np.asarray(same & long & ~is_coarse)
+
+
+FAULT = Fault(
+    "stuck-samples",
+    "an accelerometer or a gyro that repeats one value",
+    check,
+    after=("not-finite", "time-order"),
+)
