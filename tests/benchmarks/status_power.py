@@ -250,6 +250,8 @@ def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> E
 
 def _accepted(run: Run, prepared: Prepared) -> float | None:
     """Return how much of what it tested the gate of a run accepted (percent), None where it has no gate."""
+    if run.causal is None:
+        return None
     return score_run(run, "causal", prepared.sequence).values.get(ACCEPTED)
 
 
