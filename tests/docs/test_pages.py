@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+import toolkit
+from toolkit.audit import audit
 from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
@@ -27,8 +29,13 @@ from toolkit.metrics import score_run
 from toolkit.report.records import read_metrics
 
 PROJECT = Path(__file__).parents[2]
-README, EXTENDING = PROJECT / "README.md", PROJECT / "docs/extending.md"
-PAGES = (README, *sorted((PROJECT / "docs").glob("*.md")), PROJECT / "data/README.md")
+README, EXTENDING, COURSE = PROJECT / "README.md", PROJECT / "docs/extending.md", PROJECT / "docs/course.md"
+PAGES = (
+    README,
+    *sorted((PROJECT / "docs").glob("*.md")),
+    PROJECT / "data/README.md",
+    PROJECT / ".github/CONTRIBUTING.md",
+)
 
 _FENCE = re.compile(r"^```(?P<language>\w*)(?: title=\"(?P<title>[^\"]+)\")?\n(?P<text>.*?)^```$", re.M | re.S)
 
@@ -205,7 +212,7 @@ by_page = pytest.mark.parametrize("page", PAGES, ids=_name)
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if _steps(page) and page not in (README, EXTENDING)], ids=_name
+    "page", [page for page in PAGES if _steps(page) and page not in (README, EXTENDING, COURSE)], ids=_name
 )
 def test_everything_a_page_shows_runs_and_prints_the_tables_shown(page: Path, alone: Path) -> None:
     write_files(page, alone)
@@ -224,6 +231,34 @@ def test_everything_the_readme_shows_runs_and_prints_the_tables_shown(
 
 def test_everything_the_page_on_extending_shows_runs_and_prints_the_tables_shown(extended: Extended) -> None:
     assert_tables_are_those_shown(EXTENDING, dict(zip(_steps(EXTENDING), extended.by_page, strict=True)))
+
+
+def test_everything_the_page_for_the_course_shows_runs_and_prints_what_is_shown(
+    real: Callable[[str], Path], alone: Path
+) -> None:
+    (alone / "03.npz").symlink_to(real("ucsd/03.npz").resolve())
+    steps = _steps(COURSE)
+    printed = dict(zip(steps, carry_out(steps), strict=True))
+    assert_tables_are_those_shown(COURSE, printed)
+    program, shown = next(pair for pair in pairwise(blocks(COURSE)) if pair[0].language == "python")
+    words, fresh = shown.text.split(), printed[program].split()
+    assert len(words) == len(fresh)
+    for word, now in zip(words, fresh, strict=True):
+        if re.match(r"-?\d", word):
+            # Metres, after 1.3 km; other versions of the libraries round another way.
+            assert float(word.strip(",")) == pytest.approx(float(now.strip(",")), abs=2.0), shown.text
+        else:
+            assert word == now
+
+
+def test_the_page_for_the_course_says_of_dataset_10_what_its_velocities_say(real: Callable[[str], Path]) -> None:
+    page = " ".join(COURSE.read_text(encoding="utf-8").split())
+    sequence = load_sequence(str(real("ucsd/10_imu_only.npz")))
+    (bias,) = [finding.detail for finding in audit(sequence).findings if finding.fault == "gyro-bias"]
+    (standing,) = re.findall(r"(\d+) samples at standstill", bias)
+    assert f"stands still in {standing} of {sequence.frame_count} samples" in page
+    run = toolkit.compare(sequence, ["dead-reckoning"]).runs["dead-reckoning"]
+    assert f"ends {run.final.positions[-1, 2]:.0f} m above its start" in page
 
 
 def test_on_the_first_lines_drive_the_decoupled_filter_is_marked_and_the_others_are_not(
@@ -264,6 +299,9 @@ def assert_tables_are_those_shown(page: Path, printed: Mapping[str | Block, str]
 
 
 def _assert_tables_agree(shown: str, printed: str) -> None:
+    if shown.startswith("$ vislam check-data"):
+        lines = {line for line in shown.splitlines()[1:] if line != "..."}
+        assert lines <= {*printed.splitlines()}
     there = _rows(printed)
     for row, cells in _rows(shown).items():
         for cell, fresh in zip(cells[:-2], there[row][:-2], strict=True):  # the last two are times of a machine

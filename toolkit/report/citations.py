@@ -22,6 +22,7 @@ from toolkit.report.run_directory import MANIFEST
 _ENTRY = re.compile(r"^@\w+\{\s*([^,\s]+)\s*,.*?^\}", re.MULTILINE | re.DOTALL)
 _SOFTWARE = """@software{{vislam_toolkit,
   title = {{{{vislam-toolkit}}: filters and smoothers for stereo visual-inertial odometry on the same measurements}},
+  author = {{{{The vislam-toolkit developers}}}},
   version = {{{version}}}
 }}"""
 
