@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from toolkit.datasets.own_tables import save
     from toolkit.settings import Settings
 
+    __version__: str
+
 __all__ = ["Result", "Settings", "compare", "load_sequence", "save"]
 
 _HOME = {
@@ -25,6 +27,10 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("vislam-toolkit")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

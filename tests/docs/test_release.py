@@ -7,7 +7,11 @@ import tomllib
 from pathlib import Path
 
 import jsonschema
+import pytest
 import yaml
+
+import toolkit
+from toolkit.cli import main
 
 PROJECT = Path(__file__).parents[2]
 DOCS = PROJECT / "docs"
@@ -71,6 +75,13 @@ def test_the_changes_begin_with_what_is_not_released_and_then_this_version() -> 
     kinds = set(re.findall(r"^### (.+)$", changes, flags=re.M))
     assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}  # those of Keep a Changelog
     datetime.date.fromisoformat(_released()[1])
+
+
+def test_the_installed_toolkit_says_the_same_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert toolkit.__version__ == VERSION, "pip install -e . again"
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"vislam {VERSION}\n"
 
 
 def test_the_citation_is_of_the_format_and_of_the_version_released_last() -> None:
