@@ -10,6 +10,7 @@ from toolkit.geometry import Array, IntArray, read_only
 
 Status = Literal["ok", "diverged", "failed"]
 Output = Literal["causal", "final"]
+Arithmetic = Literal["compiled", "numpy"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +143,7 @@ class Run:
     ``causal`` is what was known at each frame and is None for an estimator that answers only at the end.
     ``timings`` is None for another system's run, read from a file and not made here.
     ``info`` holds the diagnostics of the causal estimates by name, each (N,), NaN where one was not given.
+    ``arithmetic`` says what computed where an estimator has both, compiled code or NumPy.
     """
 
     estimator: str
@@ -152,6 +154,7 @@ class Run:
     timings: Timings | None
     info: Mapping[str, Array] = field(default_factory=dict)
     log: tuple[str, ...] = ()
+    arithmetic: Arithmetic | None = None
 
     def trajectory(self, output: Output) -> Trajectory | None:
         """Return the trajectory of one kind of output."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, cast
 
+from toolkit.compilation import Compilation, check_possible
 from toolkit.discovery import FoundModule, MissingDependency, announced
 from toolkit.errors import EstimatorError, no_such
 from toolkit.estimate import Estimate, Finished
@@ -32,7 +33,8 @@ LADDER = "ladder"
 class Setup:
     """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
 
-    ``options`` are the settings of this estimator alone, by name; ``progress`` hears of a long ``finish``.
+    ``options`` are the settings of this estimator alone, by name; ``progress`` hears of a long ``finish``;
+    ``compilation`` gives what is compiled.
     """
 
     rig: StereoRig
@@ -43,6 +45,7 @@ class Setup:
     settings: Settings = DEFAULTS
     options: Mapping[str, Scalar] = field(default_factory=dict)
     progress: Progress = SILENT
+    compilation: Compilation = field(default_factory=Compilation)
 
 
 class Estimator(Protocol):
@@ -94,7 +97,11 @@ class EstimatorEntry:
         return {str(k): str(v) for k, v in ignores.items()} if isinstance(ignores, dict) else {}
 
     def check_usable(self, settings: Settings) -> None:
-        """Raise EstimatorError unless the estimator can be imported and reads every option set for it."""
+        """Raise EstimatorError unless the estimator can be imported and reads every option set for it.
+
+        So it does where compiled arithmetic is asked for and there is nothing to compile with.
+        """
+        check_possible(settings.arithmetic)
         self.load()
         for option in settings.options_of(self.name):
             if option not in self.options():

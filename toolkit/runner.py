@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
@@ -41,6 +42,12 @@ class _Clock:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
         self.steps: list[float] = []
         self.finish_s = 0.0
+
+    def leave_out(self, compilation: Compilation) -> None:
+        """Count neither the time nor the memory of what a process imports and compiles once."""
+        if compilation.ran == "compiled":
+            self._wall, self._cpu = self._wall + compilation.wall_s, self._cpu + compilation.cpu_s
+            _count_memory_anew()
 
     def timings(self) -> Timings:
         total_s, cpu_s = time.perf_counter() - self._wall, time.process_time() - self._cpu
@@ -85,6 +92,7 @@ def run(
 
 def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Progress, settings: Settings) -> Run:
     packets = list(sequence.packets())
+    compilation = Compilation(settings.arithmetic)
     setup = Setup(
         sequence.rig,
         sequence.noise,
@@ -94,10 +102,12 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         settings,
         settings.options_of(name),
         progress,
+        compilation,
     )
     clock, said = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)
+        clock.leave_out(compilation)
         for packet in packets:
             estimate = _timed_step(estimator, packet, clock)
             if estimate is not None:
@@ -109,8 +119,9 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
     except (DataError, KeyboardInterrupt, MemoryError):
         raise
     except Exception as error:
-        return _failed(name, said, clock.timings(), error)
-    return _judged(name, said, finished, clock.timings(), sequence)
+        return replace(_failed(name, said, clock.timings(), error), arithmetic=compilation.ran)
+    run = _judged(name, said, finished, clock.timings(), sequence)
+    return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)
 
 
 def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate | None:

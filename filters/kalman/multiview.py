@@ -13,7 +13,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.models import correlated_noise, stereo
 from toolkit.sequence import StereoRig
 
-_REFINEMENTS = 3
+REFINEMENTS = 3
 
 
 class TrackSightings(NamedTuple):
@@ -106,7 +106,7 @@ def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoR
     Gauss-Newton, each step no longer than a fifth of the way to the newest pose that saw the point.
     """
     count, window = sightings.seen.shape
-    for _ in range(_REFINEMENTS):
+    for _ in range(REFINEMENTS):
         here = decorrelated(linearise(sightings, points, poses, poses, rig), sightings, rig)
         assert here.decorrelation is not None
         H = here.decorrelation @ here.H_point.reshape(count, 3 * window, 3)

@@ -18,9 +18,9 @@ from filters.kalman.erring_landmarks import ErringBelief
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.multiview import Constraints, TrackSightings
+from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from filters.kalman.track_gate import TrackGate
+from filters.kalman.track_gate import TrackGate, track_test
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -47,6 +47,7 @@ class SlidingWindowFilter:
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
         self._tracks = WindowTracks()
+        self._track_test = track_test(setup.compilation)
         self._memory = LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:
@@ -96,17 +97,23 @@ class SlidingWindowFilter:
         """Correct the window by tracks; add as many of those still seen as landmarks as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        accepted = TrackGate(joint, self._at, self._rig).accepted(sightings, gate)
+        track_gate = TrackGate(joint, self._at, self._rig, self._track_test)
+        accepted = track_gate.accepted(sightings, gate)
         if not len(accepted.points):
             return
         self._memory.remember(accepted.sightings.track_ids, accepted.points)
-        kept = accepted.select(np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room])
-        if len(kept.points) and isinstance(joint, ErringBelief):
-            erring_landmarks.add_tracks(joint, kept.sightings, kept.points, kept.linearised)
-        elif len(kept.points):
-            joint_landmarks.add_tracks(joint, kept.sightings.track_ids, kept.points, kept.linearised)
-        H, residuals = multiview.compressed(*_stacked(accepted.constraints))
-        joint.update(H, residuals, joint.clone_columns)
+        kept = np.flatnonzero(accepted.sightings.seen[:, -1])[: self._room]
+        if len(kept):
+            self._add_landmarks(
+                accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
+            )
+        joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
+
+    def _add_landmarks(self, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
+        if isinstance(self._joint, ErringBelief):
+            erring_landmarks.add_tracks(self._joint, sightings, points, linearised)
+        else:
+            joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, linearised)
 
     def _forget_clones(self, which: BoolArray) -> None:
         if which.any():
@@ -169,10 +176,3 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of the state's landmarks."""
     return frame.select(~np.isin(frame.track_ids, joint.landmark_ids))
-
-
-def _stacked(constraints: Constraints) -> tuple[Array, Array]:
-    """Return the rows of all tracks under each other, without those that are padding."""
-    H = constraints.H.reshape(-1, constraints.H.shape[2])
-    used = H.any(axis=1)
-    return H[used], constraints.residuals.reshape(-1)[used]

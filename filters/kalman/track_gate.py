@@ -6,7 +6,9 @@ window is left out, and the track is tested once more if two sightings remain. O
 track with bad luck: to leave out its worst sighting would choose the measurements by their agreement.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -16,44 +18,133 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
+from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
+from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, chi2_bound, mahalanobis_squared
 from toolkit.sequence import StereoRig
 
 
-class AcceptedTracks(NamedTuple):
-    """F tracks that passed: the sightings that count, points (F, 3), and their constraints on the window."""
+class Window(NamedTuple):
+    """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the covariance (6 W, 6 W) of all."""
+
+    poses: Array
+    poses_at: Array
+    cov: Array
+
+
+class TestedTracks(NamedTuple):
+    """F tracks with a landmark (F, 3) each: the NIS (F,) of what they constrain the window by, and those constraints.
+
+    ``worst`` (F,) is the sighting that disagrees most where the NIS is far above its bound, else -1. Of the tracks
+    below their bounds the whitened constraints stand under each other: ``H`` (n, 6 W), ``residuals`` (n,), and whose
+    each is, ``track`` (n,).
+    """
 
     sightings: TrackSightings
     points: Array
-    linearised: Linearised
-    constraints: Constraints
+    nis: Array
+    worst: IntArray
+    H: Array
+    residuals: Array
+    track: IntArray
 
-    def select(self, rows: BoolArray | IntArray) -> "AcceptedTracks":
-        """Return some of the tracks."""
-        linearised, constraints = self.linearised.select(rows), self.constraints.select(rows)
-        return AcceptedTracks(self.sightings.select(rows), self.points[rows], linearised, constraints)
 
-    def weighed(self, weights: Array) -> "AcceptedTracks":
-        """Return the tracks as if their noise were larger, each by its weight (F,)."""
-        roots = np.sqrt(weights)
-        return self._replace(linearised=self.linearised.scaled(roots), constraints=self.constraints.scaled(roots))
+# Tests tracks against a window; the bounds (3 W - 2,) are those of the NIS by degrees of freedom.
+TrackTest = Callable[[TrackSightings, Window, StereoRig, Array], TestedTracks]
+
+
+class AcceptedTracks(NamedTuple):
+    """F tracks that passed: the sightings that count, points (F, 3), weights (F,), and their constraints.
+
+    The constraints on the W poses are whitened, weighed and stand under each other: H (n, 6 W), residuals (n,).
+    """
+
+    sightings: TrackSightings
+    points: Array
+    weights: Array
+    H: Array
+    residuals: Array
 
     def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
         """Return both together."""
-        return AcceptedTracks(
-            self.sightings.joined(other.sightings),
-            np.concatenate([self.points, other.points]),
-            self.linearised.joined(other.linearised),
-            self.constraints.joined(other.constraints),
-        )
+        pairs = zip(self[1:], other[1:], strict=True)
+        return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
+
+
+def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
+    """Triangulate tracks, free them of their landmarks and test them: the definition, in NumPy, all tracks at once."""
+    poses, P = window.poses, window.cov
+    points, reliable = triangulate(sightings.uvs_px, sightings.seen, poses, rig)
+    sightings, points = sightings.select(reliable), points[reliable]
+    if rig.track_noise is not None:
+        points = multiview.refined(sightings, points, poses, rig)
+    linearised = _linearised(sightings, points, window, rig)
+    constraints = multiview.without_landmark(linearised, sightings.seen)
+    covs = innovation_covs(constraints, P)
+    nis = mahalanobis_squared(constraints.residuals, covs)
+    bound = bounds[constraints.dof]
+    worst = np.full(len(nis), -1)
+    far = np.asarray(nis > MISMATCHED_TRACK_FACTOR * bound)
+    if far.any():
+        basis, residuals = multiview.null_space(linearised.select(far)), constraints.residuals[far]
+        worst[far] = _worst_sighting(basis, residuals, covs[far], sightings.seen[far])
+    below = np.flatnonzero(nis < bound)
+    H = constraints.H[below].reshape(-1, P.shape[0])
+    used = H.any(axis=1)
+    owner = np.repeat(below, constraints.H.shape[1])
+    return TestedTracks(
+        sightings, points, nis, worst, H[used], constraints.residuals[below].reshape(-1)[used], owner[used]
+    )
+
+
+def _linearised(sightings: TrackSightings, points: Array, window: Window, rig: StereoRig) -> Linearised:
+    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig)
+    return multiview.decorrelated(linearised, sightings, rig)
+
+
+def innovation_covs(constraints: Constraints, P: Array) -> Array:
+    """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals, that of the window being P (6 W, 6 W)."""
+    covs = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
+    variances = np.einsum("fii->fi", covs)
+    variances += 1.0
+    return np.asarray(covs)
+
+
+def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray) -> IntArray:
+    """Return the sighting (F,) of each track without which its NIS would be least.
+
+    ``basis`` (F, 3W - 3, 3W) made its residuals (F, 3W - 3) of those of its sightings (F, W); ``covs`` (F, 3W - 3,
+    3W - 3) are theirs. Leaving out a sighting is letting it be anything: with ``W`` the precision of all coordinates
+    and ``r`` their residuals, the NIS falls by ``(W r)_j^T W_jj^-1 (W r)_j``.
+    """
+    count, window = seen.shape
+    informed = np.linalg.solve(covs, np.concatenate([basis, residuals[..., None]], axis=2))
+    weighted = (np.swapaxes(basis, 1, 2) @ informed[..., -1:]).reshape(count, window, 3)
+    own = np.swapaxes(multiview.by_pose(basis), 2, 3) @ multiview.by_pose(informed[..., :-1])
+    own = np.where(seen[..., None, None], own, np.eye(3))
+    fall = (weighted * np.linalg.solve(own + 1e-12 * np.eye(3), weighted[..., None])[..., 0]).sum(axis=2)
+    return np.asarray(np.argmax(np.where(seen, fall, -1.0), axis=1))
+
+
+def track_test(compilation: Compilation) -> TrackTest:
+    """Return what is to test tracks: compiled where that is asked for and possible, else the definition."""
+    compiled = compilation.module("filters.kalman.compiled_gate")
+    return tested if compiled is None else cast(TrackTest, compiled.tested)
+
+
+@lru_cache(maxsize=64)
+def _bounds(probability: float | None, most: int) -> Array:
+    """Return the NIS (most + 1,) that is just accepted at 0, 1 ... degrees of freedom."""
+    return chi2_bound(np.arange(most + 1), probability)
 
 
 class TrackGate:
-    """Tests tracks against a joint belief."""
+    """Tests tracks against a joint belief, by NumPy or by what computes the same."""
 
-    def __init__(self, joint: JointBelief, at: Linearisation, rig: StereoRig) -> None:
-        self._joint, self._at, self._rig = joint, at, rig
+    def __init__(self, joint: JointBelief, at: Linearisation, rig: StereoRig, test: TrackTest = tested) -> None:
+        self._rig, self._test = rig, test
+        columns = joint.clone_columns
+        self._window = Window(joint.clones, at.clones(joint), joint.cov[columns, columns])
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
         """Return the tracks that pass, some of them without one of their sightings.
@@ -64,50 +155,27 @@ class TrackGate:
         again = mismatched.select(mismatched.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
         return accepted.joined(self._tested(again, gate)[0]) if len(again.track_ids) else accepted
 
+    def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
+        """Return some of the accepted tracks linearised, landmarks included, with their weights."""
+        linearised = _linearised(tracks.sightings.select(rows), tracks.points[rows], self._window, self._rig)
+        return linearised.scaled(np.sqrt(tracks.weights[rows]))
+
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
         """Return the tracks that pass as they are, and those that fail by far less their worst sighting."""
-        joint = self._joint
-        points, reliable = triangulate(sightings.uvs_px, sightings.seen, joint.clones, self._rig)
-        sightings, points = sightings.select(reliable), points[reliable]
-        if self._rig.track_noise is not None:
-            points = multiview.refined(sightings, points, joint.clones, self._rig)
-        linearised = multiview.linearise(sightings, points, joint.clones, self._at.clones(joint), self._rig)
-        linearised = multiview.decorrelated(linearised, sightings, self._rig)
-        constraints = multiview.without_landmark(linearised, sightings.seen)
-        covs = self._covs(constraints)
-        nis = mahalanobis_squared(constraints.residuals, covs)
-        accepted = gate.accepts(nis, constraints.dof)
-        weights = gate.weights(nis, constraints.dof, accepted)
-        tracks = AcceptedTracks(sightings, points, linearised, constraints)
-        mismatched = np.asarray(nis > MISMATCHED_TRACK_FACTOR * gate.bound(constraints.dof))
-        seen = sightings.seen[mismatched]
-        if len(seen):
-            worst = _worst_sighting(tracks.select(mismatched), covs[mismatched])
-            seen[np.arange(len(worst)), worst] = False
-        return tracks.select(accepted).weighed(weights[accepted]), sightings.select(mismatched)._replace(seen=seen)
-
-    def _covs(self, constraints: Constraints) -> Array:
-        """Return the covariance (F, 3W - 3, 3W - 3) of each track's residuals."""
-        P = self._joint.cov[self._joint.clone_columns, self._joint.clone_columns]
-        covs = constraints.H @ P @ np.swapaxes(constraints.H, 1, 2)
-        variances = np.einsum("fii->fi", covs)
-        variances += 1.0
-        return np.asarray(covs)
-
-
-def _worst_sighting(tracks: AcceptedTracks, covs: Array) -> IntArray:
-    """Return the sighting (F,) of each track without which its NIS would be least.
-
-    ``covs`` (F, 3W - 3, 3W - 3) are those of the tracks' residuals. Leaving out a sighting is letting it be anything:
-    with ``W`` the precision of all coordinates and ``r`` their residuals, the NIS falls by
-    ``(W r)_j^T W_jj^-1 (W r)_j``.
-    """
-    seen = tracks.sightings.seen
-    count, window = seen.shape
-    basis = multiview.null_space(tracks.linearised)
-    informed = np.linalg.solve(covs, np.concatenate([basis, tracks.constraints.residuals[..., None]], axis=2))
-    weighted = (np.swapaxes(basis, 1, 2) @ informed[..., -1:]).reshape(count, window, 3)
-    own = np.swapaxes(multiview.by_pose(basis), 2, 3) @ multiview.by_pose(informed[..., :-1])
-    own = np.where(seen[..., None, None], own, np.eye(3))
-    fall = (weighted * np.linalg.solve(own + 1e-12 * np.eye(3), weighted[..., None])[..., 0]).sum(axis=2)
-    return np.asarray(np.argmax(np.where(seen, fall, -1.0), axis=1))
+        bounds = _bounds(gate.probability, 3 * sightings.seen.shape[1])
+        tracks = self._test(sightings, self._window, self._rig, bounds)
+        dof = 3 * tracks.sightings.seen.sum(axis=1) - 3
+        accepted = gate.accepts(tracks.nis, dof)
+        weights = gate.weights(tracks.nis, dof, accepted)
+        roots = np.sqrt(weights)[tracks.track]
+        passed = AcceptedTracks(
+            tracks.sightings.select(accepted),
+            tracks.points[accepted],
+            weights[accepted],
+            roots[:, None] * tracks.H,
+            roots * tracks.residuals,
+        )
+        mismatched = tracks.worst >= 0
+        less = tracks.sightings.select(mismatched)
+        less.seen[np.arange(len(less.seen)), tracks.worst[mismatched]] = False
+        return passed, less

@@ -13,9 +13,11 @@ from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.sequence import StereoRig
 
-_ITERATIONS, _FIRST_DAMPING = 6, 1e-3
+ITERATIONS, FIRST_DAMPING = 6, 1e-3
 # A track's residuals are freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
-_RELATIVE_DECREASE = 1e-4
+RELATIVE_DECREASE = 1e-4
+# A step that changes the error by rounding alone is taken, lest rounding should choose between the points.
+ROUNDING = 1e-12
 
 
 class _Views(NamedTuple):
@@ -52,12 +54,12 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
         return np.empty((0, 3)), np.empty(0, dtype=bool)
     start, wide = _nearest(uvs_px, seen, poses, rig)
     views = _views(uvs_px, seen, poses, rig)
-    fit, damping = _fit(start, views, rig), np.full(len(start), _FIRST_DAMPING)
-    for _ in range(_ITERATIONS):
+    fit, damping = _fit(start, views, rig), np.full(len(start), FIRST_DAMPING)
+    for _ in range(ITERATIONS):
         damped = fit.hessian + (damping[:, None, None] * fit.hessian + 1e-12) * np.eye(3)
         tried = _fit(fit.points + np.linalg.solve(damped, fit.gradient[..., None])[..., 0], views, rig)
-        better = tried.cost < fit.cost
-        unsettled = tried.cost < (1.0 - _RELATIVE_DECREASE) * fit.cost
+        better = tried.cost < (1.0 + ROUNDING) * fit.cost
+        unsettled = tried.cost < (1.0 - RELATIVE_DECREASE) * fit.cost
         fit = _chosen(better, tried, fit)
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if not unsettled.any():

@@ -225,6 +225,11 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
         help="how far back windowed filters and smoothers reach alike",
     )
     parser.add_argument(
+        "--no-fast",
+        action="store_true",
+        help="NumPy throughout, where the extra 'fast' would have the windowed filters run compiled code",
+    )
+    parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
         action="append",
@@ -234,8 +239,9 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def assignments_asked(options: argparse.Namespace) -> list[str]:
-    """Return what --outliers, --window and --set say, in that order, as assignments."""
-    named = {"outliers.policy": options.outliers, "window.lag_s": options.window}
+    """Return what --outliers, --window, --no-fast and --set say, in that order, as assignments."""
+    arithmetic = "numpy" if options.no_fast else None
+    named = {"outliers.policy": options.outliers, "window.lag_s": options.window, "arithmetic": arithmetic}
     return [*(f"{key}={value}" for key, value in named.items() if value is not None), *options.set]
 
 

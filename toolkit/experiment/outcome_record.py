@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from toolkit.estimate import Output, Status
+from toolkit.estimate import Arithmetic, Output, Status
 from toolkit.experiment.units import Outcome, Scored
 from toolkit.geometry import Array
 from toolkit.metrics import Scores, repeated, without_requests
@@ -55,6 +55,7 @@ class OutcomeRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="
     outputs: dict[Output, ScoredRecord]
     files: Annotated[dict[str, str], Meta(description="SHA-256 of its trajectories by their relative paths")]
     log: tuple[str, ...]
+    arithmetic: Annotated[Arithmetic | None, Meta(description="of an estimator that has both")] = None
 
 
 class FilesRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome-files/1"):
@@ -75,6 +76,7 @@ def record_of(outcome: Outcome, unit: UnitKey, requested: tuple[str, ...], files
         outputs={k: _scored_record(v) for k, v in outcome.outputs.items() if not (repeats and k == "final")},
         files=files,
         log=outcome.log,
+        arithmetic=outcome.arithmetic,
     )
 
 
@@ -94,6 +96,7 @@ def outcome_of_record(record: OutcomeRecord, requested: tuple[str, ...]) -> Outc
         sequence_hash=record.sequence_hash,
         final_is_causal=record.final_is_causal,
         files=record.files,
+        arithmetic=record.arithmetic,
     )
 
 

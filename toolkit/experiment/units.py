@@ -7,7 +7,7 @@ import numpy as np
 
 from toolkit import runner
 from toolkit.datasets.trajectories import tum
-from toolkit.estimate import Output, Run, Status
+from toolkit.estimate import Arithmetic, Output, Run, Status
 from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
@@ -58,6 +58,7 @@ class Outcome:
     ``sequence_hash`` is that of the recording it read; ``run`` is there where it was asked for. ``final_is_causal``
     tells that the final output only repeats the causal one, as a filter's does. ``tum`` has, where they are to be kept,
     the trajectories as texts; once they are written ``files`` has the SHA-256 of each by its path in the run directory.
+    ``arithmetic`` is the run's.
     """
 
     seed: int
@@ -70,6 +71,7 @@ class Outcome:
     run: Run | None = None
     tum: Mapping[Output, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    arithmetic: Arithmetic | None = None
 
 
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
@@ -115,7 +117,17 @@ def outcome_of(run: Run, sequence: Sequence, seed: int, requested: tuple[str, ..
         outputs: dict[Output, Scored] = {"causal": causal, "final": replace(causal, scores=repeated(causal.scores))}
     else:
         outputs = {output: _scored(run, output, sequence, requested) for output in given}
-    return Outcome(seed, run.estimator, run.status, outputs, run.log, sequence.content_hash(), run.final_is_causal, run)
+    return Outcome(
+        seed,
+        run.estimator,
+        run.status,
+        outputs,
+        run.log,
+        sequence.content_hash(),
+        run.final_is_causal,
+        run,
+        arithmetic=run.arithmetic,
+    )
 
 
 def _scored(run: Run, output: Output, sequence: Sequence, requested: tuple[str, ...]) -> Scored:

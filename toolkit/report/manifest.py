@@ -5,6 +5,7 @@ import platform
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from msgspec import UNSET
@@ -39,6 +40,7 @@ def manifest_document(comparison: Comparison, command: str, asked: Configuration
         references=tuple(name for name in comparison.estimators if name not in here),
         seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),
         threads=_threads(comparison),
+        arithmetic=_arithmetic(comparison),
         cpu=cpu_model(),
         os=platform.platform(),
     )
@@ -48,6 +50,16 @@ def _run_here(comparison: Comparison) -> tuple[str, ...]:
     """Return the estimators that were run here, and not read from files."""
     others = {run.estimator for run in comparison.runs if run.timings is None}
     return tuple(name for name in comparison.estimators if name not in others)
+
+
+def _arithmetic(comparison: Comparison) -> dict[str, Literal["compiled", "numpy", "both"]]:
+    """Return by estimator what computed, of those that have compiled code."""
+    ran: dict[str, Literal["compiled", "numpy", "both"]] = {}
+    for outcome in comparison.outcomes:
+        if outcome.arithmetic is not None:
+            before = ran.get(outcome.estimator, outcome.arithmetic)
+            ran[outcome.estimator] = outcome.arithmetic if before == outcome.arithmetic else "both"
+    return ran
 
 
 def _threads(comparison: Comparison) -> dict[str, int | str | None]:

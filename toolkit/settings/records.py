@@ -12,6 +12,7 @@ _NS_PER_S = 1_000_000_000
 Probability = Annotated[float, Meta(gt=0.0, lt=1.0)]
 Tracks = Literal["auto", "images", "simulated"]
 Varied = Literal["noise", "world"]
+Arithmetic = Literal["auto", "compiled", "numpy"]
 TrackModel = Literal["white", "correlated", "fitted"]
 Scalar = bool | int | float | str
 
@@ -242,6 +243,10 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     card: Annotated[
         bool, Meta(description="in the report, what the recording's tracks are like; takes some seconds")
     ] = False
+    arithmetic: Annotated[
+        Arithmetic,
+        Meta(description="of the windowed filters' track gate: auto is compiled where the extra fast is installed"),
+    ] = "auto"
     first_seed: Annotated[int, Meta(ge=0, description="seed of simulated sequences, the first of several")] = 0
     seeds: Annotated[
         int, Meta(ge=1, le=100_000, description="how many seeds a simulated sequence is repeated over")

@@ -47,6 +47,13 @@ class Manifest(Struct, frozen=True, kw_only=True):
         dict[str, int | str | None],
         Meta(description="processors, and the limits of threads: variables, or over seeds workers and threads of each"),
     ]
+    arithmetic: (
+        Annotated[
+            dict[str, Literal["compiled", "numpy", "both"]],
+            Meta(description="that ran, by estimator, of those that have compiled code; both only over seeds"),
+        ]
+        | UnsetType
+    ) = UNSET
     cpu: str
     os: str
     files: (

@@ -1,0 +1,109 @@
+"""The compiled test of tracks computes what NumPy's does: NumPy is the definition."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman import track_gate
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
+from filters.kalman.multiview import TrackSightings
+from filters.kalman.track_gate import Window
+from toolkit.compilation import Compilation
+from toolkit.models import stereo
+from toolkit.models.gating import chi2_bound
+from toolkit.models.motion import motion_model
+from toolkit.simulation import FLIGHT, simulate
+from toolkit.track_noise import TrackNoise
+
+WINDOW, TRACKS = 9, 40
+# Both round at 1e-16 of terms that cancel by up to a million, the carried covariance against the noise of a pixel.
+TOLERANCE = 1e-9
+CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0.0, 0.7, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
+    from filters.kalman import compiled_gate
+
+    return compiled_gate.tested
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """A window of a flight, corrected once so that first and latest estimates differ."""
+    sequence = simulate(replace(FLIGHT, duration_s=1.0), 2)
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    joint = JointBelief(model.initial_belief(sequence.prior))
+    for packet in list(sequence.packets())[:WINDOW]:
+        propagate(joint, model, AtLatestEstimates(), packet.motion)
+        joint.clone(packet.index)
+    clones = joint.clone_columns
+    joint.update(np.eye(6, 6 * WINDOW, 6 * WINDOW - 6) * 40.0, np.full(6, 0.3), clones)
+    return sequence.rig, Window(joint.clones, AtFirstEstimates().clones(joint), joint.cov[clones, clones])
+
+
+def sightings_in(rig, window: Window) -> TrackSightings:
+    """Return tracks of all lengths and with gaps; some mismatched, one behind the camera, one too far."""
+    rng = np.random.default_rng(5)
+    rays = np.stack([rng.uniform(-0.6, 0.6, TRACKS), rng.uniform(-0.4, 0.4, TRACKS), np.ones(TRACKS)], axis=1)
+    in_imu = (rays * rng.uniform(3.0, 20.0, TRACKS)[:, None]) @ rig.T_imu_cam[:3, :3].T + rig.T_imu_cam[:3, 3]
+    points = in_imu @ window.poses[-1, :3, :3].T + window.poses[-1, :3, 3]
+    uvs_px = np.stack([stereo.predict(points, T, rig).uv_px for T in window.poses], axis=1)
+    uvs_px += rng.normal(size=uvs_px.shape) @ np.linalg.cholesky(rig.cov_uv_px2).T
+    uvs_px[:6, 4] += [25.0, 20.0, -30.0]
+    uvs_px[6, :, 1] = uvs_px[6, :, 0] - 0.2
+    uvs_px[7, :, :2] = uvs_px[7, :, 1::-1]
+    seen = rng.random((TRACKS, WINDOW)) < rng.uniform(0.3, 1.0, TRACKS)[:, None]
+    seen[:, 4:6] = True
+    return TrackSightings(np.arange(TRACKS), uvs_px, seen, np.tile(np.arange(3, 3 + WINDOW), (TRACKS, 1)))
+
+
+@pytest.mark.parametrize("noise", [None, CORRELATED], ids=["white", "correlated"])
+def test_compiled_and_numpy_test_tracks_alike(compiled, flight, noise):
+    """Of rows in two bases of the same space those products are alike that any basis gives."""
+    rig, window = replace(flight[0], track_noise=noise), flight[1]
+    arguments = sightings_in(rig, window), window, rig, chi2_bound(np.arange(3 * WINDOW + 1), 0.95)
+    ours, theirs = track_gate.tested(*arguments), compiled(*arguments)
+    assert ours.sightings.track_ids.tolist() == theirs.sightings.track_ids.tolist()
+    assert ours.points == pytest.approx(theirs.points, rel=TOLERANCE)
+    assert ours.nis == pytest.approx(theirs.nis, rel=TOLERANCE)
+    longer = ours.sightings.seen.sum(axis=1) > 2  # of two sightings one is as bad as the other
+    assert ours.worst[longer].tolist() == theirs.worst[longer].tolist()
+    assert (ours.worst >= 0).tolist() == (theirs.worst >= 0).tolist()
+    assert (ours.worst >= 0).any()
+    assert len(ours.track) > 100
+    assert set(ours.track) == set(theirs.track)
+    for track in set(ours.track):
+        a, b = ours.H[ours.track == track], theirs.H[theirs.track == track]
+        r, s = ours.residuals[ours.track == track], theirs.residuals[theirs.track == track]
+        assert a.T @ a == pytest.approx(b.T @ b, abs=TOLERANCE * np.abs(a.T @ a).max())
+        assert a.T @ r == pytest.approx(b.T @ s, abs=TOLERANCE * np.abs(a.T @ a).max())
+
+
+def test_no_track_is_no_row(compiled, flight):
+    rig, window = flight
+    none = sightings_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
+    result = compiled(none, window, rig, chi2_bound(np.arange(3 * WINDOW + 1), 0.95))
+    assert len(result.nis) == len(result.H) == len(result.residuals) == 0
+
+
+def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
+    for compilation in (Compilation(), Compilation("numpy")):
+        assert track_gate.track_test(compilation) is track_gate.tested
+        assert compilation.ran == "numpy"
+
+
+def test_importing_the_toolkit_and_its_estimators_imports_no_numba():
+    code = (
+        "import sys, toolkit, toolkit.cli\n"
+        "from toolkit.estimator import discover\n"
+        "[entry.load() for entry in discover().values()]\n"
+        "print('numba' in sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "False"

@@ -1,0 +1,65 @@
+"""Whether what an estimator has compiled runs in the place of its NumPy, and what became of it.
+
+NumPy is the definition. What computes the same compiled is a module of its own that imports numba (the extra ``fast``):
+it is imported when an estimator that has one is built, never before, and compiled then, once for each version.
+"""
+
+import sys
+import time
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Literal
+
+from toolkit.errors import EstimatorError
+
+Asked = Literal["auto", "compiled", "numpy"]
+Ran = Literal["compiled", "numpy"]
+_NEEDS = "needs numba, which is not installed: pip install 'vislam-toolkit[fast]', or --no-fast"
+
+
+def check_possible(asked: Asked) -> None:
+    """Raise EstimatorError where compiled code is asked for and cannot be had here."""
+    if asked == "compiled" and find_spec("numba") is None:
+        raise EstimatorError(f"arithmetic = compiled {_NEEDS}")
+
+
+class Compilation:
+    """Compiled modules for one run, as asked: where numba is installed ("auto"), in any case, or never ("numpy").
+
+    ``ran`` says afterwards what did, None where the estimator has NumPy alone; ``log`` what is to be told of it;
+    ``wall_s`` and ``cpu_s`` what importing and compiling took, which is once a process and no cost of the run.
+    """
+
+    def __init__(self, asked: Asked = "numpy") -> None:
+        self._asked = asked
+        self.ran: Ran | None = None
+        self.log: tuple[str, ...] = ()
+        self.wall_s = self.cpu_s = 0.0
+
+    def module(self, name: str) -> ModuleType | None:
+        """Return a compiled module by its dotted name, or None where NumPy is to run.
+
+        Its constant ``COMPILED`` says in words what had to be compiled; empty where that was found on disk. Raises
+        EstimatorError where it is asked for and cannot be had.
+        """
+        check_possible(self._asked)
+        self.ran = "numpy"
+        if self._asked == "numpy" or find_spec("numba") is None:
+            return None
+        first = name not in sys.modules
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            module = import_module(name)
+        except Exception as error:
+            # A numba that does not fit this Python or NumPy says so in errors of many kinds.
+            why = " ".join(str(error).split())[:200]
+            if self._asked == "compiled":
+                raise EstimatorError(f"arithmetic = compiled: numba cannot be used here ({why})") from error
+            self.log = (f"numba cannot be used here, NumPy ran: {why}",)
+            return None
+        self.ran = "compiled"
+        self.wall_s, self.cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+        if first and module.COMPILED:
+            self.log = (f"{module.COMPILED} ({self.cpu_s:.0f} s of CPU, in none of the times)",)
+        return module
