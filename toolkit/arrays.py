@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, read_only
+from toolkit.geometry import Array, BoolArray, IntArray, read_only
 
 
 def check_shape(what: str, shape: tuple[int, ...], expected: tuple[int | None, ...]) -> None:
@@ -46,3 +46,11 @@ def freeze_arrays(value: Any, **shapes: tuple[int | None, ...]) -> None:
         array = read_only(given, np.int64 if integer else np.float64)
         check_shape(f"{type(value).__name__}.{name}", array.shape, shape)
         object.__setattr__(value, name, array)
+
+
+def is_among(ids: IntArray, others: IntArray) -> BoolArray:
+    """Say which ids (N,) are among others (M,), each of which there is once; for some hundreds, where isin is slow."""
+    if not others.size:
+        return np.zeros(ids.shape, dtype=bool)
+    ascending = np.sort(others)
+    return np.asarray(ascending[np.minimum(np.searchsorted(ascending, ids), others.size - 1)] == ids)

@@ -1,6 +1,8 @@
 """The chi-square gate of one frame: which innovations may correct, and what its tests add up to."""
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,14 +33,17 @@ class FrameGate:
 
     def bound(self, dof: IntArray | int) -> Array:
         """Return the NIS that is just accepted at each number of degrees of freedom (N,)."""
-        return chi2_bound(dof, self.probability)
+        return np.asarray(self._table(dof).bound[dof])
+
+    def _table(self, dof: IntArray | int) -> "_Table":
+        return _table(self.probability, int(np.max(dof, initial=1)).bit_length())
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
         accepted = np.asarray((nis < self.bound(dof)) & in_front)
         self.nis += float(nis[accepted].sum())
         self.dof += int(np.broadcast_to(dof, nis.shape)[accepted].sum())
-        expected = mean_below_bound(dof, self.probability)
+        expected = self._table(dof).expected[dof]
         self.nis_expected += float(np.broadcast_to(expected, nis.shape)[accepted].sum())
         self.tested += accepted.size
         self.accepted += int(accepted.sum())
@@ -60,3 +65,20 @@ class FrameGate:
             "gate_accepted": self.accepted,
             "unconverged": self.unconverged,
         }
+
+
+class _Table(NamedTuple):
+    """At each number of degrees of freedom, from none on, the bound of the NIS and its mean below it."""
+
+    bound: Array
+    expected: Array
+
+
+@lru_cache(maxsize=64)
+def _table(probability: float | None, bits: int) -> _Table:
+    """Return what a gate needs to know of all numbers of degrees of freedom of so many bits.
+
+    A filter asks for the same few in every frame, and the quantiles take longer than the rest of the gate.
+    """
+    dof = np.arange(2**bits)
+    return _Table(chi2_bound(dof, probability), mean_below_bound(dof, probability))

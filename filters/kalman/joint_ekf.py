@@ -16,6 +16,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.triangulation import triangulate
+from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.models.motion import motion_model
@@ -75,7 +76,7 @@ class JointEkf:
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""
         joint = self._joint
-        new = ~np.isin(frame.track_ids, joint.landmark_ids)
+        new = ~is_among(frame.track_ids, joint.landmark_ids)
         sightings = TrackSightings(
             frame.track_ids[new],
             frame.uvs_px[new][:, None],

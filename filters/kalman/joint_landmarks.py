@@ -14,6 +14,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
+from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
@@ -52,7 +53,7 @@ class StackedSightings(NamedTuple):
 def forget_lost(joint: JointBelief, frame: StereoFrame, memory: LandmarkMemory) -> None:
     """Marginalise the landmarks of the state that the frame does not show; the memory keeps their last value."""
     if len(joint.landmark_ids):
-        forget(joint, ~np.isin(joint.landmark_ids, frame.track_ids), memory)
+        forget(joint, ~is_among(joint.landmark_ids, frame.track_ids), memory)
 
 
 def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None:

@@ -5,6 +5,7 @@ from typing import Self
 
 import numpy as np
 
+from toolkit.arrays import is_among
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import stereo
@@ -90,7 +91,7 @@ class TrackedMap:
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
         """Keep the landmarks seen again, with their new values, and start the frame's other tracks."""
-        new = ~np.isin(frame.track_ids, seen.track_ids, assume_unique=True)
+        new = ~is_among(frame.track_ids, seen.track_ids)
         self._in_view = seen.merged(first_sighting(frame, np.flatnonzero(new), T_world_imu, self._rig))
 
     def landmarks(self) -> Landmarks:

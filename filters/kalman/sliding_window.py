@@ -21,6 +21,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.track_gate import TrackGate, track_test
+from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -133,7 +134,7 @@ class WindowTracks:
 
     def add_frame(self, frame: StereoFrame) -> None:
         """Append the frame's sightings as a new column; ids unknown so far start new tracks."""
-        new = np.setdiff1d(frame.track_ids, self._ids, assume_unique=True)
+        new = frame.track_ids[~is_among(frame.track_ids, self._ids)]
         ids = np.concatenate([self._ids, new])
         count, window = len(ids), self._seen.shape[1] + 1
         uvs_px, seen = np.zeros((count, window, 3)), np.zeros((count, window), dtype=bool)
@@ -175,4 +176,4 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of the state's landmarks."""
-    return frame.select(~np.isin(frame.track_ids, joint.landmark_ids))
+    return frame.select(~is_among(frame.track_ids, joint.landmark_ids))

@@ -7,7 +7,6 @@ track with bad luck: to leave out its worst sighting would choose the measuremen
 """
 
 from collections.abc import Callable
-from functools import lru_cache
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -20,7 +19,7 @@ from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, chi2_bound, mahalanobis_squared
+from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
 
 
@@ -132,12 +131,6 @@ def track_test(compilation: Compilation) -> TrackTest:
     return tested if compiled is None else cast(TrackTest, compiled.tested)
 
 
-@lru_cache(maxsize=64)
-def _bounds(probability: float | None, most: int) -> Array:
-    """Return the NIS (most + 1,) that is just accepted at 0, 1 ... degrees of freedom."""
-    return chi2_bound(np.arange(most + 1), probability)
-
-
 class TrackGate:
     """Tests tracks against a joint belief, by NumPy or by what computes the same."""
 
@@ -162,7 +155,7 @@ class TrackGate:
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
         """Return the tracks that pass as they are, and those that fail by far less their worst sighting."""
-        bounds = _bounds(gate.probability, 3 * sightings.seen.shape[1])
+        bounds = gate.bound(np.arange(3 * sightings.seen.shape[1] + 1))
         tracks = self._test(sightings, self._window, self._rig, bounds)
         dof = 3 * tracks.sightings.seen.sum(axis=1) - 3
         accepted = gate.accepts(tracks.nis, dof)
