@@ -70,6 +70,7 @@ def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vis
         "robust",
         "--window",
         "1.5",
+        "--no-fast",
         "--workers",
         "1",
         "--out",
@@ -79,6 +80,7 @@ def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vis
     settings = json.loads(Path("two/manifest.json").read_text())["settings"]
     assert settings["outliers"] == msgspec.to_builtins(POLICIES["robust"])
     assert settings["window"]["lag_s"] == 1.5
+    assert settings["arithmetic"] == "numpy"
 
 
 def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam) -> None:

@@ -1,0 +1,63 @@
+"""What runs in the place of NumPy, where it can be had and where not, and what is told of it."""
+
+import pytest
+
+from toolkit import compilation, runner
+from toolkit.compilation import Compilation
+from toolkit.datasets import load_sequence
+from toolkit.errors import EstimatorError
+from toolkit.estimator import find
+from toolkit.initialization import start_from_truth
+from toolkit.settings import Settings
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """Return a function that writes an importable module of some text and says its name; numba is there."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(compilation, "find_spec", lambda name: name)
+
+    def written(name: str, text: str) -> str:
+        (tmp_path / f"{name}.py").write_text(text, encoding="utf-8")
+        return name
+
+    return written
+
+
+def test_without_numba_numpy_runs_unless_compiled_is_asked_for(monkeypatch):
+    monkeypatch.setattr(compilation, "find_spec", lambda name: None)
+    auto = Compilation("auto")
+    assert auto.module("filters.kalman.compiled_gate") is None
+    assert (auto.ran, auto.log) == ("numpy", ())
+    with pytest.raises(EstimatorError, match=r"needs numba.*\[fast\]"):
+        Compilation("compiled").module("filters.kalman.compiled_gate")
+    with pytest.raises(EstimatorError, match="needs numba"):
+        find("msckf").check_usable(Settings(arithmetic="compiled"))
+
+
+def test_a_numba_that_does_not_fit_is_told_and_numpy_runs(module):
+    name = module("numba_does_not_fit", "raise ImportError('Numba needs NumPy 2.5 or less')")
+    auto = Compilation("auto")
+    assert auto.module(name) is None
+    assert auto.ran == "numpy"
+    assert auto.log == ("numba cannot be used here, NumPy ran: Numba needs NumPy 2.5 or less",)
+    with pytest.raises(EstimatorError, match=r"cannot be used here \(Numba needs NumPy"):
+        Compilation("compiled").module(name)
+
+
+def test_what_was_compiled_is_told_once_in_a_process_and_what_was_found_is_not(module):
+    name, found = module("was_compiled", "COMPILED = 'this was compiled'"), module("was_found", "COMPILED = ''")
+    first, second, third = Compilation("auto"), Compilation("auto"), Compilation("auto")
+    for one, of in ((first, name), (second, name), (third, found)):
+        assert one.module(of) is not None
+        assert one.ran == "compiled"
+    assert [len(one.log) for one in (first, second, third)] == [1, 0, 0]
+    assert first.log[0].startswith("this was compiled (")
+
+
+@pytest.mark.parametrize(("estimator", "ran"), [("msckf", "numpy"), ("dead-reckoning", None)])
+def test_a_run_says_what_computed_where_there_are_both(estimator, ran):
+    sequence = load_sequence("drive").truncated(4)
+    settings = Settings(arithmetic="numpy")
+    run = runner.run(estimator, find(estimator).load(), sequence, start_from_truth(sequence), settings=settings)
+    assert run.arithmetic == ran
