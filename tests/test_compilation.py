@@ -1,5 +1,9 @@
 """What runs in the place of NumPy, where it can be had and where not, and what is told of it."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from toolkit import compilation, runner
@@ -61,3 +65,20 @@ def test_a_run_says_what_computed_where_there_are_both(estimator, ran):
     settings = Settings(arithmetic="numpy")
     run = runner.run(estimator, find(estimator).load(), sequence, start_from_truth(sequence), settings=settings)
     assert run.arithmetic == ran
+
+
+def test_processes_compile_one_after_another(tmp_path):
+    """Two that begin together: each module takes a while, and neither begins before the other has ended."""
+    (tmp_path / "slow.py").write_text(
+        "import time\nbegan = time.monotonic()\ntime.sleep(0.5)\nended = time.monotonic()\nCOMPILED = ''\n"
+    )
+    code = (
+        "from toolkit import compilation\n"
+        "compilation.find_spec = lambda name: name\n"
+        "slow = compilation.Compilation('auto').module('slow')\n"
+        "print(slow.began, slow.ended)"
+    )
+    where = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    both = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=where) for _ in "ab"]
+    first, second = sorted(tuple(map(float, process.communicate()[0].split())) for process in both)
+    assert first[1] <= second[0]

@@ -4,10 +4,16 @@ NumPy is the definition. What computes the same compiled is a module of its own 
 it is imported when an estimator that has one is built, never before, and compiled then, once for each version.
 """
 
+import fcntl
+import os
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
@@ -50,7 +56,8 @@ class Compilation:
         first = name not in sys.modules
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            module = import_module(name)
+            with _one_process_at_a_time():
+                module = import_module(name)
         except Exception as error:
             # A numba that does not fit this Python or NumPy says so in errors of many kinds.
             why = " ".join(str(error).split())[:200]
@@ -63,3 +70,20 @@ class Compilation:
         if first and module.COMPILED:
             self.log = (f"{module.COMPILED} ({self.cpu_s:.0f} s of CPU, in none of the times)",)
         return module
+
+
+@contextmanager
+def _one_process_at_a_time() -> Iterator[None]:
+    """Have the processes of a user compile one after another: what the first has compiled the others find on disk."""
+    place = Path(tempfile.gettempdir()) / f"vislam-compilation-{os.getuid()}.lock"
+    try:
+        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except OSError:  # then they compile side by side
+        yield
+        return
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)

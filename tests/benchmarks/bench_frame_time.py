@@ -26,7 +26,8 @@ from toolkit.datasets import load_sequence
 from toolkit.estimator import find
 from toolkit.initialization import start_from_measurements
 from toolkit.progress import SILENT
-from toolkit.sequence import Sequence
+from toolkit.sequence import Prior, Sequence
+from toolkit.settings import DEFAULTS, Settings
 
 DATA = Path(__file__).parents[2] / os.environ.get("VISLAM_DATA", "../shared/data")
 RECORDINGS = ("drive", "drive-imu", "kitti00", str(DATA / "ucsd" / "03.npz"))
@@ -57,21 +58,29 @@ def _recordings() -> Iterator[Sequence]:
 
 
 def measure(names: tuple[str, ...]) -> None:
-    """Print one line for each estimator on each recording."""
+    """Print one line for each estimator on each recording, two where it has compiled code and can run it."""
     print(
-        f"{'recording':<12}{'estimator':<16}{'status':<10}{'ms/frame':>9}{'p95':>8}{'total s':>9}{'reference ms':>14}"
+        f"{'recording':<12}{'estimator':<16}{'arithmetic':<12}{'status':<10}{'ms/frame':>9}{'p95':>8}{'total s':>9}"
+        f"{'reference ms':>14}"
     )
     for sequence in _recordings():
         prior = start_from_measurements(sequence)
         for name in names:
-            reference = reference_ms()
-            run = runner.run(name, find(name).load(), sequence, prior, SILENT)
-            step_ms, total_s = 1e3 * run.timings.step_s, run.timings.total_s
-            print(
-                f"{sequence.name:<12}{name:<16}{run.status:<10}{step_ms.mean():>9.3f}{np.quantile(step_ms, 0.95):>8.3f}"
-                f"{total_s:>9.2f}{reference:>14.1f}   "
-                f"frame/reference {step_ms.mean() / reference:.4f}, total/reference {1e3 * total_s / reference:.1f}"
-            )
+            if _measured(name, sequence, prior, DEFAULTS) == "compiled":
+                _measured(name, sequence, prior, Settings(arithmetic="numpy"))
+
+
+def _measured(name: str, sequence: Sequence, prior: Prior, settings: Settings) -> str | None:
+    """Print the line of an estimator and return what computed, None where it has NumPy alone."""
+    reference = reference_ms()
+    run = runner.run(name, find(name).load(), sequence, prior, SILENT, settings)
+    step_ms, total_s = 1e3 * run.timings.step_s, run.timings.total_s
+    print(
+        f"{sequence.name:<12}{name:<16}{run.arithmetic or '':<12}{run.status:<10}{step_ms.mean():>9.3f}"
+        f"{np.quantile(step_ms, 0.95):>8.3f}{total_s:>9.2f}{reference:>14.1f}   "
+        f"frame/reference {step_ms.mean() / reference:.4f}, total/reference {1e3 * total_s / reference:.1f}"
+    )
+    return run.arithmetic
 
 
 def test_frame_times_are_printed() -> None:
