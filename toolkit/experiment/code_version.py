@@ -11,8 +11,12 @@ from pathlib import Path
 from toolkit import datasets, estimator, metrics
 
 # Distributions by the name a manifest gives them.
-NUMERIC_PACKAGES = {"numpy": "numpy", "scipy": "scipy", "gtsam": "gtsam", "opencv": "opencv-python-headless"} | {
-    "numba": "numba"
+NUMERIC_PACKAGES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "gtsam": "gtsam",
+    "opencv": "opencv-python-headless",
+    "numba": "numba",
 }
 # The toolkit's parts above the experiment, which it cannot import: they change no result.
 _ABOVE = ("api.py", "cli", "gate", "report")
