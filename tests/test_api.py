@@ -226,7 +226,7 @@ def surrounded(words: list[str], program: str | None, folder: Path) -> str:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     assert (told.returncode, told.stderr) == (0, "")
