@@ -3,17 +3,13 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from toolkit.audit import audit
-from toolkit.datasets import load_sequence
 from toolkit.divergence import MOST_FAR_STEPS, contradiction, gate_collapse
 from toolkit.estimate import Run, Trajectory
 from toolkit.geometry import Array, se3_exp, se3_inverse
-from toolkit.initialization import start_from_measurements
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
@@ -109,14 +105,6 @@ def test_a_trajectory_without_a_step_contradicts_nothing(count):
     sequence = recording("drive")
     truth = sequence.truth
     assert contradiction(Trajectory(truth.t_ns[:count], truth.T_world_imu[:count]), sequence) is None
-
-
-def test_on_03_the_reports_filter_is_seen_to_diverge_and_no_other(real: Callable[[str], Path], run_estimator):
-    """One test, for workers do not share what takes longest: the recording and its audit."""
-    sequence = audit(load_sequence(str(real("ucsd/03.npz")))).sequence
-    prior = start_from_measurements(sequence)
-    runs = [run_estimator(name, sequence, prior) for name in ("seed-ekf", "ekf", "dead-reckoning")]
-    assert [run.status for run in runs] == ["diverged", "ok", "ok"], [run.log for run in runs]
 
 
 def gated(share: float, share_in_the_end: float, tested: int = 20) -> dict[str, Array]:

@@ -85,6 +85,11 @@ def test_on_03_the_filter_explains_the_tracks_it_saw_and_those_it_did_not(datase
     assert scores["reproj_median_px"] <= 0.6
 
 
+def test_on_03_the_reports_filter_is_seen_to_diverge_and_no_other(dataset_03, run_on):
+    runs = [run_on(name, dataset_03) for name in ("seed-ekf", "ekf", "dead-reckoning")]
+    assert [run.status for run in runs] == ["diverged", "ok", "ok"], [run.log for run in runs]
+
+
 def assert_gyro_bias_of_03(run: Run) -> None:
     """-0.010 rad/s on every axis, as the standstill of the same rig's drive 0010 shows; 0.004 is 0.2 deg/s."""
     np.testing.assert_allclose(run.final.bias[-1, 3:], -0.010, atol=0.004)

@@ -95,8 +95,21 @@ def test_the_kitti_twists_describe_the_interval_before_their_stamp() -> None:
     assert motion.pairing == "end"
 
 
+def _yardstick_s() -> float:
+    """Return the CPU time of work on small matrices that is always the same; 0.03 s where 03 is audited in 0.5 s."""
+    rng = np.random.default_rng(0)
+    matrices, vectors = rng.normal(size=(20_000, 6, 6)), rng.normal(size=(20_000, 6, 1))
+    start_s = time.process_time()
+    np.linalg.solve(matrices, vectors)
+    np.sort(matrices, axis=0)
+    np.einsum("nij,nkj->nik", matrices, matrices @ matrices)
+    return time.process_time() - start_s
+
+
 def test_a_recording_of_a_thousand_frames_is_audited_in_a_second() -> None:
+    """By a yardstick, since on a slow machine that others share all takes longer: measured 15 to 18 of them."""
     sequence = load_sequence(str(DATA / "ucsd" / "03.npz"))
+    yardstick_s = min(_yardstick_s() for _ in range(3))
     start_s = time.process_time()
     audit(sequence)
-    assert time.process_time() - start_s < 2.0  # 0.5 s on an idle core; twice the promise where others share it
+    assert time.process_time() - start_s < 40.0 * yardstick_s

@@ -61,7 +61,7 @@ def is_short_of_memory(unit, progress):
 def refuses(unit, progress):
     if unit.seed == 1:
         raise DataError("nothing to see")
-    time.sleep(60)
+    time.sleep(600)
 
 def is_broken(unit, progress):
     raise ZeroDivisionError("a defect")
@@ -81,13 +81,14 @@ def names_its_process(unit, progress):
     time.sleep(0.02 * (unit.estimator == "ekf"))
     return os.getpid()
 
-def naps(unit, progress):
-    time.sleep(0.2)
+def leaves_a_mark(unit, progress):
+    MARK.with_name(f"done {unit.seed}").touch()
 
 def goes_on(unit, progress):
     for done in range(4):
         progress.advance(done, 4)
-        time.sleep(0.15)
+        while done == 2 and not MARK.exists():
+            time.sleep(0.005)
     return unit.seed
 """
 _COST = {metric.key for metric in cost.METRICS}
@@ -181,7 +182,7 @@ def test_an_error_of_the_recording_ends_everything_at_once(jobs: Jobs, work: Mod
     began = time.monotonic()
     with pytest.raises(DataError, match="nothing to see"):
         list(results_of(jobs((0, 1), ("ekf",)), 2, work.refuses, SILENT))
-    assert time.monotonic() - began < 30.0  # the other process, asleep for a minute, was not waited for
+    assert time.monotonic() - began < 300.0  # the other process, asleep for ten minutes, was not waited for
 
 
 def test_a_defect_is_told_with_the_traceback_of_its_process(jobs: Jobs, work: ModuleType) -> None:
@@ -219,14 +220,13 @@ def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_ha
     assert sorted(map(len, processes))[:5] == [1] * 5
 
 
-def test_processes_go_on_while_the_reader_of_their_results_is_busy(jobs: Jobs, work: ModuleType) -> None:
-    began = time.monotonic()
-    coming = results_of(jobs(tuple(range(20)), ("ekf",)), 2, work.naps, SILENT)
+def test_processes_go_on_while_the_reader_of_their_results_is_busy(
+    jobs: Jobs, work: ModuleType, tmp_path: Path
+) -> None:
+    coming = results_of(jobs(tuple(range(20)), ("ekf",)), 2, work.leaves_a_mark, SILENT)
     next(coming)
-    time.sleep(3.0)  # of work there are 2 s, and 18 units more than processes
-    resumed = time.monotonic()
+    _wait_until(lambda: len(list(tmp_path.glob("done *"))) == 20)
     assert len(list(coming)) == 19
-    assert time.monotonic() - resumed < 0.5 * (resumed - began)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -236,6 +236,8 @@ def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: Mod
     class Listening:
         def advance(self, done: int, total: int, stage: str = "") -> None:
             heard.append((done, total))
+            if done:
+                work.MARK.touch()  # no unit ends before it was heard of
 
     asked = jobs((0, 1), ("ekf",))
     assert sorted(result for _, result in results_of(asked, workers, work.goes_on, Listening())) == [0, 1]
@@ -246,10 +248,9 @@ def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: Mod
     assert shares[-1] == 1.0 or workers == 1
 
 
-# While the processes start, and while the units run.
-@pytest.mark.parametrize("delay_s", [0.2, 3.0])
+@pytest.mark.parametrize("when", ["the processes start", "units run"])
 def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_process(
-    tmp_path: Path, starts_group: StartsGroup, delay_s: float
+    tmp_path: Path, starts_group: StartsGroup, when: str
 ) -> None:
     program = textwrap.dedent("""
         import sys
@@ -266,9 +267,11 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
     vislam = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
     assert vislam.stdout is not None
     assert vislam.stdout.readline() == "starting\n"
-    time.sleep(delay_s)
+    if when == "units run":
+        _wait_until(lambda: any(map(_has_begun, tmp_path.glob("vislam-*/progress"))))
+    time.sleep(0.2)
     os.killpg(vislam.pid, signal.SIGINT)  # as a terminal does: to every process of the group
-    _, told = vislam.communicate(timeout=60)
+    _, told = vislam.communicate(timeout=300)
     assert vislam.returncode == 130
     assert (told.startswith("vislam: error: interrupted; what "), told.count("\n")) == (True, 1)
     assert (tmp_path / "run").exists() == ("what has ended is kept in run" in told)
@@ -284,7 +287,7 @@ def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: St
         workers = Workers(2)
         list(workers.results([1, 2], lambda unit, progress: unit, SILENT))
         print("started", flush=True)
-        time.sleep(60)
+        time.sleep(600)
     """)
     parent = starts_group(("-c", program), tmp_path, {"TMPDIR": str(tmp_path)})
     assert parent.stdout is not None
@@ -295,10 +298,23 @@ def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: St
 
 
 def _assert_gone(group: int) -> None:
-    for _ in range(100):
+    def gone() -> bool:
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
-            return
-        time.sleep(0.1)
-    raise AssertionError("a process is left")
+            return True
+        return False
+
+    _wait_until(gone)
+
+
+def _has_begun(board: Path) -> bool:
+    """Tell whether the processes have written anything to what their parent reads progress from."""
+    return any(board.read_bytes())
+
+
+def _wait_until(reached: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 300.0  # generous: a machine under load is no reason to fail
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

@@ -79,7 +79,7 @@ def test_a_processor_with_other_instructions_has_the_same_fingerprint():
             capture_output=True,
             text=True,
             check=True,
-            timeout=120,
+            timeout=300,
         ).stdout.split()
         for given in ({}, lesser)
     ]

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from toolkit.estimate import Landmarks
 from toolkit.geometry import se3_exp, se3_inverse, transform
 from toolkit.metrics import Evaluation, held_out, in_sample, score_run
+from toolkit.metrics._shared import leave_one_out
 from toolkit.metrics._shared.leave_one_out import predict_left_out
 from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.models import stereo
@@ -147,6 +148,16 @@ def test_leaving_a_view_out_equals_triangulating_anew(make_sequence, drive, pixe
     errors_anew_px = np.sqrt(np.mean((anew_px - uv_px[rows]) ** 2, axis=1))
     np.testing.assert_allclose(errors_px, errors_anew_px, atol=tolerance_px)
     assert np.median(errors_px) > 0.3
+
+
+@pytest.mark.parametrize("views", [1, 100, 10**9])
+def test_in_how_many_parts_it_is_solved_makes_no_difference(make_sequence, drive, monkeypatch, views):
+    sequence = make_sequence(drive(30), track_count=20, pixel_sigma=0.5)
+    tracks = tracks_of(sequence, drive(30))
+    whole = predict_left_out(*tracks, sequence.rig)
+    monkeypatch.setattr(leave_one_out, "_VIEWS_AT_A_TIME", views)
+    for one, other in zip(predict_left_out(*tracks, sequence.rig), whole, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_in_a_long_track_one_step_is_as_good_as_triangulating_anew(make_sequence, drive):

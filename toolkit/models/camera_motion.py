@@ -77,9 +77,10 @@ def neighbours(observations: Observations) -> Neighbours:
 
 
 class _TwoViews(NamedTuple):
-    """Points (P, 3) of frame k in its camera, and their pixels there and in k + 1.
+    """Points (3, P) of frame k in its camera, and their pixels (3, P) there and in k + 1.
 
-    ``interval`` (P,) is k, increasing; the rows of interval k are first[k] to first[k + 1].
+    ``interval`` (P,) is k, increasing; the columns of interval k are first[k] to first[k + 1]. The pairs come last in
+    all arrays of this file, matrices (3, 3, P) included: sums of products then run through neighbours in memory.
     """
 
     points: Array
@@ -91,9 +92,9 @@ class _TwoViews(NamedTuple):
     def over(self, intervals: slice) -> "_TwoViews":
         """Return those of some intervals, counted from the first of them."""
         first = self.first[intervals.start : intervals.stop + 1]
-        rows = slice(first[0], first[-1])
-        pixels = (self.uv_before_px[rows], self.uv_after_px[rows])
-        return _TwoViews(self.points[rows], *pixels, self.interval[rows] - intervals.start, first - first[0])
+        pairs = slice(first[0], first[-1])
+        pixels = (self.uv_before_px[:, pairs], self.uv_after_px[:, pairs])
+        return _TwoViews(self.points[:, pairs], *pixels, self.interval[pairs] - intervals.start, first - first[0])
 
 
 def usable_pairs(sequence: Sequence) -> Neighbours:
@@ -142,71 +143,85 @@ def _two_views(sequence: Sequence, intervals: int) -> _TwoViews:
     pairs, uv_px, rig = usable_pairs(sequence), sequence.observations.uv_px, sequence.rig
     points = triangulate(uv_px[pairs.before], rig)
     first = np.searchsorted(pairs.interval, np.arange(intervals + 1))
-    return _TwoViews(points, uv_px[pairs.before], uv_px[pairs.after], pairs.interval, first)
+    return _TwoViews(_last(points), _last(uv_px[pairs.before]), _last(uv_px[pairs.after]), pairs.interval, first)
+
+
+def _last(of_pairs: Array) -> Array:
+    """Return an array (P, ...) with the axis of the pairs last (..., P)."""
+    return np.moveaxis(of_pairs, 0, -1).copy()
 
 
 def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tuple[Array, Array, Array]:
     """Return one step (K - 1, 6) for every interval, on the right of its motion, the sum of its weights, and points."""
-    T_after_before = se3_inverse(T_before_after)
-    rotation = np.take(T_after_before[:, :3, :3], views.interval, axis=0)
-    moved = (rotation @ views.points[:, :, None])[..., 0] + T_after_before[views.interval, :3, 3]
-    moved[:, 2] = np.maximum(moved[:, 2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
-    d_point_d_uv, d_after = _triangulation_jacobian(views.points, rig), projection_jacobian(moved, rig)
-    d_uv_d_before = d_after @ rotation @ d_point_d_uv
-    before_px = (views.uv_before_px - project(views.points, rig))[:, :, None]
-    residual_px = (views.uv_after_px - project(moved, rig))[:, :, None] - d_uv_d_before @ before_px
-    spread = d_uv_d_before @ rig.cov_uv_px2
-    whitener = _whitener(_ridged(rig.cov_uv_px2 + spread @ np.swapaxes(d_uv_d_before, 1, 2)))
-    white = whitener @ residual_px
-    weight = _cauchy_weights((white**2).sum(axis=(1, 2)), views)
+    T_after_before = np.take(_last(se3_inverse(T_before_after)), views.interval, axis=-1)
+    rotation = T_after_before[:3, :3]
+    moved = _applied(rotation, views.points) + T_after_before[:3, 3]
+    moved[2] = np.maximum(moved[2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
+    d_point_d_uv, d_after = _triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
+    d_uv_d_before = _product(_product(d_after, rotation), d_point_d_uv)
+    before_px = views.uv_before_px - project(views.points.T, rig).T
+    residual_px = views.uv_after_px - project(moved.T, rig).T - _applied(d_uv_d_before, before_px)
+    spread = np.einsum("ijp,jk->ikp", d_uv_d_before, rig.cov_uv_px2)
+    whitener = _whitener(_ridged(rig.cov_uv_px2[..., None] + np.einsum("ijp,kjp->ikp", spread, d_uv_d_before)))
+    white = _applied(whitener, residual_px)
+    weight = _cauchy_weights((white**2).sum(axis=0), views)
     # A step [phi, rho] on the right of the motion moves a point p of the later view by [p]x phi - rho.
-    d_white = whitener @ d_after
-    equations = np.sqrt(weight)[:, None, None] * np.concatenate([d_white @ skew(moved), -d_white, white], axis=-1)
-    normal = _normal_by_interval(equations, views.first)
+    d_white = _product(whitener, d_after)
+    equations = [_product(d_white, _last(skew(moved.T))), -d_white, white[:, None]]
+    normal = _normal_by_interval(np.sqrt(weight) * np.concatenate(equations, axis=1), views.first)
     # The ridge keeps an interval without tracks where it is; it is far below one sighting's information.
-    hessian = _ridged(normal[:, :6, :6]) + 1e-6 * np.eye(6)
-    step = np.asarray(np.linalg.solve(hessian, normal[:, :6, 6:])[..., 0], dtype=np.float64)
+    hessian = np.moveaxis(_ridged(normal[:6, :6]), -1, 0) + 1e-6 * np.eye(6)
+    step = np.asarray(np.linalg.solve(hessian, np.moveaxis(normal[:6, 6:], -1, 0))[..., 0], dtype=np.float64)
     # The best point is between what the two views say of it: the first one's, corrected by its share of the residual.
-    corrected_px = before_px + np.swapaxes(whitener @ spread, 1, 2) @ white
-    points = views.points + (d_point_d_uv @ corrected_px)[..., 0]
-    points[:, 2] = np.clip(points[:, 2], LEAST_DEPTH_M, MOST_DEPTH_M)
+    share_px = np.einsum("jip,jp->ip", _product(whitener, spread), white)
+    points = views.points + _applied(d_point_d_uv, before_px + share_px)
+    points[2] = np.clip(points[2], LEAST_DEPTH_M, MOST_DEPTH_M)
     support = np.bincount(views.interval, weight, len(step)).astype(np.float64)
     return step, support, points
 
 
+def _product(a: Array, b: Array) -> Array:
+    """Return the products (i, k, P) of matrices (i, j, P) and (j, k, P)."""
+    return np.asarray(np.einsum("ijp,jkp->ikp", a, b))
+
+
+def _applied(matrix: Array, vector: Array) -> Array:
+    """Return the products (i, P) of matrices (i, j, P) and vectors (j, P)."""
+    return np.asarray(np.einsum("ijp,jp->ip", matrix, vector))
+
+
 def _triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
-    """Return d(point)/d(uL, uR, v) (P, 3, 3) of points (P, 3) in the camera: the inverse of the projection's."""
-    x, y, z = points.T
+    """Return d(point)/d(uL, uR, v) (3, 3, P) of points (3, P) in the camera: the inverse of the projection's."""
+    x, y, z = points
     d_z_px = z**2 / (rig.fx_px * rig.baseline_m)
-    jacobian = np.zeros((len(points), 3, 3))
-    jacobian[:, :, 1] = np.stack([x / z * d_z_px, y / z * d_z_px, d_z_px], axis=1)
-    jacobian[:, :, 0] = -jacobian[:, :, 1]
-    jacobian[:, 0, 0] += z / rig.fx_px
-    jacobian[:, 1, 2] = z / rig.fy_px
+    jacobian = np.zeros((3, 3, len(z)))
+    jacobian[:, 1] = x / z * d_z_px, y / z * d_z_px, d_z_px
+    jacobian[:, 0] = -jacobian[:, 1]
+    jacobian[0, 0] += z / rig.fx_px
+    jacobian[1, 2] = z / rig.fy_px
     return jacobian
 
 
 def _ridged(matrices: Array) -> Array:
-    """Return symmetric matrices (N, d, d) with a ridge on each, so that a singular one can be solved."""
-    trace = np.trace(matrices, axis1=1, axis2=2)
-    return np.asarray(matrices + (RIDGE * trace)[:, None, None] * np.eye(matrices.shape[-1]))
+    """Return symmetric matrices (d, d, N) with a ridge on each, so that a singular one can be solved."""
+    return np.asarray(matrices + RIDGE * np.trace(matrices) * np.eye(len(matrices))[..., None])
 
 
 def _whitener(cov: Array) -> Array:
-    """Return the lower triangular W (N, 3, 3) with W cov W^T = 1: the inverses of cov's Cholesky factors, all at once.
+    """Return the lower triangular W (3, 3, N) with W cov W^T = 1: the inverses of cov's Cholesky factors, all at once.
 
     cov = L D L^T with ones on the diagonal of L, so W = D^(-1/2) L^(-1).
     """
-    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(cov, 0, 2).copy()
+    (a, b, c), (_, d, e), (_, _, f) = cov
     l10, l20 = b / a, c / a
     pivot1 = d - l10 * b
     l21 = (e - l20 * b) / pivot1
     pivot2 = f - l20 * c - l21 * l21 * pivot1
     whitener = np.zeros_like(cov)
-    whitener[:, 0, 0], whitener[:, 1, 1], whitener[:, 2, 2] = np.sqrt(1.0 / np.stack([a, pivot1, pivot2]))
-    whitener[:, 1, 0] = -l10 * whitener[:, 1, 1]
-    whitener[:, 2, 1] = -l21 * whitener[:, 2, 2]
-    whitener[:, 2, 0] = (l10 * l21 - l20) * whitener[:, 2, 2]
+    whitener[0, 0], whitener[1, 1], whitener[2, 2] = np.sqrt(1.0 / np.stack([a, pivot1, pivot2]))
+    whitener[1, 0] = -l10 * whitener[1, 1]
+    whitener[2, 1] = -l21 * whitener[2, 2]
+    whitener[2, 0] = (l10 * l21 - l20) * whitener[2, 2]
     return whitener
 
 
@@ -224,7 +239,8 @@ def _cauchy_weights(chi2: Array, views: _TwoViews) -> Array:
 
 
 def _normal_by_interval(equations: Array, first: IntArray) -> Array:
-    """Return A^T A (K - 1, d, d) of the equations (P, 3, d) of each interval, which are consecutive."""
-    d = equations.shape[-1]
-    of_intervals = (equations[a:b].reshape(-1, d) for a, b in pairwise(first.tolist()))
-    return np.array([rows.T @ rows for rows in of_intervals])
+    """Return A^T A (d, d, K - 1) of the equations (3, d, P) of each interval, which are consecutive."""
+    d = equations.shape[1]
+    by_unknown = equations.swapaxes(0, 1)
+    of_intervals = (by_unknown[..., a:b].reshape(d, -1) for a, b in pairwise(first.tolist()))
+    return np.stack([rows @ rows.T for rows in of_intervals], axis=-1)

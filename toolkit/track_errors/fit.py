@@ -9,7 +9,6 @@ the recording, since tracks that are seen together err together.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -141,6 +140,8 @@ def _most_likely(groups: list[Residuals], free: BoolArray, start: Tailed | None)
     lowest, highest = np.append(_LEAST_PX[free], _DEGREES[0]), np.append(np.full(free.sum(), _MOST_PX), _DEGREES[1])
     x = np.log(np.clip(np.append(begin[free], degrees), lowest, highest))
     bounds = list(zip(np.log(lowest), np.log(highest), strict=True))
+    from scipy.optimize import minimize  # its import takes a third of a process's start, and most do without
+
     best = model(minimize(cost, x, jac=True, method="L-BFGS-B", bounds=bounds).x)
     return best, joined(likelihood(group, best) for group in groups)
 

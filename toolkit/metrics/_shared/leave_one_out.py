@@ -10,6 +10,7 @@ out then subtracts its share from the normal equations and takes one Gauss-Newto
 tracks of at most 40 views are solved again from there without view i; in a longer one its influence is negligible.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ _HUBER_SIGMAS = 2.796
 _BEHIND_SIGMAS = 1e4
 _ITERATIONS, _ITERATIONS_AGAIN = 12, 3
 _MOST_VIEWS_SOLVED_AGAIN = 40
+# So many views are solved again at a time: what is computed of them fits a processor's cache, which halves the time.
+_VIEWS_AT_A_TIME = 30_000
 _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
 
 
@@ -141,9 +144,15 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     views = _views(track_ids, uv_px, T_last_view, rig)
     points = _without_each(views, _solve(views, _start(views, T_last_view, rig), _ITERATIONS))
     again = np.flatnonzero(views.count[views.track] <= _MOST_VIEWS_SOLVED_AGAIN)
-    if again.size:
-        points[again] = _solve(views.others(again), points[again], _ITERATIONS_AGAIN)
+    for rows in _in_parts(again, views.count[views.track[again]] - 1):
+        points[rows] = _solve(views.others(rows), points[rows], _ITERATIONS_AGAIN)
     return views.predict(points)
+
+
+def _in_parts(rows: IntArray, others: IntArray) -> Iterator[IntArray]:
+    """Yield the rows (n,), so many at a time that their numbers of other views (n,) add up to the most of a part."""
+    part = np.cumsum(others) // _VIEWS_AT_A_TIME
+    yield from (of_part for of_part in np.split(rows, np.flatnonzero(np.diff(part)) + 1) if of_part.size)
 
 
 def _first_rows(track_ids: IntArray) -> IntArray:
