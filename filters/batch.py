@@ -16,17 +16,21 @@ from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.smoothing.indeterminate import with_covariances
-from filters.smoothing.robust import seen_ids, solve_robustly, worth_smoothing
+from filters.smoothing.robust import Smoothed, seen_ids, solve_robustly, worth_smoothing
+from filters.smoothing.scale_state import ScaleState
+from filters.smoothing.track_chain import scale_in
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
+from toolkit.models.gap_bridge import bridged
 from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ the future; all relinearised to convergence, outliers cut after a schedule"
 IGNORES = {"window": "it keeps every state"}
+HAS = ("disparity_scale", "bridge_gaps")
 DEFAULT = True
 
 
@@ -40,6 +44,9 @@ class Batch:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
+        noise = setup.settings.noise
+        self._bridges_gaps = noise.bridge_gaps and setup.motion_kind == "twist"
+        self._scale = None if noise.disparity_scale is None else ScaleState(noise.disparity_scale)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
         self._causal_pass = SlidingWindowFilter(setup, AtFirstEstimates())
@@ -61,15 +68,23 @@ class Batch:
         frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
         start = self._start(known, track_ids)
         factors = self._motion_factors()
+        if self._bridges_gaps:
+            factors.push_back(bridged(frames))
+        if self._scale is not None:
+            self._scale.add_to(factors, start)
         smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._progress)
+        trajectory, log = self._with_covariances(smoothed)
         values = smoothed.solution.values
-        states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
-        seen = seen_ids(smoothed.frames)
-        landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen})
-        trajectory, log = with_covariances(
-            Trajectory.of(states), smoothed.graph.linearize(values), [L(i) for i in seen], self._motion
-        )
+        landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
         return Finished(trajectory, landmarks, smoothed.solution.converged, log)
+
+    def _with_covariances(self, smoothed: Smoothed) -> tuple[Trajectory, tuple[str, ...]]:
+        values, landmark_keys = smoothed.solution.values, [L(i) for i in seen_ids(smoothed.frames)]
+        states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
+        trajectory, linear = Trajectory.of(states), smoothed.graph.linearize(values)
+        if self._scale is None:
+            return with_covariances(trajectory, linear, landmark_keys, self._motion)
+        return self._scale.with_covariances(trajectory, linear, landmark_keys, self._motion, scale_in(values))
 
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""

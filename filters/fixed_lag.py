@@ -25,6 +25,7 @@ from toolkit.sequence import Packet
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
 IGNORES = {"tracks": "each sighting is a factor of its own in GTSAM's tree"}
+HAS = ("bridge_gaps",)
 
 
 def build(setup: Setup) -> Estimator:

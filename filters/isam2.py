@@ -27,6 +27,7 @@ from toolkit.sequence import Packet
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
 IGNORES = {"window": "it keeps every state", "tracks": "each sighting is a factor of its own in GTSAM's tree"}
+HAS = ("bridge_gaps",)
 
 
 def build(setup: Setup) -> Estimator:

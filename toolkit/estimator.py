@@ -5,8 +5,9 @@ estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first li
 summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
 ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
 where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``IGNORES`` names the common rules
-("outliers", "window", "tracks") that it does not obey, each with the reason; ``CITES`` is what ``vislam cite`` prints
-for it, keys of toolkit/report/references.bib or BibTeX itself.
+("outliers", "window", "tracks") that it does not obey, each with the reason, and ``HAS`` the parts of the noise model
+("disparity_scale", "bridge_gaps") that it has, as few do; ``CITES`` is what ``vislam cite`` prints for it, keys of
+toolkit/report/references.bib or BibTeX itself.
 """
 
 import ast
@@ -95,6 +96,11 @@ class EstimatorEntry:
         """Return the common rules that the estimator does not obey, and why: its module's constant ``IGNORES``."""
         ignores = self.found.constants().get("IGNORES", {})
         return {str(k): str(v) for k, v in ignores.items()} if isinstance(ignores, dict) else {}
+
+    def has(self) -> frozenset[str]:
+        """Return the optional parts of the noise model that the estimator has: its module's constant ``HAS``."""
+        parts = self.found.constants().get("HAS", ())
+        return frozenset(map(str, parts)) if isinstance(parts, tuple) else frozenset()
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it.

@@ -15,6 +15,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, huber_loss
+from toolkit.models.gap_bridge import BridgeBuilder
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
@@ -38,6 +39,9 @@ class GraphBuilder:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
         self._outlier_check = OutlierCheck(setup.rig, outliers)
+        self._bridge: BridgeBuilder | None = None
+        if setup.settings.noise.bridge_gaps and setup.motion_kind == "twist":
+            self._bridge = BridgeBuilder(setup.settings.window.seconds(setup.motion_kind))
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -48,6 +52,8 @@ class GraphBuilder:
         expected = self._add_state(packet, extension)
         sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
         self._add_sightings(sound, packet.index, extension)
+        if self._bridge is not None:
+            extension.factors.push_back(self._bridge.added(sound, packet.index))
         return extension
 
     def update(self, newest: Estimate, points: Mapping[int, Array]) -> None:

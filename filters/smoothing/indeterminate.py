@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, se3_inverse, transform
 from toolkit.models.motion import MotionModel
-from toolkit.models.state_covariances import state_covs
+from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.sequence import StereoRig
 
 # What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
@@ -69,6 +69,13 @@ def with_covariances(
     try:
         covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
     except RuntimeError as refusal:
-        name = gtsam.Symbol(variable_named(refusal)).string()
-        return trajectory, (f"no covariances of the final states: the graph leaves {name} undetermined",)
+        return trajectory, (no_covariances(refusal),)
     return replace(trajectory, cov=covs), ()
+
+
+def no_covariances(refusal: RuntimeError) -> str:
+    """Return why there are no covariances where GTSAM refuses; another refusal is raised again."""
+    if isinstance(refusal, RoundingError):
+        return f"no covariances of the final states: {refusal}"
+    name = gtsam.Symbol(variable_named(refusal)).string()
+    return f"no covariances of the final states: the graph leaves {name} undetermined"

@@ -13,12 +13,12 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
-from filters.smoothing.robust_loss import Cauchy, Squares
+from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X, huber_loss, kind_of
+from toolkit.models.factors import SCALE, L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.progress import Progress
 from toolkit.sequence import StereoFrame, StereoRig
@@ -29,6 +29,8 @@ from toolkit.settings import Outliers
 # Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
 # and to the last solve what is gained counts in itself, not by the whole.
 _JUMPS_STOPPING, _CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
+# A scale that white noise has hangs on such differences too, but is soon found; far landmarks creep on for long.
+_SCALE_STOPPING = Stopping(1e-5, 60)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
 
 
@@ -53,6 +55,7 @@ def solve_robustly(
 
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
+    A scale of disparities among the values stays as it is until what is an outlier has been decided.
     """
     values = start
     for robust, stopping, stage in _stages(outliers):
@@ -63,6 +66,10 @@ def solve_robustly(
         return _solve_chained(motion, frames, rig, values, outliers, progress)
     bound = _cut_bound(outliers)
     frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
+    if values.exists(SCALE):
+        sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
+        apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
+        return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
     graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
     last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
     return Smoothed(last, graph, frames)
@@ -89,10 +96,21 @@ def _solve_chained(
     jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers)
     sightings, frames = without_jumps(sightings, frames, jumped)
     last = ChainedFactors(sightings, rig, Squares())
-    values = _only_seen(values, frames)
-    solution = solve(motion, values, _CHAIN_STOPPING, progress, "solving without jumps", last)
+    return _solve_last(motion, last, frames, values, _CHAIN_STOPPING, progress)
+
+
+def _solve_last(
+    motion: gtsam.NonlinearFactorGraph,
+    sightings: ChainedFactors,
+    frames: list[StereoFrame],
+    start: gtsam.Values,
+    stopping: Stopping,
+    progress: Progress,
+) -> Smoothed:
+    values = _only_seen(start, frames)
+    solution = solve(motion, values, stopping, progress, "solving along the tracks, without outliers", sightings)
     graph = gtsam.NonlinearFactorGraph(motion)
-    graph.push_back(last.linearised(solution.values))
+    graph.push_back(sightings.linearised(solution.values))
     return Smoothed(solution, graph, frames)
 
 

@@ -9,7 +9,12 @@ whose twists are noisy as they are. Each run is one line of the results, and one
 
 The table has, for each estimator and model, the geometric mean over drives of the ATE over that of dead reckoning (the
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
-parameters, or ``correlated:white,walk,offset`` with others, in px.
+parameters, or ``correlated:white,walk,offset`` with others, in px; ``+scale`` behind it gives the disparities a scale
+of 1 %, ``+gaps`` bridges what has no track.
+
+    python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
+
+compares two models run by run: per drive the ratio of the final ATE, its standard error over seeds, and on average.
 """
 
 import argparse
@@ -26,17 +31,20 @@ import numpy as np
 
 from toolkit.estimator import find
 from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.geometry import Array
 from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import score_run
 from toolkit.models.noise import twist_noise
 from toolkit.runner import run
 from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, Noise, Settings
+from toolkit.settings import Noise, Settings
 
 SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "smart", "isam2", "batch")
 METRICS = ("ate_se3_m", "ate_yaw_m", "ate_none_m", "kitti_t_percent", "nees_pose_mean", "nees_ori_mean")
 LONG_DRIVE = "0027"
+SCALE_SIGMA = 0.01
+TRACK_SETTINGS = ("track_white_px", "track_walk_px", "track_offset_px")
 
 
 class Case(NamedTuple):
@@ -75,12 +83,15 @@ def with_noisy_twists(sequence: Sequence, seed: int) -> Sequence:
 
 def noise_of(model: str) -> Noise:
     """Return the settings of a noise model."""
-    name, _, figures = model.partition(":")
-    if name == "white":
-        return DEFAULTS.noise
-    stated = [float(figure) for figure in figures.split(",")] if figures else []
-    given = dict(zip(("track_white_px", "track_walk_px", "track_offset_px"), stated, strict=False))
-    return Noise(tracks="correlated", **given)
+    tracks, *switches = model.split("+")
+    name, _, figures = tracks.partition(":")
+    given: dict[str, Any] = {"bridge_gaps": "gaps" in switches}
+    if "scale" in switches:
+        given["disparity_scale"] = SCALE_SIGMA
+    if name == "correlated":
+        stated = [float(figure) for figure in figures.split(",")] if figures else []
+        given |= {"tracks": name, **dict(zip(TRACK_SETTINGS, stated, strict=False))}
+    return Noise(**given)
 
 
 def prepared(drive: str, seed: int, model: str) -> Prepared:
@@ -98,6 +109,7 @@ def measured(case: Case, ready: Prepared) -> dict[str, Any]:
     began = time.process_time()
     result = run(case.estimator, find(case.estimator).load(), ready.sequence, ready.prior, settings=settings)
     line: dict[str, Any] = {**case._asdict(), "status": result.status, "cpu_s": time.process_time() - began}
+    line["log"] = result.log
     for output in ("causal", "final"):
         if result.trajectory(output) is not None:
             values = score_run(result, output, ready.sequence).values
@@ -159,6 +171,30 @@ def table(options: argparse.Namespace) -> None:
         )
 
 
+def pairs(options: argparse.Namespace) -> None:
+    """Print what a second model makes of the ATE of a first, drive by drive."""
+    of_model: dict[str, dict[tuple[str, int], dict[str, Any]]] = defaultdict(dict)
+    for line in lines(options.results):
+        if line["estimator"] == options.estimator and "final" in line:
+            of_model[line["model"]][line["drive"], line["seed"]] = line
+    one, other = of_model[options.one], of_model[options.other]
+    logs: dict[str, list[list[float]]] = defaultdict(list)
+    for case in one.keys() & other.keys():
+        before, after = one[case]["final"], other[case]["final"]
+        logs[case[0]].append([np.log(after[key] / before[key]) for key in METRICS[:3]])
+    print(f"{options.other} over {options.one}: SE(3), yaw, none; standard errors over seeds")
+    for drive, of_seeds in sorted(logs.items()):
+        _print_ratios(drive, np.array(of_seeds), len(of_seeds))
+    short = np.array([np.mean(of_seeds, axis=0) for drive, of_seeds in logs.items() if drive != LONG_DRIVE])
+    _print_ratios("mean", short, len(short))
+
+
+def _print_ratios(name: str, logs: Array, count: int) -> None:
+    ratios = np.exp(logs.mean(axis=0))
+    errors = ratios * logs.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(3, np.nan)
+    print(f"{name:8s}" + "  ".join(f"{one:5.3f} +- {error:5.3f}" for one, error in zip(ratios, errors, strict=True)))
+
+
 def _ratio(one: list[dict[str, Any]], reference: list[dict[str, Any]], output: str, key: str) -> float:
     seeds = {line["seed"] for line in one}
     return _mean(one, output, key) / _mean([line for line in reference if line["seed"] in seeds], "causal", key)
@@ -185,8 +221,13 @@ def main() -> None:
     running.add_argument("--models", type=lambda text: text.split("/"), default=["white", "correlated"])
     showing = commands.add_parser("table")
     showing.set_defaults(command=table)
-    for command in (running, showing):
+    pairing = commands.add_parser("pairs")
+    pairing.set_defaults(command=pairs)
+    pairing.add_argument("--estimator", default="batch")
+    for command in (running, showing, pairing):
         command.add_argument("results", type=Path)
+    pairing.add_argument("one")
+    pairing.add_argument("other")
     options = parser.parse_args()
     options.command(options)
 

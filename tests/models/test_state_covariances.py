@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from filters.smoothing import indeterminate
+from toolkit.models import state_covariances
 from toolkit.models.motion import state_cov
 from toolkit.models.state_covariances import state_covs
 from toolkit.settings import Settings, Window
@@ -44,3 +45,21 @@ def test_the_newest_state_of_a_window_that_never_leaves_has_the_batchs_covarianc
     smoothed = run_estimator("batch", sequence).final.cov[-1]
     sigma_ratio = np.sqrt(np.diag(newest)[:6] / np.diag(smoothed)[:6])
     np.testing.assert_allclose(sigma_ratio, 1.0, atol=0.25)
+
+
+def test_covariances_that_rounding_spoils_are_not_shown(run_estimator, monkeypatch):
+    """The first state is where the way back ends: what is wrong there by a twentieth is wrong on the way."""
+    recovered = state_covariances._recovered
+
+    def spoiled(conditionals, states):
+        *others, first = recovered(conditionals, states)
+        yield from others
+        yield 1.05 * first
+
+    monkeypatch.setattr(state_covariances, "_recovered", spoiled)
+    run = run_estimator("batch", simulate(replace(DRIVE, duration_s=1.0), 3))
+    assert run.status == "ok"
+    assert run.final.cov is None
+    assert run.log == (
+        "no covariances of the final states: they were lost to rounding on the way from the last state to the first",
+    )

@@ -174,9 +174,9 @@ class Comparison:
 
     ``sequence`` is what the estimators read under the first seed, after any repair; ``findings`` is what the audit saw
     in it before; ``outcomes`` are by estimator, then seed. ``changes`` says, on a ladder only, what each estimator
-    changes against the rung before; ``white`` which estimators take noise of tracks that is stated for white, and why.
-    ``undecided`` has the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks,
-    where asked for.
+    changes against the rung before; ``white`` which estimators take noise of tracks that is stated for white, and why,
+    and ``lacking`` which are without an optional part of the noise model that is asked for, by part. ``undecided`` has
+    the faults that the audit could not judge, and why; ``card`` is that of the recording's tracks, where asked for.
     """
 
     source: str
@@ -187,6 +187,7 @@ class Comparison:
     outcomes: tuple[Outcome, ...]
     changes: Mapping[str, str] = field(default_factory=dict)
     white: Mapping[str, str] = field(default_factory=dict)
+    lacking: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     settings: Settings = DEFAULTS
     workers: int = 1
     undecided: Mapping[str, str] = field(default_factory=dict)

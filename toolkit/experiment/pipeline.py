@@ -19,9 +19,10 @@ from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepa
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
+from toolkit.measured_motion import MotionKind
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
-from toolkit.settings import DEFAULTS, Settings
+from toolkit.settings import DEFAULTS, Noise, Settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,6 +271,7 @@ def _comparison(
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
         white={} if sequence.rig.track_noise is None else _told_white(entries),
+        lacking=lacking(entries, plan.settings.noise, sequence.motion_kind),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
@@ -280,6 +282,18 @@ def _comparison(
 def _told_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     """Return which estimators take the noise of tracks for white whatever the rig states, and why."""
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
+
+
+def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, motion_kind: MotionKind) -> dict[str, tuple[str, ...]]:
+    """Return, for each optional part of the noise model that is asked for, the estimators that do without.
+
+    Gaps are bridged between measured twists: where there are none, by nobody.
+    """
+    asked = {"disparity_scale": noise.disparity_scale is not None, "bridge_gaps": noise.bridge_gaps}
+    parts = {part: [name for name, entry in entries.items() if part not in entry.has()] for part in asked}
+    if motion_kind != "twist":
+        parts["bridge_gaps"] = list(entries)
+    return {part: tuple(names) for part, names in parts.items() if asked[part] and names}
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:

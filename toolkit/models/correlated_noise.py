@@ -101,6 +101,11 @@ class Chain:
         carried = with_before / variance[before]
         return cls(before, carried, np.sqrt(variance - carried * with_before))
 
+    @classmethod
+    def without_memory(cls, count: int) -> "Chain":
+        """Return the chain of sightings that err each by itself, with unit variance in their channels."""
+        return cls(np.full(count, -1), np.zeros((count, 3)), np.ones((count, 3)))
+
     def of_tracks(self, kept: BoolArray) -> "Chain":
         """Return the chain of the sightings kept (N,), which must be all or none of each track."""
         rows = np.append(np.cumsum(kept) - 1, -1)

@@ -11,10 +11,12 @@ from toolkit.geometry import Array
 from toolkit.sequence import StereoFrame, StereoRig
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
+# The scale of all disparities, a vector (1,).
+SCALE: int = gtsam.symbol("s", 0)
 
 
 def kind_of(key: int) -> str:
-    """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark."""
+    """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
     return chr(gtsam.Symbol(key).chr())
 
 

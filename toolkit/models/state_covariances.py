@@ -5,6 +5,10 @@ later ones plus noise: ``x = -R^-1 S x_S + n``. So the joint covariance of a sho
 the end to the beginning, yields every state's (Golub & Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery
 from a square root information matrix for data association"). GTSAM's Marginals traverses its Bayes tree anew for
 each state, which takes a hundred times as long.
+
+Rounding may grow on the way back, where steps between states are known far better than the states, as where the errors
+of sightings hang together and the camera stands. So the covariance of the first state, where the way ends, is also had
+by itself: where the two differ, all are refused.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,9 +18,16 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
+from toolkit.models.factors import joint_cov
 from toolkit.models.motion import MotionModel
 
 _STATES_AT_A_TIME = 10
+# A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
+_MOST_ROUNDED = 0.01
+
+
+class RoundingError(RuntimeError):
+    """The covariances of the states came out wrong, and are not known."""
 
 
 def state_covs(
@@ -24,11 +35,38 @@ def state_covs(
 ) -> Array:
     """Return the covariance (K, d, d) of the states 0 to K - 1, in the order and on the side of an Estimate.
 
-    ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them.
+    ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them, and
+    RoundingError.
+    """
+    return covs_beside(linear, landmark_keys, motion, poses, ())[0]
+
+
+def covs_beside(
+    linear: gtsam.GaussianFactorGraph,
+    landmark_keys: Sequence[int],
+    motion: MotionModel,
+    poses: Array,
+    beside: Sequence[int],
+) -> tuple[Array, Array]:
+    """Return the covariances of the states as :func:`state_covs`, and (m, m) of the variables beside them.
+
+    Those are of no frame, as the scale of disparities is: they are eliminated after all states.
     """
     states = [motion.keys(k) for k in range(len(poses))]
-    covs = list(_recovered(_eliminated(linear, landmark_keys, states), states))[::-1]
-    return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)])
+    together = [*states[:-1], [*states[-1], *beside]]
+    covs = list(_recovered(_eliminated(linear, landmark_keys, together), together))[::-1]
+    size = motion.layout.size
+    covs, of_beside = [cov[:size, :size] for cov in covs], covs[-1][size:, size:]
+    _check_first(covs[0], linear, states[0])
+    return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)]), of_beside
+
+
+def _check_first(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int]) -> None:
+    """Raise RoundingError where the covariance of the first state is not what it is by itself."""
+    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
+    expected = np.diag(joint_cov(linear.eliminateMultifrontal(last), keys))
+    if not np.allclose(np.diag(cov), expected, rtol=2.0 * _MOST_ROUNDED, atol=0.0):
+        raise RoundingError("they were lost to rounding on the way from the last state to the first")
 
 
 def _eliminated(

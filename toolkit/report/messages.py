@@ -82,7 +82,8 @@ def rules_line(comparison: Comparison) -> str:
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
-        f"outliers: {outliers_in_words(settings.outliers)}{_track_noise(settings.noise)}"
+        f"outliers: {outliers_in_words(settings.outliers)}"
+        f"{_track_noise(settings.noise)}{_optional_parts(settings.noise)}"
     )
 
 
@@ -94,6 +95,13 @@ def _track_noise(noise: Noise) -> str:
         return "; noise of tracks: correlated, as stated"
     basis = "the whole recording" if noise.track_fit_s is None else f"the first {noise.track_fit_s:g} s"
     return f"; noise of tracks: fitted to {basis}, which causal answers know too early"
+
+
+def _optional_parts(noise: Noise) -> str:
+    """Say what is taken into account besides, where it is."""
+    sigma = noise.disparity_scale
+    scale = "" if sigma is None else f"; disparities scaled by 0 +- {100.0 * sigma:g} %, a state"
+    return f"{scale}{'; gaps between tracks bridged' if noise.bridge_gaps else ''}"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:
@@ -133,6 +141,9 @@ def outcome(finding: Finding) -> str:
     return "warning" if finding.warning else "for information"
 
 
+_PARTS = {"disparity_scale": "a scale of the disparities", "bridge_gaps": "a bridge where no track leads on"}
+
+
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
     """Yield what must be known before a table is believed: how runs ended, remarks on errors, what is missing."""
     if not len(comparison.sequence.observations):
@@ -140,6 +151,8 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     yield from _ends_over_seeds(comparison) if comparison.over_seeds else _ends(comparison)
     for name, why in comparison.white.items():
         yield f"{name} takes the noise of tracks for white: {why}"
+    for part, names in comparison.lacking.items():
+        yield f"{', '.join(names)}: without {_PARTS[part]} (noise.{part})"
     yield from _marks(comparison)
     yield from _refusals(comparison)
     yield from truth_lines(comparison)

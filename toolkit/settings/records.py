@@ -168,6 +168,22 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
+    disparity_scale: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=0.5,
+                description="standard deviation of a scale on all disparities, a state of its own, as 0.01",
+                extra={"none": "none: no such state"},
+            ),
+        ]
+        | None
+    ) = None
+    bridge_gaps: Annotated[
+        bool,
+        Meta(description="where frames have no track in common, a measured twist is like those before and after, too"),
+    ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):

@@ -37,6 +37,18 @@ def disparity_scale(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> S
     return _with_pixels(sequence, (cdv_px * np.array([1.0, 1.0 + dose, 1.0])) @ np.linalg.inv(CHANNELS).T)
 
 
+def cut_tracks(sequence: Sequence, dose: float = 0.08, seed: int = 0) -> Sequence:
+    """End every track before a share of the frames, and go on with new ones: images that repeat, a tracker that fails.
+
+    Stale frames that are repaired look so: across each the motion samples alone tell how the body moved.
+    """
+    seen = sequence.observations
+    cut = np.random.default_rng(seed).uniform(size=sequence.frame_count) < dose
+    cut[0] = False
+    track_id = np.cumsum(cut)[seen.frame] * (int(seen.track_id.max(initial=-1)) + 1) + seen.track_id
+    return replace(sequence, observations=replace(seen, track_id=track_id))
+
+
 def persistent_mismatch(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
     """Let a share of the tracks slip to a point 5 to 30 px nearer to the middle, and follow that one to their end."""
     slipped = with_slips(sequence.observations, dose, sequence.rig, np.random.default_rng(seed))

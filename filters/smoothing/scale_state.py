@@ -1,0 +1,59 @@
+"""The scale of all disparities as a variable of a smoother's graph: its prior, its covariance, what is said of it.
+
+The tracks alone do not tell it: with it the whole world, path and landmarks, grows and shrinks. What is measured of the
+motion does, so the scale takes up what vision and motion samples differ by on the whole. It cannot tell which of both
+is right, but by its prior.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from filters.smoothing.indeterminate import no_covariances
+from toolkit.estimate import Trajectory
+from toolkit.models.factors import SCALE
+from toolkit.models.motion import MotionModel
+from toolkit.models.state_covariances import covs_beside
+
+# A standard deviation above this share of the prior's is that of something the measurements say nothing of.
+_UNTOLD = 0.95
+
+
+@dataclass(frozen=True)
+class ScaleState:
+    """A scale of disparities that is 0 but for a standard deviation."""
+
+    prior_sigma: float
+
+    def add_to(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """Add the variable, at 0, and its prior."""
+        values.insert(SCALE, np.zeros(1))
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, self.prior_sigma)
+        graph.add(gtsam.PriorFactorVector(SCALE, np.zeros(1), noise))
+
+    def with_covariances(
+        self,
+        trajectory: Trajectory,
+        linear: gtsam.GaussianFactorGraph,
+        landmark_keys: Sequence[int],
+        motion: MotionModel,
+        scale: float,
+    ) -> tuple[Trajectory, tuple[str, ...]]:
+        """Return the trajectory with the covariance of every state, and what came of the scale; or why there is none.
+
+        The states are as uncertain as the scale makes them.
+        """
+        try:
+            covs, of_scale = covs_beside(linear, landmark_keys, motion, trajectory.T_world_imu, (SCALE,))
+        except RuntimeError as refusal:
+            return trajectory, (f"disparities are {100.0 * scale:+.2f} % longer", no_covariances(refusal))
+        return replace(trajectory, cov=covs), (self.in_words(scale, float(np.sqrt(of_scale[0, 0]))),)
+
+    def in_words(self, scale: float, sigma: float) -> str:
+        """Say what came of the scale."""
+        told = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
+        if sigma > _UNTOLD * self.prior_sigma:
+            return f"{told}: the measurements do not tell, and that is the prior"
+        return f"{told} (prior 0 +- {100.0 * self.prior_sigma:g} %)"

@@ -1,0 +1,92 @@
+"""The bridge over gaps between tracks: where it stands, and that its factor has the derivatives of its residual."""
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+from toolkit.geometry import se3_exp
+from toolkit.measured_motion import TwistChangeNoise
+from toolkit.models.factors import X
+from toolkit.models.gap_bridge import bridged, gaps, kept_twist
+from toolkit.sequence import StereoFrame
+
+NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
+STEP = 1e-6
+
+
+def frames_of(*track_ids):
+    return [
+        StereoFrame(k * 100_000_000, np.array(ids, dtype=np.int64), np.zeros((len(ids), 3)), np.zeros(len(ids), int))
+        for k, ids in enumerate(track_ids)
+    ]
+
+
+def values_of(poses):
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(X(k), gtsam.Pose3(pose))
+    return values
+
+
+def test_a_gap_is_where_no_track_leads_on():
+    frames = frames_of([1, 2], [2, 3], [4], [4, 5], [], [6])
+    np.testing.assert_array_equal(gaps(frames), [2, 4, 5])
+
+
+def test_a_bridge_stands_at_a_gap_and_its_neighbours_alone():
+    frames = frames_of([1], [1], [1], [1], [2], [2], [2], [2])
+    graph = bridged(frames)
+    assert [tuple(graph.at(i).keys()) for i in range(graph.size())] == [(X(2), X(3), X(4)), (X(3), X(4), X(5))]
+    assert bridged(frames_of([1], [1], [1])).size() == 0
+    # At the ends there is a neighbour on one side, or none.
+    assert bridged(frames_of([1], [2])).size() == 0
+    assert bridged(frames_of([1], [2], [2])).size() == 1
+
+
+def test_a_body_that_keeps_its_twist_costs_nothing():
+    twist = np.array([0.1, -0.2, 0.3, 8.0, 0.5, -0.2])
+    poses = [np.eye(4)]
+    for dt_s in (0.1, 0.25):
+        poses.append(poses[-1] @ se3_exp(dt_s * twist))
+    assert kept_twist(0.1, 0.25, NOISE, 2).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
+
+
+def test_a_change_of_the_twist_is_whitened_by_the_noise_over_the_time_between():
+    twists = np.array([[0.1, -0.2, 0.3, 8.0, 0.5, -0.2], [0.1, -0.2, 0.5, 8.0, 0.5, -0.2]])
+    poses = [np.eye(4)]
+    for dt_s, twist in zip((0.1, 0.2), twists, strict=True):
+        poses.append(poses[-1] @ se3_exp(dt_s * twist))
+    expected = 0.5 * (0.2 / 0.7) ** 2 / 0.15
+    assert kept_twist(0.1, 0.2, NOISE, 2).error(values_of(poses)) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_factor_has_the_derivatives_of_its_residual(seed):
+    rng = np.random.default_rng(seed)
+    steps = [se3_exp(rng.normal(0.0, 0.8, 6)), *(se3_exp(rng.normal(0.0, 0.3, 6)) for _ in range(2))]
+    poses = [steps[0], steps[0] @ steps[1], steps[0] @ steps[1] @ steps[2]]
+    factor = kept_twist(0.1, 0.15, NOISE, 2)
+
+    def whitened(at):
+        return -factor.linearize(values_of(at)).jacobian()[1]
+
+    derivatives, _ = factor.linearize(values_of(poses)).jacobian()
+    for which in range(3):
+        for i, direction in enumerate(STEP * np.eye(6)):
+            ends = [
+                [pose @ se3_exp(sign * direction) if k == which else pose for k, pose in enumerate(poses)]
+                for sign in (1.0, -1.0)
+            ]
+            numeric = (whitened(ends[0]) - whitened(ends[1])) / (2.0 * STEP)
+            # Whitened derivatives are up to 1e2: a central difference of 1e-6 is good to 1e-6 of that.
+            np.testing.assert_allclose(derivatives[:, 6 * which + i], numeric, atol=1e-4, rtol=1e-6)
+
+
+def test_intervals_are_as_long_as_their_stamps_say():
+    frames = frames_of([1], [2], [2])
+    twist = np.array([0.0, 0.0, 0.3, 8.0, 0.0, 0.0])
+    poses = [np.eye(4), se3_exp(0.1 * twist), se3_exp(0.2 * twist)]
+    assert all(later.t_ns - sooner.t_ns == 100_000_000 for sooner, later in pairwise(frames))
+    assert bridged(frames).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
