@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from filters.kalman.thinning import Thinned
+from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
@@ -24,7 +25,6 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
-IGNORES = {"tracks": "each sighting is a factor of its own in GTSAM's tree"}
 
 
 def build(setup: Setup) -> Estimator:
@@ -38,7 +38,8 @@ class FixedLag:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
         self._rig = setup.rig
-        self._tree = FixedLagTree(self._lag_ns)
+        chained = ChainedWindow(setup.rig, setup.settings.outliers.smoother_huber)
+        self._tree = FixedLagTree(self._lag_ns, chained)
         self._builder = GraphBuilder(setup)
         self._first_in_window = 0
         self._states: list[Estimate] = []

@@ -23,12 +23,17 @@ from toolkit.sequence import Packet, StereoFrame
 
 @dataclass
 class GraphExtension:
-    """New factors and values, and every state and landmark they are on."""
+    """New factors and values, and every state and landmark they are on.
+
+    ``chained`` are the sightings of the frame, by its number, whose errors hang together with earlier ones: factors of
+    them are the smoother's affair.
+    """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     state_keys: list[int] = field(default_factory=list)
     landmark_ids: list[int] = field(default_factory=list)
+    chained: tuple[StereoFrame, int] | None = None
 
 
 class GraphBuilder:
@@ -85,7 +90,10 @@ class GraphBuilder:
         points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._rig)
         for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
             extension.values.insert(L(track_id), point)
-        for factor in self._stereo.of(used, k):
-            extension.factors.add(factor)
+        if self._rig.track_noise is not None:
+            extension.chained = used, k
+        else:
+            for factor in self._stereo.of(used, k):
+                extension.factors.add(factor)
         extension.landmark_ids = used.track_ids.tolist()
         self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))

@@ -82,16 +82,15 @@ class ChainedFactors:
         norms = np.linalg.norm(self.innovations(values), axis=1)
         return float(self.loss.cost(norms)[self.sightings.counted].sum())
 
-    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return the innovations as linear factors, weighed as the loss does there."""
-        seen, chain = self.sightings, self.sightings.chain
-        predicted = self._predicted(values)
-        residual, to_pose, to_point = (
-            CHANNELS @ (seen.uv_px - predicted.uv_px)[..., None],
-            CHANNELS @ predicted.d_uv_d_pose,
-            CHANNELS @ predicted.d_uv_d_point,
-        )
-        innovation = chain.whitened(residual, residual[chain.before])[..., 0]
+    def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
+        """Return the innovations as linear factors about the values, weighed as the loss does there.
+
+        Their Jacobians are those at the same values, or at others.
+        """
+        chain = self.sightings.chain
+        innovation = self.innovations(values)
+        predicted = self.predicted(values if jacobians_at is None else jacobians_at)
+        to_pose, to_point = CHANNELS @ predicted.d_uv_d_pose, CHANNELS @ predicted.d_uv_d_point
         roots = np.sqrt(self.loss.weight(np.linalg.norm(innovation, axis=1)))[:, None, None]
         own = roots * chain.whitened(to_pose, np.zeros_like(to_pose))
         before = roots * chain.whitened(np.zeros_like(to_pose), to_pose[chain.before])
@@ -100,13 +99,15 @@ class ChainedFactors:
 
     def innovations(self, values: gtsam.Values) -> Array:
         """Return what is new in each sighting (N, 3), in sigmas."""
-        return self.sightings.chain.innovations(self.sightings.uv_px - self._predicted(values).uv_px)
+        return self.sightings.chain.innovations(self.sightings.uv_px - self.predicted(values).uv_px)
 
-    def _predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
+    def predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
+        """Return what the values say of each sighting (N,)."""
         seen = self.sightings
-        poses = np.array([values.atPose3(X(k)).matrix() for k in range(int(seen.pose.max()) + 1)])
+        frames, row = np.unique(seen.pose, return_inverse=True)
+        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
         points = np.array([values.atPoint3(L(i)) for i in seen.track_ids.tolist()])
-        return stereo.predict(points[seen.point], poses[seen.pose], self.rig)
+        return stereo.predict(points[seen.point], poses[row], self.rig)
 
     def _factors(
         self, values: gtsam.Values, own: Array, before: Array, points: Array, innovation: Array
