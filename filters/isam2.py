@@ -13,10 +13,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from filters.smoothing.chained_past import ChainedPast
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
-from filters.smoothing.isam2_tree import Isam2Tree
+from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.robust import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -26,7 +28,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
-IGNORES = {"window": "it keeps every state", "tracks": "each sighting is a factor of its own in GTSAM's tree"}
+IGNORES = {"window": "it keeps every state"}
 
 
 def build(setup: Setup) -> Estimator:
@@ -40,7 +42,10 @@ class Isam2:
     def __init__(self, setup: Setup) -> None:
         self._rig, self._progress = setup.rig, setup.progress
         self._builder = GraphBuilder(setup)
-        self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m)
+        self._chained = None
+        if setup.rig.track_noise is not None:
+            self._chained = ChainedPast(setup.rig, setup.settings.outliers.smoother_huber, FROZEN_AFTER_FRAMES)
+        self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m, self._chained)
         self._stamps_ns: list[int] = []
         self._log: list[str] = []
 
@@ -48,7 +53,8 @@ class Isam2:
         """Take in one packet and return the state at its frame."""
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
-        self._note(packet, self._tree.add(extension.factors, extension.values, extension.state_keys))
+        recovery = self._tree.add(extension.factors, extension.values, extension.state_keys, extension.chained)
+        self._note(packet, recovery)
         estimate = self._newest(extension, packet)
         seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
         points = self._tree.points(map(L, seen))
@@ -59,7 +65,11 @@ class Isam2:
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
         graph, motion = self._tree.graph(), self._builder.motion
-        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping(), self._progress)
+        beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
+        start = self._tree.isam.calculateBestEstimate()
+        values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
+        if beside is not None:
+            graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(

@@ -6,54 +6,13 @@ Jacobians from there, as GTSAM's own factors do: what no sighting can tell, neit
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from filters.smoothing.robust_loss import Huber, Loss, Squares
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
-from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models.correlated_noise import Chain
-from toolkit.models.factors import L, X
+from filters.smoothing.track_chain import ChainedFactors, SightingRows
 from toolkit.sequence import StereoFrame, StereoRig
-
-
-@dataclass(frozen=True, eq=False)
-class SightingRows:
-    """N sightings in the order of time: frame (N,) by number, its stamp, track id, (uL, uR, v) (N, 3) px, age.
-
-    ``begins`` (N,) says which were the first of a landmark in the graph.
-    """
-
-    pose: IntArray
-    t_ns: IntArray
-    track_id: IntArray
-    uv_px: Array
-    age: IntArray
-    begins: BoolArray
-
-    @classmethod
-    def none(cls) -> "SightingRows":
-        """Return no rows."""
-        empty = np.empty(0, dtype=np.int64)
-        return cls(empty, empty, empty, np.empty((0, 3)), empty, np.empty(0, dtype=bool))
-
-    def followed_by(self, frame: StereoFrame, k: int) -> "SightingRows":
-        """Return the rows with those of frame k behind them."""
-        count = frame.track_ids.size
-        return SightingRows(
-            np.concatenate([self.pose, np.full(count, k)]),
-            np.concatenate([self.t_ns, np.full(count, frame.t_ns)]),
-            np.concatenate([self.track_id, frame.track_ids]),
-            np.concatenate([self.uv_px, frame.uvs_px]),
-            np.concatenate([self.age, frame.ages]),
-            np.concatenate([self.begins, ~np.isin(frame.track_ids, self.track_id)]),
-        )
-
-    def select(self, rows: BoolArray) -> "SightingRows":
-        """Return the rows of a mask (N,)."""
-        return SightingRows(*(column[rows] for column in vars(self).values()))
 
 
 class ChainedWindow:
@@ -95,27 +54,17 @@ class ChainedWindow:
 
     def keys(self) -> list[int]:
         """Return the keys of the poses and landmarks of all sightings."""
-        poses, tracks = np.unique(self._rows.pose).tolist(), np.unique(self._rows.track_id).tolist()
-        return [*map(X, poses), *map(L, tracks)]
+        return self._rows.keys()
 
     def factors(self, values: gtsam.Values, jacobians_at: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return what is new in each sighting, linear about the values; their slots are to be told."""
         if not self._rows.pose.size:
             self._since_ns = []
             return gtsam.NonlinearFactorGraph()
-        sightings = self._sightings()
-        before = np.where(sightings.chain.before >= 0, sightings.chain.before, np.arange(sightings.pose.size))
+        assert self._rig.track_noise is not None
+        sightings = self._rows.chained(self._rig.track_noise)
         chained = ChainedFactors(sightings, self._rig, self._loss)
-        in_front = chained.predicted(values).depth_m > 0.0
-        counted = sightings.counted & in_front & in_front[before]
+        counted = sightings.counted & chained.in_front(values)
+        before = np.where(sightings.chain.before >= 0, sightings.chain.before, np.arange(counted.size))
         self._since_ns = self._rows.t_ns[before[counted]].tolist()
-        return replace(chained, sightings=replace(sightings, counted=counted)).linearised(values, jacobians_at)
-
-    def _sightings(self) -> ChainedSightings:
-        """Return all sightings; what was new in those whose predecessor has left, a marginal counts."""
-        rows, noise = self._rows, self._rig.track_noise
-        assert noise is not None
-        ids, point = np.unique(rows.track_id, return_inverse=True)
-        chain = Chain.of(noise, point.astype(np.int64), rows.age)
-        counted = rows.begins | (chain.before >= 0)
-        return ChainedSightings(rows.pose, point.astype(np.int64), rows.uv_px, chain, counted, ids)
+        return chained.factors(chained.linear(values, jacobians_at), values, counted)

@@ -28,7 +28,7 @@ from toolkit.settings import Outliers
 # starts where these end.
 # Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
 # and to the last solve what is gained counts in itself, not by the whole.
-_JUMPS_STOPPING, _CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
+_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
 
 
@@ -90,7 +90,7 @@ def _solve_chained(
     sightings, frames = without_jumps(sightings, frames, jumped)
     last = ChainedFactors(sightings, rig, Squares())
     values = _only_seen(values, frames)
-    solution = solve(motion, values, _CHAIN_STOPPING, progress, "solving without jumps", last)
+    solution = solve(motion, values, CHAIN_STOPPING, progress, "solving without jumps", last)
     graph = gtsam.NonlinearFactorGraph(motion)
     graph.push_back(last.linearised(solution.values))
     return Smoothed(solution, graph, frames)

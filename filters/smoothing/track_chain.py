@@ -5,7 +5,9 @@ is new in it is a residual of both poses and of the landmark. GTSAM has no such 
 slow: here all of them are evaluated and linearised at once, and take part in a solve by their linearisation.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -16,7 +18,7 @@ from toolkit.models import stereo
 from toolkit.models.correlated_noise import Chain
 from toolkit.models.factors import L, X
 from toolkit.sequence import StereoFrame, StereoRig
-from toolkit.track_noise import CHANNELS
+from toolkit.track_noise import CHANNELS, TrackNoise
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,66 @@ class ChainedSightings:
         chain = Chain.of(rig.track_noise, point, ages)
         uv_px = np.concatenate([frame.uvs_px for frame in frames])
         return cls(pose, point, uv_px, chain, np.ones(pose.size, dtype=bool), ids)
+
+    def places(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """Return the poses (N, 4, 4) and points (N, 3) m of the sightings."""
+        frames, row = np.unique(self.pose, return_inverse=True)
+        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
+        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()])
+        return poses[row], points[self.point]
+
+
+@dataclass(frozen=True, eq=False)
+class SightingRows:
+    """N sightings in the order of time: frame (N,) by number, its stamp, track id, (uL, uR, v) (N, 3) px, age.
+
+    ``begins`` (N,) says which were the first of a landmark in the graph.
+    """
+
+    pose: IntArray
+    t_ns: IntArray
+    track_id: IntArray
+    uv_px: Array
+    age: IntArray
+    begins: BoolArray
+
+    @classmethod
+    def none(cls) -> "SightingRows":
+        """Return no rows."""
+        empty = np.empty(0, dtype=np.int64)
+        return cls(empty, empty, empty, np.empty((0, 3)), empty, np.empty(0, dtype=bool))
+
+    def followed_by(self, frame: StereoFrame, k: int) -> "SightingRows":
+        """Return the rows with those of frame k behind them."""
+        count = frame.track_ids.size
+        return SightingRows(
+            np.concatenate([self.pose, np.full(count, k)]),
+            np.concatenate([self.t_ns, np.full(count, frame.t_ns)]),
+            np.concatenate([self.track_id, frame.track_ids]),
+            np.concatenate([self.uv_px, frame.uvs_px]),
+            np.concatenate([self.age, frame.ages]),
+            np.concatenate([self.begins, ~np.isin(frame.track_ids, self.track_id)]),
+        )
+
+    def select(self, rows: BoolArray) -> "SightingRows":
+        """Return the rows of a mask (N,)."""
+        return SightingRows(*(column[rows] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Iterable["SightingRows"]) -> "SightingRows":
+        """Return several in one."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def keys(self) -> list[int]:
+        """Return the keys of the poses and landmarks of all sightings."""
+        return [*map(X, np.unique(self.pose).tolist()), *map(L, np.unique(self.track_id).tolist())]
+
+    def chained(self, noise: TrackNoise) -> ChainedSightings:
+        """Return all of them as they hang together; what is new counts where it is known what came before."""
+        ids, point = np.unique(self.track_id, return_inverse=True)
+        chain = Chain.of(noise, point.astype(np.int64), self.age)
+        counted = self.begins | (chain.before >= 0)
+        return ChainedSightings(self.pose, point.astype(np.int64), self.uv_px, chain, counted, ids)
 
 
 def without_jumps(
@@ -83,45 +145,75 @@ class ChainedFactors:
         return float(self.loss.cost(norms)[self.sightings.counted].sum())
 
     def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
-        """Return the innovations as linear factors about the values, weighed as the loss does there.
+        """Return the innovations that count as linear factors about the values, weighed as the loss does there.
 
         Their Jacobians are those at the same values, or at others.
         """
-        chain = self.sightings.chain
-        innovation = self.innovations(values)
-        predicted = self.predicted(values if jacobians_at is None else jacobians_at)
-        to_pose, to_point = CHANNELS @ predicted.d_uv_d_pose, CHANNELS @ predicted.d_uv_d_point
-        roots = np.sqrt(self.loss.weight(np.linalg.norm(innovation, axis=1)))[:, None, None]
-        own = roots * chain.whitened(to_pose, np.zeros_like(to_pose))
-        before = roots * chain.whitened(np.zeros_like(to_pose), to_pose[chain.before])
-        points = roots * chain.whitened(to_point, to_point[chain.before])
-        return self._factors(values, own, before, points, roots[:, 0] * innovation)
+        return self.factors(self.linear(values, jacobians_at), values, self.sightings.counted)
 
     def innovations(self, values: gtsam.Values) -> Array:
         """Return what is new in each sighting (N, 3), in sigmas."""
         return self.sightings.chain.innovations(self.sightings.uv_px - self.predicted(values).uv_px)
 
+    def linear(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> "LinearInnovations":
+        """Return what is new in each sighting, and how it changes with what it depends on, without a loss."""
+        chain = self.sightings.chain
+        predicted = self.predicted(values)
+        innovation = chain.innovations(self.sightings.uv_px - predicted.uv_px)
+        if jacobians_at is not None:
+            predicted = self.predicted(jacobians_at)
+        to_pose, to_point = CHANNELS @ predicted.d_uv_d_pose, CHANNELS @ predicted.d_uv_d_point
+        nothing = np.zeros_like(to_pose)
+        return LinearInnovations(
+            innovation,
+            chain.whitened(to_pose, nothing),
+            chain.whitened(nothing, to_pose[chain.before]),
+            chain.whitened(to_point, to_point[chain.before]),
+        )
+
     def predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
         """Return what the values say of each sighting (N,)."""
-        seen = self.sightings
-        frames, row = np.unique(seen.pose, return_inverse=True)
-        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
-        points = np.array([values.atPoint3(L(i)) for i in seen.track_ids.tolist()])
-        return stereo.predict(points[seen.point], poses[row], self.rig)
+        poses, points = self.sightings.places(values)
+        return stereo.predict(points, poses, self.rig)
 
-    def _factors(
-        self, values: gtsam.Values, own: Array, before: Array, points: Array, innovation: Array
-    ) -> gtsam.NonlinearFactorGraph:
+    def in_front(self, values: gtsam.Values) -> BoolArray:
+        """Say of which sightings (N,) the landmark is in front of the camera, and of the camera before."""
+        in_front, before = self.predicted(values).depth_m > 0.0, self.sightings.chain.before
+        return np.asarray(in_front & (in_front[before] | (before < 0)))
+
+    def factors(self, linear: "LinearInnovations", values: gtsam.Values, rows: BoolArray) -> gtsam.NonlinearFactorGraph:
+        """Return innovations of a mask (N,), linear about the values, as factors weighed by the loss."""
         seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
         graph = gtsam.NonlinearFactorGraph()
+        weighed = linear.scaled(np.sqrt(self.loss.weight(np.linalg.norm(linear.innovation, axis=1))))
+        innovation, own, before, points = weighed
         poses, landmarks = [X(k) for k in seen.pose.tolist()], [L(i) for i in seen.track_ids[seen.point].tolist()]
         previous = seen.chain.before.tolist()
-        for row in np.flatnonzero(seen.counted).tolist():
+        for row in np.flatnonzero(rows).tolist():
             here, landmark, last = poses[row], landmarks[row], previous[row]
             terms = (here, own[row], landmark, points[row], innovation[row], unit)
             if last >= 0:
-                linear = gtsam.JacobianFactor(poses[last], before[row], *terms)
+                factor = gtsam.JacobianFactor(poses[last], before[row], *terms)
             else:
-                linear = gtsam.JacobianFactor(*terms)
-            graph.add(gtsam.LinearContainerFactor(linear, values))
+                factor = gtsam.JacobianFactor(*terms)
+            graph.add(gtsam.LinearContainerFactor(factor, values))
         return graph
+
+
+class LinearInnovations(NamedTuple):
+    """Innovations (N, 3) in sigmas, and what they are less by a step of their pose, the one before, and their point.
+
+    ``own`` and ``before`` are (N, 3, 6), ``point`` (N, 3, 3).
+    """
+
+    innovation: Array
+    own: Array
+    before: Array
+    point: Array
+
+    def scaled(self, factors: Array) -> "LinearInnovations":
+        """Return each multiplied by a factor (N,)."""
+        column = factors[:, None, None]
+        return LinearInnovations(
+            column[:, 0] * self.innovation, column * self.own, column * self.before, column * self.point
+        )
