@@ -12,7 +12,6 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from filters.smoothing.robust_loss import Huber, Loss, Squares
 from filters.smoothing.track_chain import ChainedFactors, LinearInnovations, SightingRows
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
 from toolkit.models.factors import L
@@ -34,11 +33,12 @@ class Renewal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """N sightings, linear about poses (N, 4, 4), their own and the one before, and points (N, 3)."""
+    """N sightings, linear about poses (N, 4, 4), their own and the one before, and points (N, 3), and their weights."""
 
     own: Array
     before: Array
     points: Array
+    weight: Array
     linear: LinearInnovations
 
     @classmethod
@@ -46,20 +46,22 @@ class _Linearised:
         """Return no rows."""
         poses, blocks = np.empty((0, 4, 4)), np.empty((0, 3, 6))
         linear = LinearInnovations(np.empty((0, 3)), blocks, blocks, np.empty((0, 3, 3)))
-        return cls(poses, poses, np.empty((0, 3)), linear)
+        return cls(poses, poses, np.empty((0, 3)), np.empty(0), linear)
 
     @classmethod
     def at(cls, chained: ChainedFactors, values: gtsam.Values) -> "_Linearised":
         """Linearise sightings at values."""
         poses, points = chained.sightings.places(values)
         before = poses[chained.sightings.chain.before]
-        return cls(poses, before, points, chained.linear(values))
+        linear = chained.linear(values)
+        return cls(poses, before, points, chained.weights(linear.innovation), linear)
 
-    def innovation_at(self, now: "_Linearised") -> Array:
-        """Return what these linearisations say is new (N, 3) where others are made."""
-        steps = _step(self.own, now.own), _step(self.before, now.before), now.points - self.points
-        said = sum((by @ step[..., None])[..., 0] for by, step in zip(self.linear[1:], steps, strict=True))
-        return np.asarray(self.linear.innovation - said)
+    def differs_from(self, old: "_Linearised") -> BoolArray:
+        """Say where (N,) old linearisations are off by now, or weigh something else."""
+        steps = _step(old.own, self.own), _step(old.before, self.before), self.points - old.points
+        said = sum((by @ step[..., None])[..., 0] for by, step in zip(old.linear[1:], steps, strict=True))
+        off = np.linalg.norm(old.linear.innovation - said - self.linear.innovation, axis=1)
+        return np.asarray((off > RENEW_BEYOND) | (np.abs(self.weight / old.weight - 1.0) > RENEW_BEYOND))
 
     def select(self, rows: BoolArray) -> "_Linearised":
         """Return the rows of a mask (N,)."""
@@ -79,12 +81,12 @@ class _Linearised:
         return self._of(np.where(rows.reshape(-1, *(1,) * (old.ndim - 1)), other, old) for old, other in pairs)
 
     def _columns(self) -> list[Array]:
-        return [self.own, self.before, self.points, *self.linear]
+        return [self.own, self.before, self.points, self.weight, *self.linear]
 
     @staticmethod
     def _of(columns: Iterable[Array]) -> "_Linearised":
-        own, before, points, *linear = columns
-        return _Linearised(own, before, points, LinearInnovations(*linear))
+        own, before, points, weight, *linear = columns
+        return _Linearised(own, before, points, weight, LinearInnovations(*linear))
 
 
 def _step(start: Array, end: Array) -> Array:
@@ -95,8 +97,7 @@ class ChainedPast:
     """The sightings of all frames, those of the latest with their linearisations, and the slots of their factors."""
 
     def __init__(self, rig: StereoRig, huber: float | None, recent_frames: int) -> None:
-        self._rig, self._recent_frames = rig, recent_frames
-        self._loss: Loss = Squares() if huber is None else Huber(huber)
+        self._rig, self._huber, self._recent_frames = rig, huber, recent_frames
         self._rows, self._linearised = SightingRows.none(), _Linearised.none()
         # Where the factor of each of these sightings is, -1 for nowhere.
         self._slot = np.empty(0, dtype=np.int64)
@@ -110,10 +111,11 @@ class ChainedPast:
         self._add(frame, k)
         if not self._rows.pose.size:
             return Renewal(gtsam.NonlinearFactorGraph(), {})
-        values, chained = read(self._rows.keys()), self._chained(self._rows)
+        values = read(self._rows.keys())
+        chained = ChainedFactors.of(self._rows, self._rig, self._huber).in_front(values)
         now = _Linearised.at(chained, values)
         known = self._linearised.followed_by(now.last(frame.track_ids.size))
-        stale = chained.sightings.counted & chained.in_front(values) & ((self._slot < 0) | self._strayed(known, now))
+        stale = chained.sightings.counted & ((self._slot < 0) | now.differs_from(known))
         landmarks = map(L, self._rows.track_id[stale].tolist())
         replaced = {slot: key for slot, key in zip(self._slot[stale].tolist(), landmarks, strict=True) if slot >= 0}
         self._linearised = known.with_rows(stale, now)
@@ -144,12 +146,8 @@ class ChainedPast:
 
     def whole(self) -> ChainedFactors:
         """Return all sightings, to be linearised together."""
-        return self._chained(SightingRows.joined([*(rows for rows, _ in self._older), self._rows]))
-
-    def _chained(self, rows: SightingRows) -> ChainedFactors:
-        noise = self._rig.track_noise
-        assert noise is not None
-        return ChainedFactors(rows.chained(noise), self._rig, self._loss)
+        rows = SightingRows.joined([*(rows for rows, _ in self._older), self._rows])
+        return ChainedFactors.of(rows, self._rig, self._huber)
 
     def _add(self, frame: StereoFrame, k: int) -> None:
         """Add what frame k sees; what is no longer recent stays linearised as it is."""
@@ -157,9 +155,3 @@ class ChainedPast:
         self._older.append((self._rows.select(~stay), self._slot[~stay]))
         self._rows, self._linearised = self._rows.select(stay).followed_by(frame, k), self._linearised.select(stay)
         self._slot = np.concatenate([self._slot[stay], np.full(frame.track_ids.size, -1)])
-
-    def _strayed(self, known: _Linearised, now: _Linearised) -> BoolArray:
-        """Say which linearisations (N,) are off, or weigh something else than the loss does."""
-        off = np.linalg.norm(known.innovation_at(now) - now.linear.innovation, axis=1)
-        then, weight = (self._loss.weight(np.linalg.norm(a.linear.innovation, axis=1)) for a in (known, now))
-        return np.asarray((off > RENEW_BEYOND) | (np.abs(weight / then - 1.0) > RENEW_BEYOND))

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from filters.smoothing.robust_loss import Huber, Loss, Squares
 from filters.smoothing.track_chain import ChainedFactors, SightingRows
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -19,8 +18,7 @@ class ChainedWindow:
     """The sightings of the frames in a window, and the slots of their factors in the graph that has them."""
 
     def __init__(self, rig: StereoRig, huber: float | None) -> None:
-        self._rig = rig
-        self._loss: Loss = Squares() if huber is None else Huber(huber)
+        self._rig, self._huber = rig, huber
         self._rows = SightingRows.none()
         self._since_ns: list[int] = []
         self._slots: list[int] = []
@@ -61,10 +59,8 @@ class ChainedWindow:
         if not self._rows.pose.size:
             self._since_ns = []
             return gtsam.NonlinearFactorGraph()
-        assert self._rig.track_noise is not None
-        sightings = self._rows.chained(self._rig.track_noise)
-        chained = ChainedFactors(sightings, self._rig, self._loss)
-        counted = sightings.counted & chained.in_front(values)
-        before = np.where(sightings.chain.before >= 0, sightings.chain.before, np.arange(counted.size))
-        self._since_ns = self._rows.t_ns[before[counted]].tolist()
-        return chained.factors(chained.linear(values, jacobians_at), values, counted)
+        chained = ChainedFactors.of(self._rows, self._rig, self._huber).in_front(values)
+        counted, before = chained.sightings.counted, chained.sightings.chain.before
+        oldest = np.where(before >= 0, before, np.arange(before.size))
+        self._since_ns = self._rows.t_ns[oldest[counted]].tolist()
+        return chained.linearised(values, jacobians_at)

@@ -4,11 +4,13 @@ Sightings of tracks that have gone over to another point are left out.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
+import msgspec
 import numpy as np
 
+from filters.smoothing.alignment import aligned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
@@ -43,6 +45,7 @@ class GraphBuilder:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
         self._outlier_check = OutlierCheck(setup.rig, outliers)
+        self._aligned_check = OutlierCheck(setup.rig, msgspec.structs.replace(outliers, smoother_gate_factor=1.0))
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -52,6 +55,9 @@ class GraphBuilder:
         extension = GraphExtension()
         expected = self._add_state(packet, extension)
         sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
+        if self._rig.track_noise is not None:
+            sound = self._aligned(sound, expected)
+        self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
         return extension
 
@@ -75,8 +81,16 @@ class GraphBuilder:
             prediction = increment.predict(self.belief)
             self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
             extension.factors.push_back(increment.factors(packet.index))
-        self._add_values(packet, extension)
         return expected
+
+    def _aligned(self, frame: StereoFrame, expected: Belief) -> StereoFrame:
+        """Begin the new state where the frame puts it; return the frame without what is an outlier there.
+
+        There the gate is the filters': what the motion is off by is none of its business any more.
+        """
+        there = aligned(expected, frame, self._points, self._rig)
+        self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
+        return self._aligned_check.without_outliers(frame, self._points, relative_to_its_map(there))
 
     def _add_values(self, packet: Packet, extension: GraphExtension) -> None:
         self.motion.insert(extension.values, self.belief.estimate(packet.frame.t_ns), packet.index)

@@ -6,19 +6,23 @@ slow: here all of them are evaluated and linearised at once, and take part in a 
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.robust_loss import Loss
+from filters.smoothing.robust_loss import Huber, Loss, Squares
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import stereo
 from toolkit.models.correlated_noise import Chain
 from toolkit.models.factors import L, X
 from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.track_noise import CHANNELS, TrackNoise
+
+# Of Student's t over tracks, as fitted to all real recordings (docs/tracks.md); Gaussian ones lose a few percent by it.
+FREEDOM_OF_TRACKS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,16 +137,67 @@ def without_jumps(
 
 @dataclass(frozen=True, eq=False)
 class ChainedFactors:
-    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' lengths."""
+    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' lengths.
+
+    With ``freedom`` what is left of a track is Student-t distributed as a whole, with so many degrees of freedom: one
+    that errs more than the others throughout, as on a vehicle, counts less throughout (Lange, Little & Taylor 1989,
+    "Robust statistical modeling using the t distribution", eq. 3).
+    """
 
     sightings: ChainedSightings
     rig: StereoRig
     loss: Loss
+    freedom: float | None = None
+
+    @classmethod
+    def of(cls, rows: SightingRows, rig: StereoRig, huber: float | None) -> "ChainedFactors":
+        """Return the factors of an incremental smoother, with Huber's loss and that of whole tracks, or with neither.
+
+        The rig must state the noise of tracks.
+        """
+        assert rig.track_noise is not None
+        sightings = rows.chained(rig.track_noise)
+        if huber is None:
+            return cls(sightings, rig, Squares())
+        return cls(sightings, rig, Huber(huber), FREEDOM_OF_TRACKS)
+
+    def in_front(self, values: gtsam.Values) -> "ChainedFactors":
+        """Return them without sightings of landmarks behind the camera, or behind that of the sighting before."""
+        seen, in_front = self.sightings, self.predicted(values).depth_m > 0.0
+        in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
+        return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
     def error(self, values: gtsam.Values) -> float:
         """Return the sum of the losses, half a square each where there is none."""
-        norms = np.linalg.norm(self.innovations(values), axis=1)
-        return float(self.loss.cost(norms)[self.sightings.counted].sum())
+        costs = self.loss.cost(np.linalg.norm(self.innovations(values), axis=1))
+        if self.freedom is None:
+            return float(costs[self.sightings.counted].sum())
+        of_tracks = self._of_tracks(costs)
+        return float((0.5 * (self.freedom + self._dof) * np.log1p(2.0 * of_tracks / self.freedom)).sum())
+
+    def weights(self, innovation: Array) -> Array:
+        """Return what the squares of innovations (N, 3) count for (N,)."""
+        norms = np.linalg.norm(innovation, axis=1)
+        weights = self.loss.weight(norms)
+        if self.freedom is None:
+            return weights
+        of_tracks = self._of_tracks(self.loss.cost(norms))
+        return np.asarray(
+            weights * ((self.freedom + self._dof) / (self.freedom + 2.0 * of_tracks))[self.sightings.point]
+        )
+
+    def _of_tracks(self, costs: Array) -> Array:
+        """Return the sum of the costs (N,) of each track (M,) that count."""
+        seen = self.sightings
+        counted = np.where(seen.counted, costs, 0.0)
+        return np.asarray(np.bincount(seen.point, counted, seen.track_ids.size), dtype=float)
+
+    @cached_property
+    def _dof(self) -> Array:
+        """The degrees of freedom (M,) that the innovations of each track have: its first one places the landmark."""
+        seen = self.sightings
+        follows = seen.counted & (seen.chain.before >= 0)
+        return np.asarray(3.0 * np.bincount(seen.point, follows, seen.track_ids.size), dtype=float)
 
     def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
         """Return the innovations that count as linear factors about the values, weighed as the loss does there.
@@ -176,17 +231,11 @@ class ChainedFactors:
         poses, points = self.sightings.places(values)
         return stereo.predict(points, poses, self.rig)
 
-    def in_front(self, values: gtsam.Values) -> BoolArray:
-        """Say of which sightings (N,) the landmark is in front of the camera, and of the camera before."""
-        in_front, before = self.predicted(values).depth_m > 0.0, self.sightings.chain.before
-        return np.asarray(in_front & (in_front[before] | (before < 0)))
-
     def factors(self, linear: "LinearInnovations", values: gtsam.Values, rows: BoolArray) -> gtsam.NonlinearFactorGraph:
         """Return innovations of a mask (N,), linear about the values, as factors weighed by the loss."""
         seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
         graph = gtsam.NonlinearFactorGraph()
-        weighed = linear.scaled(np.sqrt(self.loss.weight(np.linalg.norm(linear.innovation, axis=1))))
-        innovation, own, before, points = weighed
+        innovation, own, before, points = linear.scaled(np.sqrt(self.weights(linear.innovation)))
         poses, landmarks = [X(k) for k in seen.pose.tolist()], [L(i) for i in seen.track_ids[seen.point].tolist()]
         previous = seen.chain.before.tolist()
         for row in np.flatnonzero(rows).tolist():
