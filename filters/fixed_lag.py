@@ -57,7 +57,7 @@ class FixedLag:
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
         self._note(packet, recovery)
         self._read(packet)
-        self._drop_landmarks_behind(packet)
+        self._drop_landmarks(packet)
         return self._states[-1]
 
     def finish(self) -> Finished:
@@ -84,16 +84,18 @@ class FixedLag:
         self._points |= in_tree
         self._builder.update(self._states[-1], in_tree)
 
-    def _drop_landmarks_behind(self, packet: Packet) -> None:
-        """Drop what is no longer in front of the camera that sees it, before it is linearised there."""
+    def _drop_landmarks(self, packet: Packet) -> None:
+        """Drop what is not in front of the camera any more, before it is linearised there, and what is elsewhere."""
         seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
         points = np.array([self._points[i] for i in seen]).reshape(-1, 3)
         rows = np.flatnonzero(behind_camera(points, self._states[-1].T_world_imu, self._rig))
-        behind = {seen[row] for row in rows}
-        if behind:
-            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
-            recovery = self._tree.drop(behind)
-            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
+        log = {seen[row]: "fell behind the camera" for row in rows}
+        contradicted = self._builder.contradicted() & self._last_seen_ns.keys()
+        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        if log:
+            recovery = self._tree.drop(log.keys())
+            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
+            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Keep the log of a recovery, and no point of what it dropped."""

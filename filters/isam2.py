@@ -59,7 +59,7 @@ class Isam2:
         seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
         points = self._tree.points(map(L, seen))
         self._builder.update(estimate, dict(zip(seen, points, strict=True)))
-        self._drop_landmarks_behind(seen, points, estimate, packet)
+        self._drop_landmarks(seen, points, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
@@ -83,13 +83,16 @@ class Isam2:
         cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
-    def _drop_landmarks_behind(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
-        """Drop what is no longer in front of the camera that sees it: its sightings would have no gradient."""
-        behind = {seen[row] for row in np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))}
-        if behind:
-            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
-            recovery = self._tree.drop(map(L, behind))
-            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
+    def _drop_landmarks(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
+        """Drop what is not in front of the camera any more, where sightings have no gradient, and what is elsewhere."""
+        rows = np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))
+        log = {seen[row]: "fell behind the camera" for row in rows}
+        contradicted = {i for i in self._builder.contradicted() if self._tree.has(L(i))}
+        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        if log:
+            recovery = self._tree.drop(map(L, log))
+            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
+            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Keep the log of a recovery; a landmark that was dropped begins anew with its next sighting."""

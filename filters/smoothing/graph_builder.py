@@ -12,9 +12,10 @@ import numpy as np
 
 from filters.smoothing.alignment import aligned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
+from filters.smoothing.refused_tracks import RefusedTracks
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, huber_loss
 from toolkit.models.gating import LEAST_DISPARITY_PX
@@ -46,6 +47,8 @@ class GraphBuilder:
         self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._aligned_check = OutlierCheck(setup.rig, msgspec.structs.replace(outliers, smoother_gate_factor=1.0))
+        self._refused_tracks = RefusedTracks(setup.rig, outliers.gate_probability)
+        self._refused: tuple[StereoFrame, BoolArray] | None = None
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -57,6 +60,7 @@ class GraphBuilder:
         sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
         if self._rig.track_noise is not None:
             sound = self._aligned(sound, expected)
+        self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
         self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
         return extension
@@ -66,8 +70,14 @@ class GraphBuilder:
         self.belief = self.belief.at(newest)
         self._points.update(points)
 
+    def contradicted(self) -> set[int]:
+        """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
+        assert self._refused is not None
+        return self._refused_tracks.contradicted(*self._refused, self.belief.T_world_imu)
+
     def forget(self, landmark_ids: set[int]) -> None:
         """Drop landmarks that have left the graph; seen again, they start anew."""
+        self._refused_tracks.forget(landmark_ids)
         for i in landmark_ids:
             self._points.pop(i, None)
 
