@@ -3,7 +3,11 @@
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
 causal answer is the newest state, its final answer each state as it left the window, with the covariance the window
 had for it. A landmark that fell behind the camera is dropped and begins anew with its next sighting; a variable that
-makes the window's system indeterminate is held where it is. The log says so.
+makes the window's system indeterminate is held where it is; a landmark that more sightings refuse than made it begins
+anew, where these agree. The log says so.
+
+Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
+landmark (``filters/smoothing/chained_window.py``).
 """
 
 from dataclasses import replace

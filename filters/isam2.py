@@ -4,8 +4,11 @@ What it approximates, frame by frame: a variable is relinearised once it has mov
 iteration; what none of the last 30 frames has factors on is not relinearised at all; and each frame makes one
 Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal
 answer is the newest state. For its final answer everything is linearised anew until the error stalls: that is the
-optimum of all it took in. A landmark that falls behind the camera, or makes the system indeterminate, is dropped and
-the log says so.
+optimum of all it took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by
+more sightings than made it, where these agree, is dropped and the log says so.
+
+Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
+landmark (``filters/smoothing/chained_past.py``).
 """
 
 from dataclasses import replace
