@@ -3,7 +3,11 @@
 What it approximates: what has left the window stays linearised where it was and is never corrected again. Its
 causal answer is the newest state, its final answer each state as it left the window, with the covariance the window
 had for it. A landmark that fell behind the camera is dropped and begins anew with its next sighting; a variable that
-makes the window's system indeterminate is held where it is. The log says so.
+makes the window's system indeterminate is held where it is; a landmark that more sightings refuse than made it begins
+anew, where these agree. The log says so.
+
+Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
+landmark (``filters/smoothing/chained_window.py``).
 """
 
 from dataclasses import replace
@@ -11,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from filters.kalman.thinning import Thinned
+from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
@@ -24,7 +29,6 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
-IGNORES = {"tracks": "each sighting is a factor of its own in GTSAM's tree"}
 HAS = ("bridge_gaps",)
 
 
@@ -39,7 +43,8 @@ class FixedLag:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         self._lag_ns = round(lag_s * NS_PER_S)
         self._rig = setup.rig
-        self._tree = FixedLagTree(self._lag_ns)
+        chained = ChainedWindow(setup.rig, setup.settings.outliers.smoother_huber)
+        self._tree = FixedLagTree(self._lag_ns, chained)
         self._builder = GraphBuilder(setup)
         self._first_in_window = 0
         self._states: list[Estimate] = []
@@ -57,7 +62,7 @@ class FixedLag:
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))
         self._note(packet, recovery)
         self._read(packet)
-        self._drop_landmarks_behind(packet)
+        self._drop_landmarks(packet)
         return self._states[-1]
 
     def finish(self) -> Finished:
@@ -84,16 +89,18 @@ class FixedLag:
         self._points |= in_tree
         self._builder.update(self._states[-1], in_tree)
 
-    def _drop_landmarks_behind(self, packet: Packet) -> None:
-        """Drop what is no longer in front of the camera that sees it, before it is linearised there."""
+    def _drop_landmarks(self, packet: Packet) -> None:
+        """Drop what is not in front of the camera any more, before it is linearised there, and what is elsewhere."""
         seen = [i for i, t_ns in self._last_seen_ns.items() if t_ns == packet.frame.t_ns]
         points = np.array([self._points[i] for i in seen]).reshape(-1, 3)
         rows = np.flatnonzero(behind_camera(points, self._states[-1].T_world_imu, self._rig))
-        behind = {seen[row] for row in rows}
-        if behind:
-            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
-            recovery = self._tree.drop(behind)
-            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
+        log = {seen[row]: "fell behind the camera" for row in rows}
+        contradicted = self._builder.contradicted() & self._last_seen_ns.keys()
+        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        if log:
+            recovery = self._tree.drop(log.keys())
+            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
+            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Keep the log of a recovery, and no point of what it dropped."""

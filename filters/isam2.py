@@ -4,8 +4,11 @@ What it approximates, frame by frame: a variable is relinearised once it has mov
 iteration; what none of the last 30 frames has factors on is not relinearised at all; and each frame makes one
 Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal
 answer is the newest state. For its final answer everything is linearised anew until the error stalls: that is the
-optimum of all it took in. A landmark that falls behind the camera, or makes the system indeterminate, is dropped and
-the log says so.
+optimum of all it took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by
+more sightings than made it, where these agree, is dropped and the log says so.
+
+Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
+landmark (``filters/smoothing/chained_past.py``).
 """
 
 from dataclasses import replace
@@ -13,10 +16,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from filters.smoothing.chained_past import ChainedPast
 from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
-from filters.smoothing.isam2_tree import Isam2Tree
+from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.robust import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -26,7 +31,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
-IGNORES = {"window": "it keeps every state", "tracks": "each sighting is a factor of its own in GTSAM's tree"}
+IGNORES = {"window": "it keeps every state"}
 HAS = ("bridge_gaps",)
 
 
@@ -41,7 +46,10 @@ class Isam2:
     def __init__(self, setup: Setup) -> None:
         self._rig, self._progress = setup.rig, setup.progress
         self._builder = GraphBuilder(setup)
-        self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m)
+        self._chained = None
+        if setup.rig.track_noise is not None:
+            self._chained = ChainedPast(setup.rig, setup.settings.outliers.smoother_huber, FROZEN_AFTER_FRAMES)
+        self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m, self._chained)
         self._stamps_ns: list[int] = []
         self._log: list[str] = []
 
@@ -49,18 +57,23 @@ class Isam2:
         """Take in one packet and return the state at its frame."""
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
-        self._note(packet, self._tree.add(extension.factors, extension.values, extension.state_keys))
+        recovery = self._tree.add(extension.factors, extension.values, extension.state_keys, extension.chained)
+        self._note(packet, recovery)
         estimate = self._newest(extension, packet)
         seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
         points = self._tree.points(map(L, seen))
         self._builder.update(estimate, dict(zip(seen, points, strict=True)))
-        self._drop_landmarks_behind(seen, points, estimate, packet)
+        self._drop_landmarks(seen, points, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
         graph, motion = self._tree.graph(), self._builder.motion
-        values, _, _, converged = solve(graph, self._tree.isam.calculateBestEstimate(), Stopping(), self._progress)
+        beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
+        start = self._tree.isam.calculateBestEstimate()
+        values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
+        if beside is not None:
+            graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(
@@ -74,13 +87,16 @@ class Isam2:
         cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
         return replace(estimate, cov=cov)
 
-    def _drop_landmarks_behind(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
-        """Drop what is no longer in front of the camera that sees it: its sightings would have no gradient."""
-        behind = {seen[row] for row in np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))}
-        if behind:
-            log = [f"landmark {i} fell behind the camera and was dropped" for i in sorted(behind)]
-            recovery = self._tree.drop(map(L, behind))
-            self._note(packet, Recovery(log + recovery.log, behind | recovery.dropped))
+    def _drop_landmarks(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
+        """Drop what is not in front of the camera any more, where sightings have no gradient, and what is elsewhere."""
+        rows = np.flatnonzero(behind_camera(points, estimate.T_world_imu, self._rig))
+        log = {seen[row]: "fell behind the camera" for row in rows}
+        contradicted = {i for i in self._builder.contradicted() if self._tree.has(L(i))}
+        log |= dict.fromkeys(contradicted, "was contradicted by its next sightings")
+        if log:
+            recovery = self._tree.drop(map(L, log))
+            lines = [f"landmark {i} {why} and was dropped" for i, why in sorted(log.items())]
+            self._note(packet, Recovery(lines + recovery.log, log.keys() | recovery.dropped))
 
     def _note(self, packet: Packet, recovery: Recovery) -> None:
         """Keep the log of a recovery; a landmark that was dropped begins anew with its next sighting."""

@@ -11,10 +11,11 @@ an accurate IMU alone: the window is then solved by QR, ten times as long, until
 reaches. Either way a new tree is built of the factors of the old, with the same estimates.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import gtsam
 
+from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
 from toolkit.errors import EstimatorError
@@ -27,11 +28,11 @@ RELINEARISE_BEYOND = 0.01
 class FixedLagTree:
     """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
 
-    def __init__(self, lag_ns: int) -> None:
-        self._lag_ns = lag_ns
+    def __init__(self, lag_ns: int, chained: ChainedWindow) -> None:
+        self._lag_ns, self._chained = lag_ns, chained
         self._by_qr_from_ns: int | None = None
         self._isam = self._empty_tree()
-        self._values = gtsam.Values()
+        self._values, self._left = gtsam.Values(), set[int]()
         self._oldest_ns = 0
         self._state_stamps_ns: dict[int, int] = {}
         self._landmark_stamps_ns: dict[int, int] = {}
@@ -50,6 +51,8 @@ class FixedLagTree:
         self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
         self._landmark_stamps_ns |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
         self._oldest_ns = t_ns - self._lag_ns
+        if extension.chained is not None:
+            self._chained.add(*extension.chained)
         added = self._solved(extension.factors, extension.values)
         return Recovery(back.log + added.log, back.dropped | added.dropped)
 
@@ -57,8 +60,9 @@ class FixedLagTree:
         """Build the tree anew; its estimates, now and later, are the same but for rounding."""
         return self._solved(*self._emptied())
 
-    def drop(self, track_ids: Iterable[int]) -> Recovery:
+    def drop(self, track_ids: Collection[int]) -> Recovery:
         """Take landmarks out with their sightings in the window; the others keep what older sightings added."""
+        self._chained.drop(track_ids)
         keys, factors = [L(i) for i in track_ids], self._isam.getFactorsUnsafe()
         slots = [slot for slot in range(factors.size()) if factors.exists(slot)]
         slots = [slot for slot in slots if any(_goes_with(key, factors.at(slot)) for key in keys)]
@@ -113,15 +117,46 @@ class FixedLagTree:
         # states are at every step: CCOLAMD takes no place beyond the number of variables it orders.
         moved = [*(self._landmark_stamps_ns if old_states else old_landmarks), *self._state_stamps_ns]
         known = [key for key in moved if self._isam.valueExists(key)]
-        slots, fixed = list(dropped_slots), _key_list(self._fixed)
-        self._isam.update(factors, values, slots, self._order(), fixed, _key_list(known))
+        self._add(factors, values, dropped_slots, _key_list(known))
         # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.
         self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
         still_there = [key for key in leaving if self._isam.valueExists(key)]
         if still_there:
             self._isam.marginalizeLeaves(_key_list(still_there))
+        self._chained.forget(self._oldest_ns)
         self._forget(leaving)
+        self._left = set(leaving)
+
+    def _add(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        dropped_slots: Iterable[int],
+        eliminated_anew: gtsam.KeyList,
+    ) -> None:
+        """Add factors and values, take some factors out, and linearise all chained sightings anew."""
+        before, together = self._isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph(factors)
+        slots = [*dropped_slots, *self._chained.slots]
+        together.push_back(self._relinearised(values))
+        try:
+            result = self._isam.update(together, values, slots, self._order(), _key_list(self._fixed), eliminated_anew)
+        except RuntimeError:
+            # What was new is in the tree by now: in the first slots that were free, in its order.
+            new_slots = _new_slots(before, self._isam.getFactorsUnsafe())
+            self._chained.placed(new_slots[factors.size() :])
+            raise
+        self._chained.placed(list(result.getNewFactorsIndices())[factors.size() :])
+
+    def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+        """Return the factors of chained sightings about the latest estimates, or where there are none the new."""
+        keys = self._chained.keys()
+        known = [key for key in keys if self._values.exists(key) and key not in self._left]
+        estimates = _joined(self._values.extract(known), new, keys)
+        held = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
+        in_tree = [key for key in held if self._isam.valueExists(key)]
+        at = _joined(self._isam.getLinearizationPoint().extract(in_tree), new, held)
+        return self._chained.factors(estimates, _joined(at, estimates, keys))
 
     def _forget(self, leaving: Iterable[int]) -> None:
         for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns):
@@ -136,11 +171,15 @@ class FixedLagTree:
         GTSAM's marginal factors have no linearisation point: they stay right only while their variables stay linearised
         where they are. The tree that made them holds those fixed; the next one must be given them.
         """
-        factors, values = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
+        others, values = self._isam.getFactorsUnsafe(), self._isam.getLinearizationPoint()
+        for slot in self._chained.slots:
+            others.remove(slot)
+        self._chained.placed([])
+        factors = without_gaps(others)
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
-        known = factors.keys()
-        lost = [key for key in values.keys() if not known.count(key)]  # noqa: SIM118 - not a mapping
+        known = {*factors.keyVector(), *self._chained.keys()}
+        lost = [key for key in values.keys() if key not in known]  # noqa: SIM118 - not a mapping
         for key in lost:
             values.erase(key)
         self._forget(lost)
@@ -150,6 +189,7 @@ class FixedLagTree:
         self, key: int, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return factors and values less a landmark and its sightings; what the prior has of it is marginalised."""
+        self._chained.drop([gtsam.Symbol(key).index()])
         kept = gtsam.NonlinearFactorGraph()
         for factor in (factors.at(i) for i in range(factors.size())):
             if not _goes_with(key, factor):
@@ -204,3 +244,15 @@ def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
     for key in keys:
         listed.push_back(key)
     return listed
+
+
+def _new_slots(before: gtsam.NonlinearFactorGraph, after: gtsam.NonlinearFactorGraph) -> list[int]:
+    """Return the slots, ascending, that have a factor where there was none."""
+    was = [slot < before.size() and before.exists(slot) for slot in range(after.size())]
+    return [slot for slot in range(after.size()) if after.exists(slot) and not was[slot]]
+
+
+def _joined(first: gtsam.Values, second: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
+    """Return values of keys: the first, and of keys that are not among them the second."""
+    first.insert(second.extract([key for key in keys if not first.exists(key)]))
+    return first

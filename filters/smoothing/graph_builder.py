@@ -4,15 +4,18 @@ Sightings of tracks that have gone over to another point are left out.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
+import msgspec
 import numpy as np
 
+from filters.smoothing.alignment import aligned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
+from filters.smoothing.refused_tracks import RefusedTracks
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, huber_loss
 from toolkit.models.gap_bridge import BridgeBuilder
@@ -24,12 +27,17 @@ from toolkit.sequence import Packet, StereoFrame
 
 @dataclass
 class GraphExtension:
-    """New factors and values, and every state and landmark they are on."""
+    """New factors and values, and every state and landmark they are on.
+
+    ``chained`` are the sightings of the frame, by its number, whose errors hang together with earlier ones: factors of
+    them are the smoother's affair.
+    """
 
     factors: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
     state_keys: list[int] = field(default_factory=list)
     landmark_ids: list[int] = field(default_factory=list)
+    chained: tuple[StereoFrame, int] | None = None
 
 
 class GraphBuilder:
@@ -42,6 +50,9 @@ class GraphBuilder:
         self._bridge: BridgeBuilder | None = None
         if setup.settings.noise.bridge_gaps and setup.motion_kind == "twist":
             self._bridge = BridgeBuilder(setup.settings.window.seconds(setup.motion_kind))
+        self._aligned_check = OutlierCheck(setup.rig, msgspec.structs.replace(outliers, smoother_gate_factor=1.0))
+        self._refused_tracks = RefusedTracks(setup.rig, outliers.gate_probability)
+        self._refused: tuple[StereoFrame, BoolArray] | None = None
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
@@ -51,6 +62,10 @@ class GraphBuilder:
         extension = GraphExtension()
         expected = self._add_state(packet, extension)
         sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
+        if self._rig.track_noise is not None:
+            sound = self._aligned(sound, expected)
+        self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
+        self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
         if self._bridge is not None:
             extension.factors.push_back(self._bridge.added(sound, packet.index))
@@ -61,8 +76,14 @@ class GraphBuilder:
         self.belief = self.belief.at(newest)
         self._points.update(points)
 
+    def contradicted(self) -> set[int]:
+        """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
+        assert self._refused is not None
+        return self._refused_tracks.contradicted(*self._refused, self.belief.T_world_imu)
+
     def forget(self, landmark_ids: set[int]) -> None:
         """Drop landmarks that have left the graph; seen again, they start anew."""
+        self._refused_tracks.forget(landmark_ids)
         for i in landmark_ids:
             self._points.pop(i, None)
 
@@ -76,8 +97,16 @@ class GraphBuilder:
             prediction = increment.predict(self.belief)
             self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
             extension.factors.push_back(increment.factors(packet.index))
-        self._add_values(packet, extension)
         return expected
+
+    def _aligned(self, frame: StereoFrame, expected: Belief) -> StereoFrame:
+        """Begin the new state where the frame puts it; return the frame without what is an outlier there.
+
+        There the gate is the filters': what the motion is off by is none of its business any more.
+        """
+        there = aligned(expected, frame, self._points, self._rig)
+        self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
+        return self._aligned_check.without_outliers(frame, self._points, relative_to_its_map(there))
 
     def _add_values(self, packet: Packet, extension: GraphExtension) -> None:
         self.motion.insert(extension.values, self.belief.estimate(packet.frame.t_ns), packet.index)
@@ -91,7 +120,10 @@ class GraphBuilder:
         points = stereo.triangulate_world(new.uvs_px, self.belief.T_world_imu, self._rig)
         for track_id, point in zip(new.track_ids.tolist(), points, strict=True):
             extension.values.insert(L(track_id), point)
-        for factor in self._stereo.of(used, k):
-            extension.factors.add(factor)
+        if self._rig.track_noise is not None:
+            extension.chained = used, k
+        else:
+            for factor in self._stereo.of(used, k):
+                extension.factors.add(factor)
         extension.landmark_ids = used.track_ids.tolist()
         self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))

@@ -19,11 +19,13 @@ from filters.smoothing.cached_linearisation import (
     renewed,
     with_linearisations,
 )
+from filters.smoothing.chained_past import ChainedPast
 from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
-from toolkit.models.factors import kind_of
+from toolkit.models.factors import L, kind_of
 from toolkit.models.motion import MotionModel
+from toolkit.sequence import StereoFrame
 
 # The states of so many frames are eliminated last, in the order of time, and behind them what has more sightings than
 # these: a state costs as much as two landmarks, so that a longer track is cheaper in the root than the states it spans.
@@ -44,8 +46,8 @@ MOST_RECOVERIES = 20
 class Isam2Tree:
     """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
 
-    def __init__(self, motion: MotionModel, baseline_m: float) -> None:
-        self._motion, self._baseline_m = motion, baseline_m
+    def __init__(self, motion: MotionModel, baseline_m: float, chained: ChainedPast | None = None) -> None:
+        self._motion, self._baseline_m, self._chained = motion, baseline_m, chained
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
         self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
@@ -54,29 +56,48 @@ class Isam2Tree:
         self._cached: dict[int, CachedLinearisation] = {}
         self._sightings: dict[int, list[int]] = {}
 
-    def add(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, state_keys: list[int]) -> Recovery:
+    def add(
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        state_keys: list[int],
+        seen: tuple[StereoFrame, int] | None = None,
+    ) -> Recovery:
         """Take in a frame whose new state has the given keys; return what had to be recovered.
 
-        Raises EstimatorError where the system stays indeterminate whatever is dropped.
+        ``seen`` are its sightings and its number where the tree is to chain them. Raises EstimatorError where the
+        system stays indeterminate whatever is dropped.
         """
         if self._factorization == "QR":
             self._return_to_cholesky(values)
         self._recent.append(state_keys)
-        self._frozen.add_frame(factors.keyVector())
+        self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
         cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
         watched = [(slot, factor) for slot, factor in self._cached.items() if not self._frozen.contain_all(factor.keys)]
         moved = renewed(watched, self.read)
-        return self._update(with_linearisations(factors, cached), values, cached, moved)
+        factors, stale = with_linearisations(factors, cached), list[int]()
+        if seen is not None and self._chained is not None:
+            first_slot = self._slot_count + factors.size()
+            renewal = self._chained.renewal(*seen, lambda keys: self._first_values(keys, values), first_slot)
+            factors.push_back(renewal.factors)
+            for slot, landmark in renewal.replaced.items():
+                self._sightings[landmark].remove(slot)
+            stale = list(renewal.replaced)
+        return self._update(factors, values, cached, moved, stale)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Return all factors, of the Python ones themselves and not their linearisations."""
+        """Return all factors but chained sightings, of the Python ones themselves and not their linearisations."""
         factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
         for slot, cached in self._cached.items():
             factors.replace(slot, cached.factor)
+        for slot in self._chained.slots() if self._chained else ():
+            factors.remove(slot)
         return without_gaps(factors)
 
     def drop(self, landmarks: Iterable[int]) -> Recovery:
         """Take landmarks out, with all their sightings; return what had to be recovered."""
+        landmarks = list(landmarks)
+        self._unchain(landmarks)
         slots = [slot for key in landmarks for slot in self._sightings.pop(key)]
         return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
 
@@ -97,9 +118,18 @@ class Isam2Tree:
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
 
     def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
-        values = self.read([key for key in keys if not new.exists(key)])
+        """Return values of states and landmarks: the new, and the latest of what is in the tree."""
+        known = [key for key in keys if not new.exists(key)]
+        values = self.read([key for key in known if kind_of(key) != "l"])
+        for key in known:
+            if kind_of(key) == "l":
+                values.insert(key, self.isam.calculateEstimatePoint3(key))
         values.insert(new.extract([key for key in keys if new.exists(key)]))
         return values
+
+    def _unchain(self, landmarks: list[int]) -> None:
+        if self._chained is not None:
+            self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
 
     def _update(
         self,
@@ -160,6 +190,7 @@ class Isam2Tree:
             if kind_of(key) == "l":
                 dropped.add(gtsam.Symbol(key).index())
                 log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
+                self._unchain([key])
                 for slot in self._sightings.pop(key):
                     factors.remove(slot)
                 values.erase(key)
@@ -202,6 +233,8 @@ class Isam2Tree:
         self._slot_count = len(kept)
         self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
+        if self._chained is not None:
+            self._chained.move(slot_of)
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(compact))
         self._solve_back()

@@ -7,21 +7,26 @@ of all disparities is a variable of every sighting where the values have one, wh
 sightings that err each by itself are then chains without memory.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain as chain_of
 from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 
-from filters.smoothing.robust_loss import Loss
+from filters.smoothing.robust_loss import Huber, Loss, Squares
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import stereo
 from toolkit.models.correlated_noise import Chain
 from toolkit.models.disparity_scale import d_uv_d_scale, scaled_rig
 from toolkit.models.factors import SCALE, L, X
 from toolkit.sequence import StereoFrame, StereoRig
-from toolkit.track_noise import CHANNELS
+from toolkit.track_noise import CHANNELS, TrackNoise
+
+# Of Student's t over tracks, as fitted to all real recordings (docs/tracks.md); Gaussian ones lose a few percent by it.
+FREEDOM_OF_TRACKS = 2.0
 
 # GTSAM's Python has linear factors on so many variables; on more it has conditionals, which are such factors too.
 _MOST_TERMS = 3
@@ -56,6 +61,66 @@ class ChainedSightings:
         uv_px = np.concatenate([frame.uvs_px for frame in frames])
         return cls(pose, point, uv_px, chain, np.ones(pose.size, dtype=bool), ids, channels)
 
+    def places(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """Return the poses (N, 4, 4) and points (N, 3) m of the sightings."""
+        frames, row = np.unique(self.pose, return_inverse=True)
+        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
+        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()])
+        return poses[row], points[self.point]
+
+
+@dataclass(frozen=True, eq=False)
+class SightingRows:
+    """N sightings in the order of time: frame (N,) by number, its stamp, track id, (uL, uR, v) (N, 3) px, age.
+
+    ``begins`` (N,) says which were the first of a landmark in the graph.
+    """
+
+    pose: IntArray
+    t_ns: IntArray
+    track_id: IntArray
+    uv_px: Array
+    age: IntArray
+    begins: BoolArray
+
+    @classmethod
+    def none(cls) -> "SightingRows":
+        """Return no rows."""
+        empty = np.empty(0, dtype=np.int64)
+        return cls(empty, empty, empty, np.empty((0, 3)), empty, np.empty(0, dtype=bool))
+
+    def followed_by(self, frame: StereoFrame, k: int) -> "SightingRows":
+        """Return the rows with those of frame k behind them."""
+        count = frame.track_ids.size
+        return SightingRows(
+            np.concatenate([self.pose, np.full(count, k)]),
+            np.concatenate([self.t_ns, np.full(count, frame.t_ns)]),
+            np.concatenate([self.track_id, frame.track_ids]),
+            np.concatenate([self.uv_px, frame.uvs_px]),
+            np.concatenate([self.age, frame.ages]),
+            np.concatenate([self.begins, ~np.isin(frame.track_ids, self.track_id)]),
+        )
+
+    def select(self, rows: BoolArray) -> "SightingRows":
+        """Return the rows of a mask (N,)."""
+        return SightingRows(*(column[rows] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Iterable["SightingRows"]) -> "SightingRows":
+        """Return several in one."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def keys(self) -> list[int]:
+        """Return the keys of the poses and landmarks of all sightings."""
+        return [*map(X, np.unique(self.pose).tolist()), *map(L, np.unique(self.track_id).tolist())]
+
+    def chained(self, noise: TrackNoise) -> ChainedSightings:
+        """Return all of them as they hang together; what is new counts where it is known what came before."""
+        ids, point = np.unique(self.track_id, return_inverse=True)
+        chain = Chain.of(noise, point.astype(np.int64), self.age)
+        counted = self.begins | (chain.before >= 0)
+        return ChainedSightings(self.pose, point.astype(np.int64), self.uv_px, chain, counted, ids, CHANNELS)
+
 
 def without_jumps(
     sightings: ChainedSightings, frames: list[StereoFrame], jumped: BoolArray
@@ -83,74 +148,156 @@ def without_jumps(
 
 @dataclass(frozen=True, eq=False)
 class ChainedFactors:
-    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' lengths."""
+    """Evaluates and linearises chained sightings at GTSAM's values, under a loss of the innovations' lengths.
+
+    With ``freedom`` what is left of a track is Student-t distributed as a whole, with so many degrees of freedom: one
+    that errs more than the others throughout, as on a vehicle, counts less throughout (Lange, Little & Taylor 1989,
+    "Robust statistical modeling using the t distribution", eq. 3).
+    """
 
     sightings: ChainedSightings
     rig: StereoRig
     loss: Loss
+    freedom: float | None = None
+
+    @classmethod
+    def of(cls, rows: SightingRows, rig: StereoRig, huber: float | None) -> "ChainedFactors":
+        """Return the factors of an incremental smoother, with Huber's loss and that of whole tracks, or with neither.
+
+        The rig must state the noise of tracks.
+        """
+        assert rig.track_noise is not None
+        sightings = rows.chained(rig.track_noise)
+        if huber is None:
+            return cls(sightings, rig, Squares())
+        return cls(sightings, rig, Huber(huber), FREEDOM_OF_TRACKS)
+
+    def in_front(self, values: gtsam.Values) -> "ChainedFactors":
+        """Return them without sightings of landmarks behind the camera, or behind that of the sighting before."""
+        seen, in_front = self.sightings, self.predicted(values).depth_m > 0.0
+        in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
+        return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
     def error(self, values: gtsam.Values) -> float:
         """Return the sum of the losses, half a square each where there is none."""
-        norms = np.linalg.norm(self.innovations(values), axis=1)
-        return float(self.loss.cost(norms)[self.sightings.counted].sum())
+        costs = self.loss.cost(np.linalg.norm(self.innovations(values), axis=1))
+        if self.freedom is None:
+            return float(costs[self.sightings.counted].sum())
+        of_tracks = self._of_tracks(costs)
+        return float((0.5 * (self.freedom + self._dof) * np.log1p(2.0 * of_tracks / self.freedom)).sum())
 
-    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return the innovations as linear factors, weighed as the loss does there."""
-        predicted, chain = self._predicted(values), self.sightings.chain
-        residual, to_pose, to_point, to_scale = (
-            self.sightings.channels @ change
-            for change in (
-                (self.sightings.uv_px - predicted.uv_px)[..., None],
-                predicted.d_uv_d_pose,
-                predicted.d_uv_d_point,
-                d_uv_d_scale(predicted.uv_px, scale_in(values))[..., None],
-            )
+    def weights(self, innovation: Array) -> Array:
+        """Return what the squares of innovations (N, 3) count for (N,)."""
+        norms = np.linalg.norm(innovation, axis=1)
+        weights = self.loss.weight(norms)
+        if self.freedom is None:
+            return weights
+        of_tracks = self._of_tracks(self.loss.cost(norms))
+        return np.asarray(
+            weights * ((self.freedom + self._dof) / (self.freedom + 2.0 * of_tracks))[self.sightings.point]
         )
-        innovation = chain.whitened(residual, residual[chain.before])[..., 0]
-        roots = np.sqrt(self.loss.weight(np.linalg.norm(innovation, axis=1)))[:, None, None]
-        parts = _Linearised(
-            own=roots * chain.whitened(to_pose, np.zeros_like(to_pose)),
-            before=roots * chain.whitened(np.zeros_like(to_pose), to_pose[chain.before]),
-            point=roots * chain.whitened(to_point, to_point[chain.before]),
-            scale=roots * chain.whitened(to_scale, to_scale[chain.before]),
-            innovation=roots[:, 0] * innovation,
-        )
-        return self._factors(values, parts)
+
+    def _of_tracks(self, costs: Array) -> Array:
+        """Return the sum of the costs (N,) of each track (M,) that count."""
+        seen = self.sightings
+        counted = np.where(seen.counted, costs, 0.0)
+        return np.asarray(np.bincount(seen.point, counted, seen.track_ids.size), dtype=float)
+
+    @cached_property
+    def _dof(self) -> Array:
+        """The degrees of freedom (M,) that the innovations of each track have: its first one places the landmark."""
+        seen = self.sightings
+        follows = seen.counted & (seen.chain.before >= 0)
+        return np.asarray(3.0 * np.bincount(seen.point, follows, seen.track_ids.size), dtype=float)
+
+    def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
+        """Return the innovations that count as linear factors about the values, weighed as the loss does there.
+
+        Their Jacobians are those at the same values, or at others.
+        """
+        linear = self.linear(values, jacobians_at)
+        return self.factors(linear, values, self.sightings.counted, self._to_scale(values))
 
     def innovations(self, values: gtsam.Values) -> Array:
         """Return what is new in each sighting (N, 3), in sigmas."""
-        residual = (self.sightings.uv_px - self._predicted(values).uv_px) @ self.sightings.channels.T
-        return self.sightings.chain.whitened(residual, residual[self.sightings.chain.before])
+        return self._innovations(self.predicted(values))
 
-    def _predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
-        seen, rig = self.sightings, scaled_rig(self.rig, scale_in(values)) if values.exists(SCALE) else self.rig
-        poses = np.array([values.atPose3(X(k)).matrix() for k in range(int(seen.pose.max()) + 1)])
-        points = np.array([values.atPoint3(L(i)) for i in seen.track_ids.tolist()])
-        return stereo.predict(points[seen.point], poses[seen.pose], rig)
+    def _innovations(self, predicted: stereo.StereoPrediction) -> Array:
+        seen = self.sightings
+        residual = (seen.uv_px - predicted.uv_px) @ seen.channels.T
+        return seen.chain.whitened(residual, residual[seen.chain.before])
 
-    def _factors(self, values: gtsam.Values, parts: "_Linearised") -> gtsam.NonlinearFactorGraph:
+    def linear(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> "LinearInnovations":
+        """Return what is new in each sighting, and how it changes with what it depends on, without a loss."""
+        chain = self.sightings.chain
+        predicted = self.predicted(values)
+        innovation = self._innovations(predicted)
+        if jacobians_at is not None:
+            predicted = self.predicted(jacobians_at)
+        channels = self.sightings.channels
+        to_pose, to_point = channels @ predicted.d_uv_d_pose, channels @ predicted.d_uv_d_point
+        nothing = np.zeros_like(to_pose)
+        return LinearInnovations(
+            innovation,
+            chain.whitened(to_pose, nothing),
+            chain.whitened(nothing, to_pose[chain.before]),
+            chain.whitened(to_point, to_point[chain.before]),
+        )
+
+    def predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
+        """Return what the values say of each sighting (N,)."""
+        poses, points = self.sightings.places(values)
+        rig = scaled_rig(self.rig, scale_in(values)) if values.exists(SCALE) else self.rig
+        return stereo.predict(points, poses, rig)
+
+    def _to_scale(self, values: gtsam.Values) -> Array | None:
+        """Return how the innovations change with the scale (N, 3, 1) where the values have one."""
+        if not values.exists(SCALE):
+            return None
+        seen = self.sightings
+        to_scale = seen.channels @ d_uv_d_scale(self.predicted(values).uv_px, scale_in(values))[..., None]
+        return seen.chain.whitened(to_scale, to_scale[seen.chain.before])
+
+    def factors(
+        self, linear: "LinearInnovations", values: gtsam.Values, rows: BoolArray, to_scale: Array | None = None
+    ) -> gtsam.NonlinearFactorGraph:
+        """Return innovations of a mask (N,), linear about the values, as factors weighed by the loss.
+
+        ``to_scale`` (N, 3, 1) is how they change with a scale of disparities among the values.
+        """
         seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
-        graph, has_scale = gtsam.NonlinearFactorGraph(), values.exists(SCALE)
+        graph = gtsam.NonlinearFactorGraph()
+        roots = np.sqrt(self.weights(linear.innovation))
+        innovation, own, before, points = linear.scaled(roots)
         poses, landmarks = [X(k) for k in seen.pose.tolist()], [L(i) for i in seen.track_ids[seen.point].tolist()]
         previous = seen.chain.before.tolist()
-        for row in np.flatnonzero(seen.counted).tolist():
-            terms = [(poses[row], parts.own[row]), (landmarks[row], parts.point[row])]
+        for row in np.flatnonzero(rows).tolist():
+            terms = [(poses[row], own[row]), (landmarks[row], points[row])]
             if previous[row] >= 0:
-                terms.insert(0, (poses[previous[row]], parts.before[row]))
-            if has_scale:
-                terms.append((SCALE, parts.scale[row]))
-            graph.add(gtsam.LinearContainerFactor(_linear(terms, parts.innovation[row], unit), values))
+                terms.insert(0, (poses[previous[row]], before[row]))
+            if to_scale is not None:
+                terms.append((SCALE, roots[row] * to_scale[row]))
+            graph.add(gtsam.LinearContainerFactor(_linear(terms, innovation[row], unit), values))
         return graph
 
 
-class _Linearised(NamedTuple):
-    """Derivatives (N, 3, ...) of what is new in N sightings, by their pose, the pose before, landmark and scale."""
+class LinearInnovations(NamedTuple):
+    """Innovations (N, 3) in sigmas, and what they are less by a step of their pose, the one before, and their point.
 
+    ``own`` and ``before`` are (N, 3, 6), ``point`` (N, 3, 3).
+    """
+
+    innovation: Array
     own: Array
     before: Array
     point: Array
-    scale: Array
-    innovation: Array
+
+    def scaled(self, factors: Array) -> "LinearInnovations":
+        """Return each multiplied by a factor (N,)."""
+        column = factors[:, None, None]
+        return LinearInnovations(
+            column[:, 0] * self.innovation, column * self.own, column * self.before, column * self.point
+        )
 
 
 def _linear(terms: list[tuple[int, Array]], residual: Array, unit: gtsam.noiseModel.Unit) -> gtsam.JacobianFactor:

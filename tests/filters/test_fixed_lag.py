@@ -8,6 +8,7 @@ import pytest
 
 from filters.fixed_lag import FixedLag
 from filters.smoothing import indeterminate
+from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.graph_builder import GraphExtension
 from toolkit.estimate import Estimate
@@ -18,6 +19,11 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+
+
+def unchained(lag_ns: int) -> FixedLagTree:
+    """Return a tree whose factors are its own."""
+    return FixedLagTree(lag_ns, ChainedWindow(DRIVE.rig, None))
 
 
 def setup_of(sequence: Sequence) -> Setup:
@@ -56,7 +62,7 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
     The fixes pull each position away from where it begins, beyond the threshold of relinearisation: a prior that
     followed its variables there would pull the less.
     """
-    window, everything = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
+    window, everything = unchained(2 * NS_PER_S), gtsam.NonlinearFactorGraph()
     start = gtsam.Values()
     for k in range(8):
         extension = chain_link(k)
@@ -93,7 +99,7 @@ def test_a_point_that_moves_with_the_car_does_not_end_it(tracks, seed, depth_m, 
 def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sightings(monkeypatch):
     """A hold that holds nothing stands for one that is too weak."""
     monkeypatch.setattr(indeterminate, "WEAK_SIGMA", 1e200)
-    window, extension = FixedLagTree(NS_PER_S), chain_link(0)
+    window, extension = unchained(NS_PER_S), chain_link(0)
     extension.landmark_ids = [5, 6]
     for i, seen in ((5, 1.0), (6, 0.0)):
         information = gtsam.noiseModel.Diagonal.Precisions(np.full(3, seen))
@@ -110,7 +116,7 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
 
 def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_told_before():
     """The position that saw it has left, so the prior holds the landmark: it is marginalised, not cut out."""
-    window, everything, start = FixedLagTree(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    window, everything, start = unchained(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(5):
         extension = chain_link(k)
         sighting = gtsam.BetweenFactorPoint3(X(k), L(5), np.array([7.0 - k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
@@ -148,7 +154,7 @@ class BrokenOff:
 
 def test_a_landmark_without_sightings_does_not_come_into_a_tree_built_anew():
     """GTSAM, asked to marginalise a variable that is in no clique, ends the process."""
-    window, extension = FixedLagTree(2 * NS_PER_S), chain_link(0)
+    window, extension = unchained(2 * NS_PER_S), chain_link(0)
     extension.landmark_ids = [5]
     extension.values.insert(L(5), np.array([7.0, 0.0, 0.0]))
     unit = gtsam.noiseModel.Unit.Create(3)

@@ -50,12 +50,13 @@ def values_of(poses, points):
 LOSSES = [Squares(), Huber(1.5), Cauchy(2.0)]
 
 
+@pytest.mark.parametrize("freedom", [None, 2.0])
 @pytest.mark.parametrize("loss", LOSSES, ids=["squares", "huber", "cauchy"])
-def test_the_linear_factors_have_the_gradient_of_the_cost(scene, loss):
+def test_the_linear_factors_have_the_gradient_of_the_cost(scene, loss, freedom):
     frames, poses, points = scene
-    vision, values = ChainedFactors(ChainedSightings.of(frames, RIG), RIG, loss), values_of(poses, points)
+    vision, values = ChainedFactors(ChainedSightings.of(frames, RIG), RIG, loss, freedom), values_of(poses, points)
     gradient = vision.linearised(values).linearize(values).gradientAtZero()
-    rng, step = np.random.default_rng(0), 1e-6
+    rng, step = np.random.default_rng(0), 3e-7
     for _ in range(3):
         delta = gtsam.VectorValues()
         for key in values.keys():  # noqa: SIM118 - not a mapping
@@ -71,6 +72,19 @@ def scaled(delta, values, factor):
     for key in values.keys():  # noqa: SIM118 - not a mapping
         result.insert(key, factor * delta.at(key))
     return result
+
+
+def test_a_track_that_errs_throughout_counts_less_throughout_and_the_others_as_they_did(scene):
+    frames, poses, points = scene
+    off_px = [np.where(frame.track_ids == 4, 5.0 * k, 0.0)[:, None] for k, frame in enumerate(frames)]
+    moved = [replace(frame, uvs_px=frame.uvs_px + off) for frame, off in zip(frames, off_px, strict=True)]
+    before, after = (ChainedFactors(ChainedSightings.of(seen, RIG), RIG, Squares(), 2.0) for seen in (frames, moved))
+    weights = [one.weights(one.innovations(values_of(poses, points))) for one in (before, after)]
+    of_it = before.sightings.point == 4
+    np.testing.assert_array_equal(weights[0][~of_it], weights[1][~of_it])
+    assert np.ptp(weights[1][of_it]) == 0.0
+    # Every track errs by some 5 sigmas a step; this one by 17 in each of two channels, so that it counts a tenth.
+    assert weights[1][of_it][0] < 0.15 * weights[0][of_it][0]
 
 
 def test_smart_says_of_the_poses_what_the_chain_says_once_its_landmarks_are_eliminated(scene):

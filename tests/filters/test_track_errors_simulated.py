@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters import msckf_fej, msckf_slam
+from filters import fixed_lag, msckf_fej, msckf_slam
 from toolkit.metrics import score_run
 from toolkit.runner import run
 from toolkit.settings import POLICIES, Settings
@@ -18,7 +18,7 @@ SCENARIO = replace(FLIGHT, duration_s=3.0, camera=replace(FLIGHT.camera, max_tra
 SETTINGS = Settings(outliers=POLICIES["none"])
 
 
-@pytest.mark.parametrize("estimator", [msckf_fej, msckf_slam], ids=lambda module: module.__name__[8:])
+@pytest.mark.parametrize("estimator", [msckf_fej, msckf_slam, fixed_lag], ids=lambda module: module.__name__[8:])
 def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(estimator, oracle):
     told, white = [], []
     for seed in range(2):

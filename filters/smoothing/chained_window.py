@@ -1,0 +1,66 @@
+"""The chained sightings of an incremental smoother: frames come, states and landmarks leave, and factors are renewed.
+
+The graph has their linearisations, in every frame new ones about the latest estimates: the residuals are then exact,
+and the weights of the loss are those of the residuals. A variable that a marginal holds where it was linearised has its
+Jacobians from there, as GTSAM's own factors do: what no sighting can tell, neither sightings nor marginal then claim.
+"""
+
+from collections.abc import Iterable
+
+import gtsam
+import numpy as np
+
+from filters.smoothing.track_chain import ChainedFactors, SightingRows
+from toolkit.sequence import StereoFrame, StereoRig
+
+
+class ChainedWindow:
+    """The sightings of the frames in a window, and the slots of their factors in the graph that has them."""
+
+    def __init__(self, rig: StereoRig, huber: float | None) -> None:
+        self._rig, self._huber = rig, huber
+        self._rows = SightingRows.none()
+        self._since_ns: list[int] = []
+        self._slots: list[int] = []
+
+    @property
+    def slots(self) -> list[int]:
+        """Return where in the graph the factors are."""
+        return self._slots
+
+    def add(self, frame: StereoFrame, k: int) -> None:
+        """Take in what frame k sees of landmarks."""
+        self._rows = self._rows.followed_by(frame, k)
+
+    def drop(self, track_ids: Iterable[int]) -> None:
+        """Let the sightings of some landmarks go."""
+        self._rows = self._rows.select(~np.isin(self._rows.track_id, list(track_ids)))
+
+    def placed(self, slots: Iterable[int]) -> None:
+        """Take down where the factors that were returned last have their places."""
+        self._slots = list(slots)
+
+    def forget(self, oldest_ns: int) -> None:
+        """Let older frames go, with the factors on them, which a marginal has taken up.
+
+        Such are the innovations of the next sightings, too. Those that follow go on from the sightings that stay.
+        """
+        self._rows = self._rows.select(self._rows.t_ns >= oldest_ns)
+        kept = [since_ns >= oldest_ns for since_ns in self._since_ns]
+        self._slots = [slot for slot, stays in zip(self._slots, kept, strict=True) if stays]
+        self._since_ns = [since_ns for since_ns in self._since_ns if since_ns >= oldest_ns]
+
+    def keys(self) -> list[int]:
+        """Return the keys of the poses and landmarks of all sightings."""
+        return self._rows.keys()
+
+    def factors(self, values: gtsam.Values, jacobians_at: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+        """Return what is new in each sighting, linear about the values; their slots are to be told."""
+        if not self._rows.pose.size:
+            self._since_ns = []
+            return gtsam.NonlinearFactorGraph()
+        chained = ChainedFactors.of(self._rows, self._rig, self._huber).in_front(values)
+        counted, before = chained.sightings.counted, chained.sightings.chain.before
+        oldest = np.where(before >= 0, before, np.arange(before.size))
+        self._since_ns = self._rows.t_ns[oldest[counted]].tolist()
+        return chained.linearised(values, jacobians_at)

@@ -1,0 +1,133 @@
+"""fixed-lag and isam2 on sightings that hang together along their tracks: against batch, the bound, and themselves."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.batch import Batch
+from filters.fixed_lag import FixedLag
+from filters.isam2 import Isam2
+from filters.smoothing.alignment import aligned
+from toolkit.estimator import Setup
+from toolkit.geometry import se3_exp, se3_inverse, se3_log, transform
+from toolkit.models import stereo
+from toolkit.models.factors import L, kind_of
+from toolkit.models.motion import motion_model
+from toolkit.sequence import StereoFrame
+from toolkit.settings import POLICIES, Settings
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.track_noise import TrackNoise
+
+NOISE = TrackNoise(np.full(3, 0.02), np.array([0.09, 0.13, 0.11]), np.array([0.0, 0.9, 0.0]))
+NO_LOSS = Settings(outliers=POLICIES["none"])
+SHORT_DRIVE = replace(DRIVE, duration_s=2.0, camera=replace(DRIVE.camera, max_tracks=25))
+SHORT_FLIGHT = replace(FLIGHT, duration_s=0.8, camera=replace(FLIGHT.camera, max_tracks=25))
+
+
+def setup_of(sequence, settings=NO_LOSS):
+    s = sequence
+    return Setup(s.rig, s.noise, s.prior, s.gravity_world, s.motion_kind, settings=settings)
+
+
+def endless(setup):
+    return FixedLag(setup, 100.0)
+
+
+def finished(estimator, sequence):
+    for packet in sequence.packets():
+        estimator.step(packet)
+    return estimator.finish()
+
+
+@pytest.mark.parametrize("scenario", [SHORT_DRIVE, SHORT_FLIGHT], ids=lambda s: s.name)
+def test_with_everything_in_the_window_they_are_the_batch(scenario, oracle):
+    """Held equal: everything but the solver. fixed-lag takes one Gauss-Newton step a frame, which leaves the newest
+    landmarks a step short; isam2 solves in the end as batch does.
+    """
+    sequence = oracle.with_track_errors(scenario, NOISE, 3)
+    best = finished(Batch(setup_of(sequence)), sequence).trajectory
+    sigma = np.sqrt(np.diagonal(best.cov, axis1=1, axis2=2))[:, :6]
+    for build, sigmas in ((endless, 0.25), (Isam2, 0.01)):
+        answer = finished(build(setup_of(sequence)), sequence).trajectory
+        off = se3_log(se3_inverse(best.T_world_imu) @ answer.T_world_imu)
+        assert (np.abs(off) < sigmas * sigma).all()
+        for one, other in zip(answer.cov, best.cov, strict=True):
+            oracle.assert_covariances_agree(one, other, 0.05)
+
+
+@pytest.mark.parametrize("scenario", [SHORT_DRIVE, SHORT_FLIGHT], ids=lambda s: s.name)
+def test_what_leaves_the_window_is_neither_counted_twice_nor_forgotten(scenario, oracle):
+    """The newest state against the step from the truth with the whole covariance of every track, and its marginal.
+
+    What has left stays linearised where it was, and the chain forgets (0.02 / 0.9)^2 of an offset at every step.
+    """
+    sequence = oracle.with_track_errors(scenario, NOISE, 5)
+    best, cov = oracle.batch_of(scenario, sequence, 5).state(sequence.frame_count - 1)
+    for seen, efficient in ((sequence, True), (replace(sequence, rig=replace(sequence.rig, track_noise=None)), False)):
+        estimator = FixedLag(setup_of(seen), 0.3)
+        newest = [estimator.step(packet) for packet in seen.packets()][-1]
+        claimed = np.trace(np.linalg.solve(cov, newest.cov)) / len(cov)
+        beyond = oracle.error_at(sequence, newest) - best
+        excess = beyond @ np.linalg.solve(cov, beyond) / len(cov)
+        assert ((abs(claimed - 1.0) < 0.03) and excess < 0.05) == efficient, (claimed, excess)
+
+
+def test_a_tree_built_anew_in_mid_run_leaves_every_later_answer_as_it_was(oracle):
+    """To rounding, and to the second order of what a frame still moves what it holds."""
+    sequence, runs = oracle.with_track_errors(SHORT_DRIVE, NOISE, 1), []
+    for rebuilt_at in (None, sequence.frame_count // 2):
+        estimator, estimates = FixedLag(setup_of(sequence), 0.5), []
+        for packet in sequence.packets():
+            if packet.index == rebuilt_at:
+                assert estimator._tree.rebuild().log == []
+            estimates.append(estimator.step(packet))
+        runs.append(estimates)
+    for one, other in zip(*runs, strict=True):
+        off = se3_log(se3_inverse(one.T_world_imu) @ other.T_world_imu)
+        assert (np.abs(off) < 1e-3 * np.sqrt(np.diagonal(one.cov)[:6])).all()
+
+
+def test_the_slots_of_isam2_are_those_of_its_chained_sightings_whatever_was_dropped_or_built_anew(oracle):
+    sequence = oracle.with_track_errors(SHORT_DRIVE, NOISE, 2)
+    estimator, dropped = Isam2(setup_of(sequence, Settings())), None
+    for packet in sequence.packets():
+        estimator.step(packet)
+        tree = estimator._tree
+        if packet.index == 8:
+            dropped = int(packet.frame.track_ids[0])
+            assert tree.drop([L(dropped)]).log == []
+            estimator._builder.forget({dropped})
+            tree._rebuild(gtsam.NonlinearFactorGraph(tree.isam.getFactorsUnsafe()), tree.isam.calculateBestEstimate())
+        factors = tree.isam.getFactorsUnsafe()
+        slots = {slot for slot in range(factors.size()) if factors.exists(slot) and any_landmark(factors.at(slot))}
+        assert set(estimator._chained.slots()) == slots
+    rows = estimator._chained.whole().sightings
+    assert (rows.pose[rows.track_ids[rows.point] == dropped] > 8).all()
+
+
+def any_landmark(factor):
+    keys = factor.keys()
+    return any(kind_of(key) == "l" for key in keys)
+
+
+def test_a_state_begins_where_its_sightings_put_it_though_the_motion_is_off_and_some_are_mismatched():
+    """Noise of half a pixel on 40 points: a tenth of a pixel of the pose, where the motion is off by eight."""
+    rng, rig = np.random.default_rng(1), DRIVE.rig
+    ids = np.arange(40)
+    points = transform(rig.T_imu_cam, np.column_stack([rng.uniform(-4.0, 4.0, (40, 2)), rng.uniform(8.0, 25.0, 40)]))
+    uvs_px = stereo.predict(points, np.eye(4), rig).uv_px + 0.5 * rng.standard_normal((40, 3))
+    uvs_px[:10] += rng.uniform(20.0, 60.0, (10, 3))
+    off = se3_exp(np.array([0.008, -0.01, 0.01, 0.05, 0.05, -0.05]))
+    expected = replace(belief_at(off), cov=np.eye(9) * 0.02**2)
+    frame = StereoFrame(0, ids, uvs_px, np.zeros_like(ids))
+    found = aligned(expected, frame, dict(zip(ids.tolist(), points, strict=True)), rig)
+    moved_px = stereo.predict(points, found.T_world_imu, rig).uv_px - stereo.predict(points, np.eye(4), rig).uv_px
+    assert np.sqrt(np.square(moved_px).mean()) < 0.3
+    assert aligned(expected, frame, {}, rig) is expected
+
+
+def belief_at(pose):
+    belief = motion_model(DRIVE.motion.noise, DRIVE.gravity_world).initial_belief(simulate(SHORT_DRIVE, 0).prior)
+    return replace(belief, T_world_imu=pose)
