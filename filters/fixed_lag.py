@@ -28,7 +28,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 90, "+ relinearisation, every sighting used at once, every landmark a variable"
+RUNG, CHANGE = 90, "+ relinearisation, every sighting kept at once, every landmark a variable"
 HAS = ("bridge_gaps",)
 
 

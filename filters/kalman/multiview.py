@@ -84,12 +84,15 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     What was not seen is zero throughout.
     """
     whitener, seen = rig.whitener, sightings.seen[..., None]
-    now = _seen_from(poses, points, rig)
-    there = now if poses_at is poses else _seen_from(poses_at, points, rig)
-    residuals = np.where(seen, (sightings.uvs_px - now.uv_px) @ whitener.T, 0.0)
+    there = stereo.linearise(_in_imu(poses_at, points), poses_at[:, :3, :3], rig)
+    if poses_at is poses:
+        uv_px, depth_m = there.uv_px, there.depth_m
+    else:
+        uv_px, depth_m = stereo.images(_in_imu(poses, points), rig)
+    residuals = np.where(seen, (sightings.uvs_px - uv_px) @ whitener.T, 0.0)
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
-    return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, now.depth_m, np.inf))
+    return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))
 
 
 def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
@@ -118,12 +121,11 @@ def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoR
     return points
 
 
-def _seen_from(poses: Array, points: Array, rig: StereoRig) -> stereo.StereoPrediction:
-    """Predict points (F, 3) from each pose (W, 4, 4), all with leading axes (F, W)."""
+def _in_imu(poses: Array, points: Array) -> Array:
+    """Return points (F, 3) of the world in the IMU frame of each pose (W, 4, 4), (F, W, 3)."""
     T_imu_world = se3_inverse(poses)
     rotated = points @ np.swapaxes(T_imu_world[:, :3, :3], 1, 2)
-    points_imu = np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
-    return stereo.linearise(points_imu, poses[:, :3, :3], rig)
+    return np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
 
 
 class Constraints(NamedTuple):

@@ -1,10 +1,11 @@
 """The multi-state constraint Kalman filter: a window of cloned poses, tied by tracks whose landmarks are eliminated.
 
 What it approximates: a track corrects once, when it ends or the oldest pose that saw it leaves, and poses that left
-the window are never corrected again (Mourikis & Roumeliotis 2007). A pose leaves once it is older than the window
-reaches, as a state does in the smoothers. With ``landmarks`` the tracks that span the window stay in the state, up to
-that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for vision-aided
-inertial navigation").
+the window are never corrected again (Mourikis & Roumeliotis 2007). The answer at a frame is the state given the tracks
+still in view as well; of that nothing is kept (:mod:`filters.kalman.tracks_in_view`). A pose leaves once it is older
+than the window reaches, as a state does in the smoothers. With ``landmarks`` the tracks that span the window stay in
+the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for
+vision-aided inertial navigation").
 
 Where the rig states noise of tracks, the sightings of a track correct with their whole covariance, and a landmark in
 the state has the error of its track beside it. What is approximated: a track that lives on after it was used starts
@@ -21,6 +22,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.track_gate import TrackGate, track_test
+from filters.kalman.tracks_in_view import TracksInView
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
@@ -34,7 +36,7 @@ from toolkit.track_noise import TrackNoise
 
 
 class SlidingWindowFilter:
-    """Propagate, clone, correct by landmarks and by finished tracks, drop the poses older than the window.
+    """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
 
     ``landmarks`` is how many long-lived landmarks the state may have.
     """
@@ -49,6 +51,7 @@ class SlidingWindowFilter:
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
         self._tracks = WindowTracks()
         self._track_test = track_test(setup.compilation)
+        self._in_view = TracksInView(linearisation, setup.rig, setup.settings.outliers)
         self._memory = LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:
@@ -63,7 +66,8 @@ class SlidingWindowFilter:
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
         self._forget_clones(leaving)
-        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
+        now = self._in_view.corrected(self._joint, self._tracks.unused())
+        return now.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
         """Return every landmark that was ever triangulated, as last known."""
@@ -158,6 +162,10 @@ class WindowTracks:
     def seen_by(self, which: BoolArray) -> BoolArray:
         """Say which tracks (A,) any of some poses (W,) has seen."""
         return np.asarray(self._seen[:, which].any(axis=1))
+
+    def unused(self) -> TrackSightings:
+        """Return the sightings of all A tracks."""
+        return TrackSightings(self._ids, self._uvs_px, self._seen, self._ages)
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""

@@ -52,7 +52,7 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
     """
     if not len(seen):
         return np.empty((0, 3)), np.empty(0, dtype=bool)
-    start, wide = _nearest(uvs_px, seen, poses, rig)
+    start, wide = nearest_view(uvs_px, seen, poses, rig)
     views = _views(uvs_px, seen, poses, rig)
     fit, damping = _fit(start, views, rig), np.full(len(start), FIRST_DAMPING)
     for _ in range(ITERATIONS):
@@ -67,7 +67,7 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
     return fit.points, wide & (fit.depth_m > LEAST_DEPTH_M)
 
 
-def _nearest(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
+def nearest_view(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
     """Return where the sighting with the largest disparity puts each point (F, 3), and whether (F,) it is enough."""
     disparity_px = np.where(seen, stereo.disparity_px(uvs_px), -np.inf)
     nearest = np.argmax(disparity_px, axis=1)

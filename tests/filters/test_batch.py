@@ -21,12 +21,12 @@ def error_since_the_start(poses: Array, truth: Array) -> float:
 
 @pytest.mark.parametrize(
     ("scenario", "duration_s", "first_seed", "most"),
-    # Measured 0.68 and 0.43. Of the flight, over sixteen seeds from 0 on, 0.50, and less error under each of them.
-    [(DRIVE, 4.0, 0, 0.75), (FLIGHT, 2.0, 10, 0.5)],
+    # Measured 0.70 and 0.59; of the flight it was 0.50 until the answers of msckf-fej had the tracks in view in them.
+    [(DRIVE, 4.0, 0, 0.75), (FLIGHT, 2.0, 10, 0.65)],
     ids=["drive", "flight"],
 )
 def test_it_beats_the_filter_it_starts_from(scenario, duration_s, first_seed, most, run_estimator):
-    """It sees the future and relinearises: less error than msckf-fej under each of five seeds, by far on average.
+    """It sees the future and relinearises: less error than msckf-fej under each of five seeds, by a quarter on average.
 
     The filter has the window of each scenario for which the bounds were measured: five poses of a car, twelve of a
     flight. One of seven poses is better on the road, and four seconds of it do not always tell the two apart.

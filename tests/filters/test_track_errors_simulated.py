@@ -29,4 +29,5 @@ def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(
             found.append(score_run(result, "causal", which).values["nees_pose_mean"])
     # Errors of successive poses are nearly the same one: of two runs the mean is known to a third at best.
     assert 0.5 < np.mean(told) < 1.6
-    assert np.mean(white) > 2.5
+    # Above what is let pass for honest, by more than the mean of two runs of an honest filter varies.
+    assert np.mean(white) > 1.8

@@ -59,15 +59,26 @@ def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPr
 
     A point within a millimetre of the camera's plane is predicted as if it were a millimetre in front of it.
     """
-    points_cam = in_camera(points_imu, rig)
-    depth_m = points_cam[..., 2].copy()
-    points_cam[..., 2] = np.where(np.abs(depth_m) < _LEAST_DIVISIBLE_M, _LEAST_DIVISIBLE_M, depth_m)
+    points_cam, depth_m = _divisible(in_camera(points_imu, rig))
     d_uv_d_point_imu = projection_jacobian(points_cam, rig) @ rig.T_imu_cam[:3, :3].T
     # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the IMU frame.
     d_uv_d_pose = np.empty((*points_imu.shape, 6))
     d_uv_d_pose[..., :3], d_uv_d_pose[..., 3:] = d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu
     d_uv_d_point = d_uv_d_point_imu @ np.swapaxes(R_world_imu, -1, -2)
     return StereoPrediction(project(points_cam, rig), d_uv_d_pose, d_uv_d_point, depth_m)
+
+
+def images(points_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Return the measurements (..., 3) px and depths (...) m that :func:`linearise` predicts, without Jacobians."""
+    points_cam, depth_m = _divisible(in_camera(points_imu, rig))
+    return project(points_cam, rig), depth_m
+
+
+def _divisible(points_cam: Array) -> tuple[Array, Array]:
+    """Return points (..., 3) no nearer to the camera's plane than what a depth is divided by, and their depths."""
+    depth_m = points_cam[..., 2].copy()
+    points_cam[..., 2] = np.where(np.abs(depth_m) < _LEAST_DIVISIBLE_M, _LEAST_DIVISIBLE_M, depth_m)
+    return points_cam, depth_m
 
 
 def in_camera(points_imu: Array, rig: StereoRig) -> Array:

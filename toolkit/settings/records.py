@@ -83,8 +83,8 @@ POLICIES: Mapping[PolicyName, Outliers] = {
 }
 
 
-# Until it leaves the window or ends, a track does not correct: a longer window sees a point from further apart, and
-# carries the newest pose further by the measured motion alone. An IMU bears that for a second, a noisy twist does not.
+# A track that outlives the window starts anew, so that a longer one is better where sightings err by themselves. Real
+# tracks do not, and the filters that take them for white lose by it on drives with measured twists (docs/settings.md).
 _LAG_WITH_IMU_S, _LAG_S = 1.2, 0.6
 
 

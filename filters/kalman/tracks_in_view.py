@@ -1,0 +1,242 @@
+"""The state now as the tracks say that are still in view: for the answer alone, nothing of it is kept.
+
+A windowed filter corrects by a track once, when it ends or leaves the window. Until then the belief knows nothing of
+its sightings, and the newest pose would be carried by the measured motion alone. So the answer at a frame is the belief
+given all tracks in view, computed beside the belief and thrown away: no sighting counts twice, and up to linearisation
+it is the answer that the filter would give if every track ended here (tested).
+
+Landmarks are eliminated by the Schur complement of the normal equations (Triggs, McLauchlan, Hartley & Fitzgibbon 2000,
+"Bundle adjustment - a modern synthesis", section 6.1), which for a track is the same as projecting its rows onto the
+left null space of its landmark (Mourikis & Roumeliotis 2007, eqs. 23-24): one matrix product for all tracks. With L and
+n the information matrix and vector that is left on the clones, the update in information form gives the state's error
+as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its covariance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from filters.kalman import multiview
+from filters.kalman.gate import FrameGate
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import Linearisation
+from filters.kalman.multiview import TrackSightings
+from filters.kalman.triangulation import nearest_view
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
+from toolkit.models.state import Belief
+from toolkit.sequence import StereoRig
+from toolkit.settings import Outliers
+
+# Of its own every clone has at least this share of its variance: less is lost in rounding, and without it a pose that
+# two clones agree on to sixteen digits leaves their covariance without a root.
+_LEAST_INDEPENDENT = 1e-12
+
+
+class TracksInView:
+    """Corrects a belief by the tracks in view, and remembers of them from frame to frame what spares work.
+
+    A landmark is triangulated at its track's second sighting and follows by a Gauss-Newton step a frame. A sighting is
+    gated once, at its frame, against the window and the earlier sightings of its track; what it counts for then stays.
+    """
+
+    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers) -> None:
+        self._at, self._rig, self._outliers = at, rig, outliers
+        self._known = _Followed.none()
+
+    def corrected(self, joint: JointBelief, sightings: TrackSightings) -> Belief:
+        """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet."""
+        tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
+        rows, in_front = self._rows(joint, tracks)
+        self._known = tracks = tracks.select(in_front)
+        if not in_front.any():
+            return joint.core
+        normals = _Normals.of(rows.select(in_front))
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
+        nis = normals.newest_nis(joint.cov[joint.clone_columns, joint.clone_columns])
+        weights = gate.weights(nis, 3, gate.accepts(nis, 3))
+        tracks.weights[:, -1] = weights
+        normals = normals.newest_weighed(weights)
+        most_m = 0.2 * rows.depth_m[in_front].min(axis=1)
+        self._known = tracks._replace(points=tracks.points + _no_longer_than(most_m, normals.point_steps()))
+        return _informed(joint, *normals.of_clones())
+
+    def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "_Followed":
+        """Return the tracks with their landmarks: as last known, or as a first triangulation has them."""
+        known = self._known
+        rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
+        points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
+        still, here = np.isin(known.clone_frames, joint.clone_frames), np.isin(joint.clone_frames, known.clone_frames)
+        points[before] = known.points[rows[before]]
+        weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
+        reliable, new = before.copy(), sightings.select(~before)
+        points[~before], reliable[~before] = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
+        return _Followed(sightings, joint.clone_frames, points, weights).select(reliable)
+
+    def _rows(self, joint: JointBelief, tracks: "_Followed") -> tuple["_Rows", BoolArray]:
+        """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front."""
+        counted = tracks.sightings._replace(seen=tracks.sightings.seen & (tracks.weights > 0.0))
+        seen = multiview.linearise(counted, tracks.points, joint.clones, self._at.clones(joint), self._rig)
+        rows = _Rows(seen.residuals, seen.H_point, seen.H_pose, seen.depth_m)
+        mixing = multiview.decorrelated(seen, counted, self._rig).decorrelation
+        rows = rows if mixing is None else rows.mixed(mixing)
+        if ((tracks.weights > 0.0) & (tracks.weights < 1.0)).any():
+            rows = rows.scaled(np.sqrt(tracks.weights))
+        return rows, np.asarray(seen.depth_m.min(axis=1) > LEAST_DEPTH_M)
+
+
+class _Followed(NamedTuple):
+    """F tracks in view of W clones: points (F, 3), and what each sighting counts for (F, W), 0 if rejected."""
+
+    sightings: TrackSightings
+    clone_frames: IntArray
+    points: Array
+    weights: Array
+
+    @classmethod
+    def none(cls) -> "_Followed":
+        """Return no tracks."""
+        ids, nothing = np.empty(0, dtype=np.int64), np.empty((0, 0))
+        sightings = TrackSightings(ids, np.empty((0, 0, 3)), nothing.astype(bool), nothing.astype(np.int64))
+        return cls(sightings, ids, np.empty((0, 3)), nothing)
+
+    def select(self, rows: BoolArray) -> "_Followed":
+        """Return some of the tracks (F,)."""
+        return _Followed(self.sightings.select(rows), self.clone_frames, self.points[rows], self.weights[rows])
+
+
+class _Rows(NamedTuple):
+    """Independent rows of F tracks, by sighting: residuals (F, W, 3), Jacobians to the landmark and to poses.
+
+    ``H_point`` is (F, W, 3, 3). ``H_pose`` (F, W, 3, k) is to the pose of the sighting, k = 6, or to all, k = 6 W.
+    """
+
+    residuals: Array
+    H_point: Array
+    H_pose: Array
+    depth_m: Array
+
+    def select(self, tracks: BoolArray) -> "_Rows":
+        """Return those of some tracks (F,)."""
+        return _Rows(self.residuals[tracks], self.H_point[tracks], self.H_pose[tracks], self.depth_m[tracks])
+
+    def scaled(self, factors: Array) -> "_Rows":
+        """Return the rows of each sighting multiplied by its factor (F, W)."""
+        by = factors[..., None]
+        return _Rows(by * self.residuals, by[..., None] * self.H_point, by[..., None] * self.H_pose, self.depth_m)
+
+    def mixed(self, mixing: Array) -> "_Rows":
+        """Return what a matrix (F, 3 W, 3 W) makes of each track's rows, stacked by sighting."""
+        tracks, window = self.residuals.shape[:2]
+        residuals = (mixing @ self.residuals.reshape(tracks, 3 * window, 1)).reshape(tracks, window, 3)
+        H_point = (mixing @ self.H_point.reshape(tracks, 3 * window, 3)).reshape(tracks, window, 3, 3)
+        H_pose = np.swapaxes(multiview.by_pose(mixing) @ self.H_pose, 1, 2)
+        return _Rows(residuals, H_point, H_pose.reshape(tracks, window, 3, 6 * window), self.depth_m)
+
+
+class _Normals(NamedTuple):
+    """The normal equations of F tracks, by sighting: of the landmark ``N x = b`` and, in ``B``, of it and the poses.
+
+    N (F, W, 3, 3), b (F, W, 3), B (F, W, 3, k), with the rows that they are made of.
+    """
+
+    rows: _Rows
+    N: Array
+    b: Array
+    B: Array
+
+    @classmethod
+    def of(cls, rows: _Rows) -> "_Normals":
+        """Return those of rows."""
+        H_transposed = np.swapaxes(rows.H_point, 2, 3)
+        right = (H_transposed @ rows.residuals[..., None])[..., 0]
+        return cls(rows, H_transposed @ rows.H_point, right, H_transposed @ rows.H_pose)
+
+    def newest_nis(self, cov_clones: Array) -> Array:
+        """Return the NIS (F,) of the newest sightings, each given the window and the others of its track.
+
+        The others put the landmark at ``V (b + B x)``, V being ``N^-1``, of which the newest sees ``H V (b + B x)``.
+        """
+        rows, (tracks, window) = self.rows, self.b.shape[:2]
+        toward = -rows.H_point[:, -1] @ np.linalg.inv(self.N[:, :-1].sum(axis=1))
+        others = self.B.copy()
+        others[:, -1] = 0.0
+        H = toward @ _to_all_poses(others)
+        H[..., -rows.H_pose.shape[3] :] += rows.H_pose[:, -1]
+        innovations = rows.residuals[:, -1] + (toward @ self.b[:, :-1].sum(axis=1)[..., None])[..., 0]
+        carried = (H.reshape(3 * tracks, 6 * window) @ cov_clones).reshape(H.shape)
+        noise = np.eye(3) - toward @ np.swapaxes(rows.H_point[:, -1], 1, 2)
+        return mahalanobis_squared(innovations, carried @ np.swapaxes(H, 1, 2) + noise)
+
+    def newest_weighed(self, weights: Array) -> "_Normals":
+        """Return these with each track's newest sighting weighed (F,)."""
+        factors = np.ones(self.b.shape[:2])
+        factors[:, -1] = weights
+        by = factors[..., None]
+        rows = self.rows.scaled(np.sqrt(factors))
+        return _Normals(rows, by[..., None] * self.N, by * self.b, by[..., None] * self.B)
+
+    def point_steps(self) -> Array:
+        """Return the Gauss-Newton step (F, 3) m of each landmark, the poses as they are."""
+        return np.asarray(np.linalg.solve(self.N.sum(axis=1), self.b.sum(axis=1)[..., None])[..., 0])
+
+    def of_clones(self) -> tuple[Array, Array]:
+        """Return the information matrix (6 W, 6 W) and vector (6 W,) on the clones, without the landmarks."""
+        tracks, window = self.b.shape[:2]
+        both = np.concatenate([_to_all_poses(self.B), self.b.sum(axis=1)[..., None]], axis=2)
+        inverse_roots = np.linalg.inv(np.linalg.cholesky(self.N.sum(axis=1)))
+        by_root = (inverse_roots @ both).reshape(3 * tracks, 6 * window + 1)
+        eliminated = by_root[:, :-1].T @ by_root
+        matrix, vector = _of_poses(self.rows)
+        return matrix - eliminated[:, :-1], vector - eliminated[:, -1]
+
+
+def _to_all_poses(by_sighting: Array) -> Array:
+    """Return sums over sightings (F, W, 3, k) as columns of all poses, (F, 3, 6 W)."""
+    tracks, window, _, k = by_sighting.shape
+    if k == 6 * window:
+        return np.asarray(by_sighting.sum(axis=1))
+    return np.swapaxes(by_sighting, 1, 2).reshape(tracks, 3, 6 * window)
+
+
+def _of_poses(rows: _Rows) -> tuple[Array, Array]:
+    """Return the normal equations (6 W, 6 W), (6 W,) of the poses alone."""
+    tracks, window, _, k = rows.H_pose.shape
+    if k == 6 * window:
+        stacked = rows.H_pose.reshape(-1, k)
+        return stacked.T @ stacked, stacked.T @ rows.residuals.reshape(-1)
+    H = np.swapaxes(rows.H_pose, 0, 1).reshape(window, 3 * tracks, 6)
+    H_transposed = np.swapaxes(H, 1, 2)
+    matrix = np.zeros((window, 6, window, 6))
+    matrix[np.arange(window), :, np.arange(window)] = H_transposed @ H
+    vector = H_transposed @ np.swapaxes(rows.residuals, 0, 1).reshape(window, 3 * tracks, 1)
+    return matrix.reshape(6 * window, 6 * window), vector.reshape(6 * window)
+
+
+def _informed(joint: JointBelief, matrix: Array, vector: Array) -> Belief:
+    """Return the state now given information (6 W, 6 W), (6 W,) on the clones."""
+    core, clones = joint.core, joint.clone_columns
+    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size]
+    cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
+    root = np.linalg.cholesky(cov)
+    to_core = solve_triangular(root, cross, lower=True, check_finite=False)
+    told = root.T @ matrix @ root
+    spread = np.eye(len(told)) + told
+    moved = to_core.T @ np.linalg.solve(spread, np.column_stack([told @ to_core, root.T @ vector]))
+    return core.moved(moved[:, -1], core.cov - moved[:, :-1])
+
+
+def _no_longer_than(most_m: Array, steps: Array) -> Array:
+    """Return steps (F, 3) shortened to a length (F,) where they are longer."""
+    lengths = np.linalg.norm(steps, axis=1)
+    return np.asarray(steps * np.minimum(1.0, most_m / np.maximum(lengths, 1e-9))[:, None])
+
+
+def _rows_in(ids: IntArray, wanted: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return the row (N,) that each of the wanted ids (N,) has among ids, and whether (N,) it is there."""
+    order = np.argsort(ids)
+    places = np.searchsorted(ids, wanted, sorter=order)
+    rows = np.append(order, 0)[places]
+    there = np.append(ids, -1)[np.where(places < len(ids), rows, len(ids))] == wanted
+    return rows, np.asarray(there)
