@@ -16,7 +16,7 @@ from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.card import card_record
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
-from toolkit.report.figures.top_view import last_word
+from toolkit.report.figures.view import last_word
 from toolkit.report.messages import (
     consistency_lines,
     header_lines,

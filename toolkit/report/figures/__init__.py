@@ -12,7 +12,17 @@ from matplotlib.text import Text
 
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import against_bound, errors_over_time, frame_times, over_seeds, reprojection, top_view
+from toolkit.report.figures import (
+    against_bound,
+    components,
+    consistency,
+    error_map,
+    errors_over_time,
+    frame_times,
+    over_seeds,
+    reprojection,
+    top_view,
+)
 from toolkit.report.figures.style import NamedFigure
 
 FigureFormat = Literal["png", "pdf", "svg"]
@@ -20,11 +30,15 @@ FigureFormat = Literal["png", "pdf", "svg"]
 _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
 _OF_ONE: tuple[_Drawing, ...] = (
-    top_view.draw,
+    top_view.draw_all,
     errors_over_time.draw,
+    consistency.draw,
+    components.draw,
     against_bound.draw,
     reprojection.draw,
     frame_times.draw,
+    error_map.draw,
+    top_view.draw_each,
 )
 _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
