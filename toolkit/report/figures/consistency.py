@@ -26,6 +26,18 @@ from toolkit.report.figures.panels import (
 from toolkit.report.figures.style import BAND_COLOUR, NamedFigure, line_of
 from toolkit.resampling import NS_PER_S
 
+_OF_NEES = (
+    "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the estimator "
+    "states. In the band (grey) are 95 % of the frames of a consistent estimator; how many are stands above each "
+    "panel. Above the band an estimator is too sure of itself, below it too timid. Errors of neighbouring frames "
+    "belong together: a long stay outside may be one draw of luck, and only seeds tell."
+)
+_OF_NIS = (
+    "Innovations of each frame, squared, over what the estimator's own covariances let expect of them behind its gate "
+    "(NIS). It needs no truth. Above the band (grey, 95 %; how many are in it stands above each panel) the "
+    "measurements surprise the estimator more than they should."
+)
+
 
 class Normalised(NamedTuple):
     """Squared errors over their expectation at times (n,) s, and the band (n,), (n,) of a consistent estimator."""
@@ -41,28 +53,18 @@ class Normalised(NamedTuple):
         return 100.0 * float(np.mean((self.value >= self.low) & (self.value <= self.high)))
 
 
-def draw(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield the figure of the NEES where there is an independent truth, and that of the NIS where any is reported."""
+def draw_nees(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of the NEES where there is an independent truth."""
     of_rows = list(_found(comparison, _nees))
     if of_rows:
-        caption = (
-            "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the "
-            "estimator states. In the band (grey) are 95 % of the frames of a consistent estimator; above it an "
-            "estimator is too sure of itself, below it too timid. Errors of neighbouring frames belong together: a "
-            "long stay outside may be one draw of luck, and only seeds tell."
-        )
-        yield _figure(comparison, "pose NEES / 6", "nees_over_time", f"{caption} {_ENDS}", of_rows)
+        yield _figure(comparison, "pose NEES / 6", "nees_over_time", _OF_NEES, of_rows)
+
+
+def draw_nis(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield the figure of the NIS where any estimator reports innovations."""
     of_rows = list(_found(comparison, _nis))
     if of_rows:
-        caption = (
-            "Innovations of each frame, squared, over the covariance that the estimator expected of them and over what "
-            "is left of it behind its gate (NIS). It needs no truth. Above the band (grey, 95 %) the measurements "
-            "surprise the estimator more than they should."
-        )
-        yield _figure(comparison, "NIS / expected", "nis_over_time", f"{caption} {_ENDS}", of_rows)
-
-
-_ENDS = f"What is beyond {RANGE[0]:g} or {RANGE[1]:g} is drawn there."
+        yield _figure(comparison, "NIS / expected", "nis_over_time", _OF_NIS, of_rows)
 
 
 def _found(comparison: Comparison, of_row: Callable[[Comparison, Row], Normalised]) -> Iterator[tuple[Row, Normalised]]:

@@ -3,6 +3,7 @@
 All panels of a figure share one scale of colours, which is logarithmic: estimators differ by orders of magnitude.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -89,11 +90,15 @@ _MAP = _Kind(
 _SCALE = "All panels have one scale of colours, which is logarithmic."
 
 
-def draw(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield trajectories by position error where there is a truth, landmarks by reprojection where there are any."""
+def draw_trajectories(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield trajectories by position error, where there is a truth."""
     coloured = [found for run in comparison.runs if (found := _by_position(comparison, run)) is not None]
     if coloured:
         yield _figure(comparison, coloured, _TRAJECTORY)
+
+
+def draw_maps(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield landmarks by reprojection error, where any estimator has landmarks."""
     coloured = [found for run in comparison.runs if (found := _by_pixel(comparison, run)) is not None]
     if coloured:
         yield _figure(comparison, coloured, _MAP)
@@ -195,6 +200,6 @@ def _columns(count: int, ratio: float) -> int:
 
     def displeasure(columns: int) -> float:
         rows = -(-count // columns)
-        return abs(np.log(rows * ratio / columns / _SHAPE)) + (rows * columns - count) / count
+        return abs(math.log(rows * ratio / columns / _SHAPE)) + (rows * columns - count) / count
 
     return min(range(1, min(count, _MOST_COLUMNS) + 1), key=displeasure)
