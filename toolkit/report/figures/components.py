@@ -118,7 +118,7 @@ def _deviation(rotations: Array, covs: Array) -> Array:
 def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:
     figure = new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
-    what = "error" if comparison.sequence.truth is not None else "difference"
+    what = _what(comparison)
     start_ns = int(comparison.sequence.frames_t_ns[0])
     for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
         for i, axis in enumerate(_ROWS):
@@ -132,8 +132,14 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
     grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
     grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
     figure.align_ylabels(grid)
-    legend_below(figure, _entries(found, both, what))
+    legend_below(figure, _entries(found, both, what.split()[0]))
     return NamedFigure(f"components_{plain_name(name)}", _caption(comparison, name), figure)
+
+
+def _what(comparison: Comparison) -> str:
+    """Return how to call what is drawn: the error, or without truth the difference from whom."""
+    reference = None if comparison.sequence.truth is not None else last_good_answer(comparison)
+    return "error" if reference is None else f"difference from {reference.name}"
 
 
 def _plot(axes: Axes, one: Components, i: int, start_ns: int, shown_as: Output) -> None:
