@@ -41,7 +41,7 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert {f"trajectories/{name}.tum" for name in ("steady_causal", "steady_final", "late_final")} <= files
     assert "trajectories/late_causal.tum" not in files
     assert {f"landmarks/{run.estimator}.csv" for run in comparison.runs} <= files
-    figures = ("top_all", "errors_over_time", "reprojection")
+    figures = ("top_all", "errors_over_time")
     assert {f"figures/{name}.png" for name in figures} == {name for name in files if name.startswith("figures/")}
     assert read_metrics(target / "metrics.json") == metrics_document(comparison)
     assert read_manifest(target / "manifest.json").command == "vislam compare"

@@ -41,9 +41,9 @@ _FEW: tuple[_Drawing, ...] = (
     errors_over_time.draw,
     consistency.draw_nees,
     against_bound.draw,
-    reprojection.draw,
 )
 _MORE: tuple[_Drawing, ...] = (
+    reprojection.draw,
     consistency.draw_nis,
     frame_times.draw,
     error_map.draw_trajectories,
