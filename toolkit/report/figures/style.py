@@ -117,7 +117,7 @@ def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **p
     return owner.legend(
         handles=[entry.samples if len(entry.samples) > 1 else entry.samples[0] for entry in entries],
         labels=[entry.label for entry in entries],
-        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.4)},
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.8)},
         handlelength=long,
         ncols=columns or max(1, min(len(entries), int(WIDTH_IN * 72.0 / widest_pt))),
         columnspacing=1.4,
