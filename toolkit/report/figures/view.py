@@ -89,7 +89,9 @@ def landmarks_shown(points: Array) -> Array:
 
 def view_of(tracks: Sequence[Track], landmarks: Array) -> View:
     """Return the view of all of the tracks and of landmarks (M, 2) near them."""
-    track = np.vstack([one.xy for one in tracks]) if tracks else np.zeros((1, 2))
+    track = np.vstack([NOWHERE, *(one.xy for one in tracks)])
+    if not track.size:
+        track = np.zeros((1, 2))
     reach = max(_LANDMARK_REACH * float(np.ptp(track, axis=0).max()), _LEAST_REACH_M)
     shown = np.vstack([track, np.clip(landmarks, track.min(axis=0) - reach, track.max(axis=0) + reach)])
     low, high = shown.min(axis=0), shown.max(axis=0)
@@ -102,9 +104,10 @@ def where_tracks_coincide(tracks: Sequence[Track], view: View, at_ns: IntArray) 
 
     Returns None where no two of them ever are.
     """
-    if len(tracks) < 2 or not at_ns.size:
+    there = [track for track in tracks if track.t_ns.size]
+    if len(there) < 2 or not at_ns.size:
         return None
-    xy = np.stack([_at(track, at_ns) for track in tracks])
+    xy = np.stack([_at(track, at_ns) for track in there])
     with np.errstate(all="ignore"):
         off = np.linalg.norm(xy - _median(xy), axis=2)
     same = off < 0.5 * _COINCIDE * float(view.size.max())
