@@ -133,9 +133,11 @@ COLUMNS = "kitti_t_percent", "kitti_r_deg_per_m", "ate_yaw_m", "reproj held-out"
 recording, truth = real("ucsd/0027.npz"), real("ucsd/gt/0027.tum")
 if recording and truth:
     print("this ran on the real drive 0027, its first 400 frames, with ground truth")
+    SIMULATED = {"seeds": 3, "max_frames": 100}
     SOURCE = {"source": str(recording), "truth": truth, "max_frames": 400}
 else:
     print("0027 is not here: this ran on the simulation drive-realistic, 160 frames")
+    SIMULATED = {"seeds": 2, "max_frames": 60}
     SOURCE = {"source": "drive-realistic", "max_frames": 160}
 
 white = compare(**SOURCE, estimators=CHOSEN)
@@ -249,7 +251,7 @@ for name in CHOSEN:
 PLANTED = {"tracks": "correlated", "track_walk_px": 0.11, "track_offset_px": 0.9}
 errors_m = {}
 for told, noise in {"white": {}, "as they are": PLANTED}.items():
-    again = compare("drive-realistic", "batch", seeds=3, max_frames=100, settings={"noise": noise})
+    again = compare("drive-realistic", "batch", **SIMULATED, settings={"noise": noise})
     errors_m[told] = np.array(again.comparison.rows[-1].values("ate_yaw_m"))
     print(f"told {told:11}  mean ATE yaw {1000 * errors_m[told].mean():.0f} mm")
 ratio = errors_m["as they are"] / errors_m["white"]
