@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,9 @@ from toolkit.audit import faults
 from toolkit.datasets import load_sequence
 from toolkit.errors import VislamError
 from toolkit.estimator import LADDER, Estimator, Setup, defaults, find
+from toolkit.experiment import Comparison
 from toolkit.metrics import describe
+from toolkit.report.figures.style import NamedFigure
 from toolkit.report.table import comparison_table
 
 pytestmark = pytest.mark.usefixtures("audited_once")
@@ -147,6 +149,17 @@ def test_figures_come_by_name(result: Result, over: Result) -> None:
     assert set(over.figures) == {"errors_over_seeds", "nees_over_seeds"}
     assert all(isinstance(figure, Figure) for figure in over.figures.values())
     assert result.figures["top_all"] is result.figures["top_all"]
+    with pytest.raises(VislamError, match=r"there is no figure 'top_batch'; there are top_all, .*top_ekf"):
+        result.figures["top_batch"]
+
+
+def test_a_figure_is_drawn_without_those_that_come_after_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    def two(_: Comparison) -> Iterator[NamedFigure]:
+        yield NamedFigure("top_all", "From above.", Figure())
+        raise AssertionError("the second was not asked for")
+
+    monkeypatch.setattr(toolkit.report.figures, "drawn", two)
+    assert isinstance(Result(result.comparison).figures["top_all"], Figure)
 
 
 def test_metrics_are_those_of_the_rows_and_of_the_mean_over_seeds(result: Result, over: Result) -> None:

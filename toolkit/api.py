@@ -31,6 +31,8 @@ from toolkit.settings import DEFAULTS, Settings, as_values, settings_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from toolkit.report.figures import FigureChoice, FigureFormat
+
 Source = str | Path | Sequence
 Names = str | Iterable[str]
 
@@ -107,10 +109,11 @@ class Result:
 
     @cached_property
     def figures(self) -> Mapping[str, "Figure"]:
-        """Every figure there is data for, by the name ``vislam compare`` gives its file; drawn when first asked for."""
-        from toolkit.report.figures import drawn
+        """Every figure there is data for, by the names of docs/figures.md; each is drawn when first asked for.
 
-        return {figure.name: figure.figure for figure in drawn(self.comparison)}
+        To ask which there are draws them all.
+        """
+        return _Figures(self.comparison)
 
     @cached_property
     def metrics(self) -> Mapping[tuple[str, Output], Mapping[str, float | None]]:
@@ -126,13 +129,18 @@ class Result:
         """Yield every value as sequence, seed, estimator, output, metric, value: a table for pandas and its kin."""
         return self.comparison.records()
 
-    def save(self, directory: str | Path) -> Path:
-        """Write the run directory that ``vislam compare`` writes; raises OutputError where it cannot be."""
+    def save(
+        self, directory: str | Path, figures: "FigureChoice" = "few", figure_format: "FigureFormat" = "png"
+    ) -> Path:
+        """Write the run directory that ``vislam compare`` writes, with "few", "all" or no ("none") figures.
+
+        Raises OutputError where it cannot be written.
+        """
         from toolkit.report.run_directory import MadeBy, write_run
 
         target = Path(directory)
         asked = Configuration(Request(), self.comparison.settings)
-        write_run(self.comparison, target, MadeBy("toolkit.compare", asked))
+        write_run(self.comparison, target, MadeBy("toolkit.compare", asked, figure_format, figures))
         return target
 
     def __repr__(self) -> str:
@@ -179,6 +187,42 @@ class _Values(Mapping[str, float | None]):
 
     def __len__(self) -> int:
         return len(self._keys)
+
+
+class _Figures(Mapping[str, "Figure"]):
+    """The figures of a comparison by name, drawn in their order as far as one is asked for."""
+
+    def __init__(self, comparison: Comparison) -> None:
+        from toolkit.report.figures import drawn
+
+        self._coming = drawn(comparison)
+        self._drawn: dict[str, Figure] = {}
+
+    def __getitem__(self, name: str) -> "Figure":
+        while name not in self._drawn and self._draw_next():
+            pass
+        if name not in self._drawn:
+            raise VislamError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
+        return self._drawn[name]
+
+    def __iter__(self) -> Iterator[str]:
+        while self._draw_next():
+            pass
+        return iter(self._drawn)
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        return name in list(iter(self))
+
+    def _draw_next(self) -> bool:
+        """Draw one more; return False where there is none."""
+        figure = next(self._coming, None)
+        if figure is None:
+            return False
+        self._drawn[figure.name] = figure.figure
+        return True
 
 
 class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):

@@ -31,6 +31,8 @@ RUNS = {
 FIGURES = {
     "kitti00.png": ("kitti00", "figures/top_all.png"),
     "errors_over_time.png": ("drive", "figures/errors_over_time.png"),
+    "trajectory_error.png": ("drive", "figures/trajectory_error.png"),
+    "components.png": ("drive", "figures/components_msckf-slam.png"),
     "reprojection.png": ("drive", "figures/reprojection.png"),
     "against_bound.png": ("drive", "figures/against_bound.png"),
     "nees_over_seeds.png": ("seeds", "figures/nees_over_seeds.png"),
@@ -47,7 +49,7 @@ FIGURES = {
 def run(name: str, folder: Path) -> Path:
     """Return the run directory of a name, made in a folder."""
     out = folder / name
-    status = main([*RUNS[name].split(), "--out", str(out)])
+    status = main([*RUNS[name].split(), "--figures", "all", "--out", str(out)])
     if status not in (0, 1):  # 1: an estimator diverged, which a page may be about
         raise SystemExit(status)
     return out

@@ -82,7 +82,7 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
     assert "| by euroc | final | ok |" in re.sub(" +", " ", report)
     assert "scored: coverage 100.0 %, pairs 20." in report
     assert "ekf.euroc (EuRoC, 20 poses), not run here" in report
-    for file in ("trajectories/by_euroc_final.tum", "figures/top_by_euroc.png"):
+    for file in ("trajectories/by_euroc_final.tum", "figures/top_all.png"):
         assert (again / file).is_file()
     manifest = json.loads((again / "manifest.json").read_text())
     assert manifest["references"] == ["by tum", "by kitti", "by euroc", "by openvins", "astray"]

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from toolkit.estimate import Landmarks
 from toolkit.experiment.comparison import Comparison
@@ -19,12 +21,17 @@ from toolkit.simulation import DRIVE, simulate
 ComparisonOf = Callable[..., Comparison]
 
 
+def map_of(figure: Figure) -> Axes:
+    """Return the axes that have a map in them, of a figure with its legend in other axes."""
+    return next(axes for axes in figure.axes if axes.get_xlabel() == "x [m]")
+
+
 def test_top_view_has_equal_scale_and_a_figure_an_estimator(comparison: Comparison) -> None:
-    drawn = {name: figure for name, _, figure in top_view.draw(comparison)}
-    assert list(drawn) == ["top_steady", "top_astray", "top_late", "top_all"]
+    drawn = {name: figure for name, _, figure in (*top_view.draw_all(comparison), *top_view.draw_each(comparison))}
+    assert list(drawn) == ["top_all", "top_steady", "top_astray", "top_late"]
     for figure in drawn.values():
-        assert figure.axes[0].get_aspect() == 1.0
-        assert "[m]" in figure.axes[0].get_xlabel()
+        assert map_of(figure).get_aspect() == 1.0
+        assert "[m]" in map_of(figure).get_xlabel()
 
 
 def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, comparison_of: ComparisonOf) -> None:
@@ -32,8 +39,8 @@ def test_far_landmarks_do_not_squash_the_top_view(comparison: Comparison, compar
     points = late.landmarks.points_world.copy()
     points[:10] = 1e6
     spoiled = replace(late, landmarks=Landmarks(late.landmarks.track_ids, points))
-    (figure, _) = (figure for _, _, figure in top_view.draw(comparison_of(comparison.sequence, (spoiled,))))
-    low, high = figure.axes[0].get_xlim()
+    ((_, _, figure),) = top_view.draw_all(comparison_of(comparison.sequence, (spoiled,)))
+    low, high = map_of(figure).get_xlim()
     assert high - low < 500.0
 
 
@@ -95,7 +102,7 @@ def test_a_diverged_run_does_not_flatten_the_others(comparison: Comparison) -> N
     assert drawn.figure.axes[0].get_ylim()[1] < 2.0
 
 
-@pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw])
+@pytest.mark.parametrize("draw", [reprojection.draw, frame_times.draw, errors_over_time.draw, top_view.draw_all])
 def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: object) -> None:
     broken = replace(comparison, outcomes=comparison.outcomes[3:])
     assert callable(draw)
@@ -111,7 +118,7 @@ def test_the_bound_is_drawn_where_it_was_asked_for(comparison_of: ComparisonOf, 
     position = drawn.figure.axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
     # Dead reckoning knows less than the bound's measurements tell, so it errs beyond it; both begin with the prior.
-    assert lines["dead-reckoning causal = final"][-1] > position.get_ylim()[0]
+    assert lines["dead-reckoning both"][-1] > position.get_ylim()[0]
     assert lines["bound causal"][0] == pytest.approx(np.sqrt(np.trace(sequence.prior.cov[3:6, 3:6])), rel=1e-6)
 
 

@@ -12,6 +12,7 @@ from msgspec import to_builtins
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
+from toolkit.report.figures.components import components
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document
 
@@ -68,6 +69,16 @@ def test_errors_are_those_of_the_metric(comparison: Comparison) -> None:
     path_m = run["errors"]["path_m"]
     assert np.all(np.diff(path_m) >= 0.0)
     assert path_m[0] == 0.0
+
+
+def test_components_and_their_deviations_are_those_of_the_figure(scored: Comparison) -> None:
+    run, row = of(build(scored), "ekf"), scored.rows[0]
+    found = components(scored, row)
+    assert found is not None
+    assert found.sigma is not None
+    assert run["components"]["z_m"] == pytest.approx(found.error[:, 5], rel=1e-5, abs=1e-12)  # six digits are kept
+    assert run["components"]["sigma_about_x_deg"] == pytest.approx(found.sigma[:, 0], rel=1e-5)
+    assert "components" not in of(build(scored), "ekf", "final")
 
 
 def test_errors_of_outputs_that_agree_stand_once(comparison: Comparison) -> None:

@@ -13,8 +13,18 @@ from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, known_metrics
 from toolkit.report.report_md import report_text
-from toolkit.report.table import Table, as_markdown, as_text, change_lines, comparison_table, heading, shown_metrics
+from toolkit.report.table import (
+    Table,
+    as_markdown,
+    as_text,
+    change_lines,
+    comparison_table,
+    explained_metrics,
+    heading,
+    shown_metrics,
+)
 from toolkit.report.terminal import comparison_text
+from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]
 
@@ -125,6 +135,23 @@ def test_all_columns_are_every_metric_with_a_value(comparison: Comparison) -> No
     shown = {metric.key for metric in shown_metrics(comparison, "all")}
     with_value = {key for row in comparison.lines for key, value in row.scores.values.items() if value is not None}
     assert shown == with_value
+
+
+def test_a_real_drive_leads_with_drift_and_the_error_that_keeps_the_vertical(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    driven = rescored(comparison, lambda row: Scores(dict(row.scores.values) | {"kitti_t_percent": 1.0}))
+    real = replace(driven, sequence=replace(driven.sequence, provenance=Provenance("kitti-raw", "a drive")))
+    usual, of_real = ([metric.key for metric in shown_metrics(one)] for one in (driven, real))
+    # Before them stand only pairs and coverage, in which these rows differ.
+    assert [key for key in of_real if key not in ("pairs", "coverage_percent")][:3] == [
+        "kitti_t_percent",
+        "ate_yaw_m",
+        "ate_se3_m",
+    ]
+    assert "kitti_t_percent" not in usual
+    assert set(usual) - set(of_real) <= {"rpe_100m_percent"}
+    assert "kitti_t_percent" in {metric.key for metric in explained_metrics(real)}
 
 
 def test_an_unknown_column_is_answered_with_the_nearest(comparison: Comparison) -> None:

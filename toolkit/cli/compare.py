@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
+    from toolkit.report.run_directory import MadeBy
     from toolkit.report.table import Columns
 
 # The one with truth first: its table is the first impression.
@@ -107,6 +108,12 @@ def add_to(subcommands: Subcommands) -> None:
     add_settings_arguments(parser)
     add_workers_argument(parser)
     parser.add_argument(
+        "--figures",
+        choices=("few", "all", "none"),
+        default="few",
+        help="which to draw; docs/figures.md shows all there are (default: few)",
+    )
+    parser.add_argument(
         "--figure-format",
         choices=("png", "pdf", "svg"),
         default="png",
@@ -131,14 +138,14 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.prose import width_of_output
-    from toolkit.report.run_directory import MadeBy, directories_for, write_run
+    from toolkit.report.run_directory import directories_for, write_run
     from toolkit.report.scores_json import scores_document
     from toolkit.report.terminal import comparison_text
 
     columns = _columns(options.columns)
     asked = _configuration(options)
     plan, progress_for = _placed(_plan(asked), options), of_this_process()
-    made_by, all_ok = MadeBy(shlex.join(options.command_line), asked, options.figure_format), True
+    made_by, all_ok = _made_by(options, asked), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
@@ -157,6 +164,12 @@ def command(options: argparse.Namespace) -> int:
                 print_above(f"\nresults: {printable(str(directory))}{found}\n")
             all_ok = all_ok and comparison.all_ok
     return 0 if all_ok else 1
+
+
+def _made_by(options: argparse.Namespace, asked: Configuration) -> MadeBy:
+    from toolkit.report.run_directory import MadeBy
+
+    return MadeBy(shlex.join(options.command_line), asked, options.figure_format, options.figures)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
@@ -15,8 +15,9 @@ from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_t
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.card import card_record
 from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
+from toolkit.report.figures.components import components
 from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
-from toolkit.report.figures.top_view import last_word
+from toolkit.report.figures.view import last_word
 from toolkit.report.messages import (
     consistency_lines,
     header_lines,
@@ -28,6 +29,7 @@ from toolkit.report.messages import (
 from toolkit.report.records.report import (
     AuditWords,
     CameraFrame,
+    ComponentSeries,
     DrawnMap,
     DrawnOverSeeds,
     DrawnRun,
@@ -147,6 +149,7 @@ def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
         errors=None if errors is None else _errors(errors, start_ns),
         nees=_told_or_why(_nees, row, comparison),
         nis=_told_or_why(_nis, row, comparison),
+        components=UNSET if row.repeats_causal else _components(row, comparison),
     )
 
 
@@ -173,6 +176,19 @@ def _told_or_why(series: Callable[[Row, Comparison], Series], row: Row, comparis
             return series(row, comparison)
     except Unavailable as reason:
         return str(reason)
+
+
+def _components(row: Row, comparison: Comparison) -> ComponentSeries | UnsetType:
+    """Return errors and stated deviations by component, or nothing where there are none."""
+    with np.errstate(all="ignore"):  # as above
+        found = components(comparison, row)
+    if found is None:
+        return UNSET
+    sigma = np.full(found.error.shape, np.nan) if found.sigma is None else found.sigma
+    names = ("about_x_deg", "about_y_deg", "about_z_deg", "x_m", "y_m", "z_m")  # as the columns stand in Components
+    columns = {name: numbers(found.error[:, i]) for i, name in enumerate(names)}
+    stated = {f"sigma_{name}": numbers(sigma[:, i]) for i, name in enumerate(names)}
+    return ComponentSeries(t_s=seconds(found.t_ns, int(comparison.sequence.frames_t_ns[0])), **columns, **stated)
 
 
 def _nees(row: Row, comparison: Comparison) -> NeesSeries:

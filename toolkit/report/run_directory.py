@@ -19,7 +19,7 @@ from toolkit.experiment.pipeline import Case
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
-from toolkit.report.figures import FigureFormat, drawn, save
+from toolkit.report.figures import FigureChoice, FigureFormat, drawn, save
 from toolkit.report.figures.alignment import truth_during
 from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest, read_manifest
@@ -121,12 +121,13 @@ def unique_names(names: Iterable[str]) -> list[str]:
 class MadeBy:
     """The command line that made a comparison, and what it came to: what to compare, with which settings.
 
-    ``figures`` is the kind of files that figures are written as.
+    ``figures`` is the kind of files that figures are written as, ``choice`` which of them.
     """
 
     command: str
     asked: Configuration
     figures: FigureFormat = "png"
+    choice: FigureChoice = "few"
 
 
 def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
@@ -148,7 +149,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             _write_text(directory / REPORT, to_line(report_json.report_document(comparison, frames)))
             _write_trajectories(comparison, directory)
         (directory / "figures").mkdir()
-        captions = save(drawn(comparison), directory / "figures", made_by.figures)
+        captions = save(drawn(comparison, made_by.choice), directory / "figures", made_by.figures)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.asked)
         _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))

@@ -6,7 +6,7 @@ Which metrics have a column, under which heading and with how many decimals, is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -40,6 +40,10 @@ _LATEX = {character: rf"\{character}" for character in "&%$#_{}"} | {
 }
 # The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
 _BANDED = "nees_pose_mean"
+
+# What comes first in the table of a real drive: its drift, and the error that keeps the vertical. After an SE(3) fit
+# good estimators differ by luck there (one model solved twice differed by a metre). The drift says what the RPE would.
+_LEADING, _SAID_BY_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 
 # The columns of a table: None for the usual ones, "all", or metrics by key or name.
 Columns = None | Literal["all"] | tuple[str, ...]
@@ -136,7 +140,20 @@ def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metr
     if comparison.over_seeds:
         return tuple(metric for metric in valued if metric.over_seeds)
     differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
-    return (*differing, *(metric for metric in valued if metric.table == "always"))
+    usual = [metric for metric in valued if metric.table == "always"]
+    return (*differing, *(_for_a_drive(valued, usual) if _is_real(comparison) else usual))
+
+
+def _is_real(comparison: Comparison) -> bool:
+    return comparison.sequence.provenance.format != "simulated"
+
+
+def _for_a_drive(valued: Sequence[Metric], usual: Sequence[Metric]) -> Sequence[Metric]:
+    """Return the columns of a recording: those of a drive where it is long enough for the KITTI benchmark's drift."""
+    leading = [metric for key in _LEADING for metric in valued if metric.key == key]
+    if len(leading) < len(_LEADING):
+        return usual
+    return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SAID_BY_DRIFT))]
 
 
 def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
@@ -144,7 +161,8 @@ def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[
     if columns is None and comparison.over_seeds:
         return tuple(metric for metric in known_metrics() if metric.over_seeds)
     if columns is None:
-        return tuple(metric for metric in known_metrics() if metric.table != "on request")
+        shown = shown_metrics(comparison)
+        return tuple(metric for metric in known_metrics() if metric in shown or metric.table != "on request")
     return known_metrics() if columns == "all" else metrics_called(columns)
 
 

@@ -1,9 +1,12 @@
-"""The figures of a comparison as files, PNG, PDF or SVG, one module a figure; drawn without a display."""
+"""The figures of a comparison as files, PNG, PDF or SVG, one module a kind; drawn without a display.
+
+Reading order: style -> alignment, view, panels -> the kinds, which __init__ lists.
+"""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -12,26 +15,50 @@ from matplotlib.text import Text
 
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures import against_bound, errors_over_time, frame_times, over_seeds, reprojection, top_view
+from toolkit.report.figures import (
+    against_bound,
+    components,
+    consistency,
+    error_map,
+    errors_over_time,
+    frame_times,
+    over_seeds,
+    reprojection,
+    top_view,
+)
 from toolkit.report.figures.style import NamedFigure
 
 FigureFormat = Literal["png", "pdf", "svg"]
+# Text stays text in an SVG; in a PDF fonts are whole, as publishers ask (no Type 3).
+_IN_FILES: Any = {"svg.hashsalt": "vislam", "svg.fonttype": "none", "pdf.fonttype": 42}
 # What formats note of the time a figure was drawn, which differs where nothing else does.
 _DATE_OF: Mapping[FigureFormat, str] = {"pdf": "CreationDate", "svg": "Date"}
+FigureChoice = Literal["few", "all", "none"]
 _Drawing = Callable[[Comparison], Iterator[NamedFigure]]
-_OF_ONE: tuple[_Drawing, ...] = (
-    top_view.draw,
+# What a comparison always leaves behind, and what it does when asked: drawing takes a while, and few are looked at.
+_FEW: tuple[_Drawing, ...] = (
+    top_view.draw_all,
     errors_over_time.draw,
+    consistency.draw_nees,
     against_bound.draw,
+)
+_MORE: tuple[_Drawing, ...] = (
     reprojection.draw,
+    consistency.draw_nis,
     frame_times.draw,
+    error_map.draw_trajectories,
+    error_map.draw_maps,
+    components.draw,
+    top_view.draw_each,
 )
 _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)
 
 
-def drawn(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Draw every figure the comparison has data for."""
-    drawings = _OVER_SEEDS if comparison.over_seeds else _OF_ONE
+def drawn(comparison: Comparison, choice: FigureChoice = "all") -> Iterator[NamedFigure]:
+    """Draw the few figures that say most, or every one the comparison has data for; each when it is asked for."""
+    drawings = _OVER_SEEDS if comparison.over_seeds else _FEW + (_MORE if choice == "all" else ())
+    if choice == "none":
+        drawings = ()
     return (_literal(figure) for drawing in drawings for figure in drawing(comparison))
 
 
@@ -51,7 +78,7 @@ def _literal(drawn_one: NamedFigure) -> NamedFigure:
 def save(figures: Iterable[NamedFigure], directory: Path, kind: FigureFormat = "png") -> dict[str, str]:
     """Save figures as files of a kind; return file name -> caption, in order. The same figures give the same bytes."""
     captions: dict[str, str] = {}
-    with warnings.catch_warnings(), rc_context({"svg.hashsalt": "vislam", "svg.fonttype": "none"}):
+    with warnings.catch_warnings(), rc_context(_IN_FILES):
         # A letter that the font lacks is drawn as a box; of that nothing is to be told.
         warnings.filterwarnings("ignore", "Glyph")
         for name, caption, figure in figures:

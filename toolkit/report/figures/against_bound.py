@@ -4,7 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
+from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable
@@ -12,8 +14,11 @@ from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.figures.style import (
     TRUTH_COLOUR,
+    Entry,
     NamedFigure,
     colour_of,
+    entries_of,
+    legend_below,
     line_of,
     line_of_estimator,
     new_figure,
@@ -46,30 +51,36 @@ def _found(comparison: Comparison) -> Iterator[tuple[Row, AgainstBound]]:
 
 
 def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> NamedFigure:
-    figure = new_figure(9.6, 6.4)
+    figure = new_figure(4.8)
     position, rotation = figure.subplots(2, 1, sharex=True)
     for axes, block, scale in ((position, POSITION, 1.0), (rotation, ROTATION, 180.0 / np.pi)):
         for row, one in found:
             _plot_estimator(axes, comparison, row, one, block, scale)
         _plot_bounds(axes, comparison, found, block, scale)
-    quiet(position, f"{comparison.sequence.name}: position beyond the efficient estimate", "", "position [m]")
+    quiet(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
     quiet(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
-    figure.legend(*position.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize=9)
+    figure.align_ylabels()
+    bounds = [
+        Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))
+        for output in dict.fromkeys(row.output for row, _ in found)
+    ]
+    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, _shown_as(row)) for row, _ in found]))
     return NamedFigure("against_bound", _CAPTION, figure)
 
 
 def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
-    colour, line, t_s = (
-        colour_of(comparison, row.estimator),
-        line_of_estimator(comparison, row.estimator, row.output),
-        _seconds(comparison, one),
-    )
-    label = f"{row.estimator} {'causal = final' if row.run.final_is_causal else row.output}"
+    colour, t_s = colour_of(comparison, row.estimator), _seconds(comparison, one)
+    line, label = line_of_estimator(comparison, row.estimator, _shown_as(row)), f"{row.estimator} {row.label}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
     axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=0.7)
+
+
+def _shown_as(row: Row) -> Output:
+    """Return the output whose line a row has: a filter's only answer is drawn as a final one."""
+    return "final" if row.label == "both" else row.output
 
 
 def _plot_bounds(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.estimate import Output, Run, Trajectory
+from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, IntArray, yaw_of
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_yaw
@@ -26,6 +27,26 @@ class Errors(NamedTuple):
     path_m: Array
     position_m: Array
     heading_deg: Array
+
+
+class Answer(NamedTuple):
+    """A trajectory that others are measured against where there is no truth, and how to call it."""
+
+    name: str
+    trajectory: Trajectory
+
+
+def last_good_answer(comparison: Comparison) -> Answer | None:
+    """Return the last trajectory made here of a run that is ok: with the defaults, the smoother's.
+
+    Only where there is none is it one that was read from a file; None where no run is ok.
+    """
+    made_here_last = sorted(comparison.rows, key=lambda row: row.run.timings is not None)
+    for row in reversed(made_here_last):
+        trajectory = row.run.trajectory(row.output)
+        if row.status == "ok" and trajectory is not None:
+            return Answer(f"{row.estimator} {row.output}", trajectory)
+    return None
 
 
 def truth_during(sequence: Sequence) -> Truth | None:

@@ -7,7 +7,16 @@ from matplotlib.ticker import NullFormatter
 
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
-from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet, width_of
+from toolkit.report.figures.style import (
+    Entry,
+    NamedFigure,
+    colour_of,
+    legend_below,
+    line_of_estimator,
+    new_figure,
+    quiet,
+    width_of,
+)
 
 _MS = 1e3
 _SMOOTHED_FRAMES = 15
@@ -18,29 +27,34 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     timed = [(run, run.timings) for run in comparison.runs if run.timings is not None and run.timings.step_s.size]
     if not timed:
         return
-    figure = new_figure(9.6, 4.2)
+    figure = new_figure(3.4)
     axes = figure.add_subplot()
+    entries = []
     for run, timings in timed:
         step_ms = np.maximum(timings.step_s * _MS, 1e-4)
         colour = colour_of(comparison, run.estimator)
         axes.plot(step_ms, ".", color=colour, markersize=2.5, alpha=0.35)
         cpu_ms = _MS * timings.cpu_s / timings.step_s.size
-        label = f"{run.estimator}: mean {float(step_ms.mean()):.2f} ms,\n{cpu_ms:.2f} ms of CPU"
+        told = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
         if timings.finish_s > timings.step_s.sum():
-            label += f",\nthen {timings.finish_s:.1f} s at the end"
-        axes.plot(_running_median(step_ms), color=colour, linewidth=width_of(comparison, run.estimator), label=label)
+            told += f", end {timings.finish_s:.1f} s"
+        line = line_of_estimator(comparison, run.estimator, "final")
+        (median,) = axes.plot(
+            _running_median(step_ms), color=colour, linestyle=line, linewidth=width_of(comparison, run.estimator)
+        )
+        entries.append(Entry(told, (median,)))
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least: jitter shall not look like drama
     axes.set_ylim(low / widened, high * widened)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    quiet(axes, f"{comparison.sequence.name}: time per frame", "frame", "time of a step [ms]")
-    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
+    quiet(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
+    legend_below(figure, entries)
     caption = (
         "Wall-clock time of each step (dots) and its running median (lines). In the legend their mean, and the "
-        "processor time a frame, the finish included: on a busy machine it alone is the estimator's. An estimator that "
-        "answers only at the end does its work there; that time is in the legend, too."
+        "processor time (CPU) a frame, the finish included: on a busy machine it alone is the estimator's. An "
+        "estimator that answers only at the end does its work there; that time is in the legend, too."
     )
     yield NamedFigure("frame_times", caption, figure)
 

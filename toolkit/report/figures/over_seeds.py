@@ -3,18 +3,20 @@
 from collections.abc import Iterator
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.geometry import Array
-from toolkit.report.figures.style import NamedFigure, line_of, new_figure, quiet
-
-_COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}  # Okabe & Ito (2008)
-_BAND_COLOUR = "#cfd5da"
-_MOST_COLUMNS = 3
-_NEES_RANGE = (1e-2, 1e4)
+from toolkit.report.figures.panels import (
+    COLOUR_OF,
+    RANGE,
+    band_entry,
+    finish,
+    output_entries,
+    panels_of,
+    scale_by_decades,
+    tell_shares,
+)
+from toolkit.report.figures.style import BAND_COLOUR, NamedFigure, line_of
 
 
 def draw(over: Comparison) -> Iterator[NamedFigure]:
@@ -26,17 +28,21 @@ def draw(over: Comparison) -> Iterator[NamedFigure]:
 
 
 def _errors(over: Comparison) -> NamedFigure:
-    figure, panels = _panels(over)
+    figure, panels = panels_of(over.estimators)
+    kinds: set[Output] = set()
     for group in over.rows:
         errors_m = group.position_m
         if errors_m is None or _repeats(over, group):
             continue
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
-        axes, t_s, colour = panels[group.estimator], over.frames_s[known], _COLOUR_OF[group.output]
+        kind = _shown_as(over, group)
+        axes, t_s, colour = panels[group.estimator], over.frames_s[known], COLOUR_OF[kind]
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
-        axes.plot(t_s, median, color=colour, linestyle=line_of(group.output), linewidth=1.4, label=_label(over, group))
-    _finish(figure, panels, over, "position error [m]")
+        axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
+        kinds.add(kind)
+    title = f"{over.name}, {len(over.seeds)} seeds: position error"
+    finish(figure, panels, "position error [m]", title, output_entries(kinds))
     next(iter(panels.values())).set_ylim(bottom=0.0)
     caption = (
         f"Position error over time on {over.name}, {len(over.seeds)} seeds, not aligned: the median and, shaded, "
@@ -46,48 +52,31 @@ def _errors(over: Comparison) -> NamedFigure:
 
 
 def _nees(over: Comparison) -> NamedFigure:
-    figure, panels = _panels(over)
+    figure, panels = panels_of(over.estimators)
+    kinds: set[Output] = set()
+    shares: dict[str, list[float]] = {}
+    least, most = 1.0, 1.0
     for group in over.rows:
         nees = group.mean_nees
         if nees is None or _repeats(over, group):
             continue
         axes = panels[group.estimator]
-        axes.fill_between(over.frames_s, nees.low, nees.high, color=_BAND_COLOUR, linewidth=0.0, zorder=1)
-        label = f"{_label(over, group)}: {nees.in_band_percent:.0f} % in band"
-        shown: Array = np.clip(nees.mean, *_NEES_RANGE)
-        colour, line = _COLOUR_OF[group.output], line_of(group.output)
-        axes.plot(over.frames_s, shown, color=colour, linestyle=line, linewidth=1.2, label=label)
-        axes.set_yscale("log")
-    _finish(figure, panels, over, "pose NEES / 6")
+        axes.fill_between(over.frames_s, nees.low, nees.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
+        kind, shown = _shown_as(over, group), np.clip(nees.mean, *RANGE)
+        axes.plot(over.frames_s, shown, color=COLOUR_OF[kind], linestyle=line_of(kind), linewidth=1.0)
+        shares.setdefault(group.estimator, []).append(nees.in_band_percent)
+        least, most = np.nanmin([least, *shown, *nees.low]), np.nanmax([most, *shown, *nees.high])
+        kinds.add(kind)
+    tell_shares(panels, shares)
+    scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
+    title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
+    finish(figure, panels, "pose NEES / 6", title, [*output_entries(kinds), band_entry()])
     caption = (
         f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
         f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band an "
-        f"estimator is too sure of itself. What is beyond {_NEES_RANGE[0]:g} and {_NEES_RANGE[1]:g} is drawn there."
+        f"estimator is too sure of itself. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
     )
     return NamedFigure("nees_over_seeds", caption, figure)
-
-
-def _panels(over: Comparison) -> tuple[Figure, dict[str, Axes]]:
-    columns = min(_MOST_COLUMNS, len(over.estimators))
-    rows = -(-len(over.estimators) // columns)
-    figure = new_figure(max(3.4 * columns, 5.0), 0.6 + 2.5 * rows)
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for axes in grid[len(over.estimators) :]:
-        axes.remove()
-    return figure, dict(zip(over.estimators, grid, strict=False))
-
-
-def _finish(figure: Figure, panels: dict[str, Axes], over: Comparison, y_label: str) -> None:
-    for name, axes in panels.items():
-        quiet(axes, name, "", "")
-        axes.tick_params(labelbottom=True)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False, fontsize=8, loc="best")
-        else:
-            axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", color="#8a949f", fontsize=9)
-    figure.suptitle(f"{over.name}, {len(over.seeds)} seeds", fontsize=11, x=0.01, ha="left")
-    figure.supxlabel("time [s]", fontsize=10)
-    figure.supylabel(y_label, fontsize=10)
 
 
 def _repeats(over: Comparison, group: Row) -> bool:
@@ -102,6 +91,7 @@ def _same_as_causal(over: Comparison, group: Row) -> bool:
     return np.array_equal(causal.position_m, group.position_m, equal_nan=True)
 
 
-def _label(over: Comparison, group: Row) -> str:
-    both = next((g for g in over.rows if g.estimator == group.estimator and g.output == "final"), group)
-    return "causal = final" if group is not both and _same_as_causal(over, both) else group.output
+def _shown_as(over: Comparison, group: Row) -> Output:
+    """Return the output whose look a group has: a filter's only answer is drawn as a final one."""
+    both = any(g.estimator == group.estimator and _repeats(over, g) for g in over.rows)
+    return "final" if both else group.output

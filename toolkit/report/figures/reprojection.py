@@ -3,7 +3,11 @@
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import NullLocator
 
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
@@ -11,12 +15,12 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, held_out, in_sample
 from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.report.figures.style import NamedFigure, colour_of, new_figure, quiet
-from toolkit.report.figures.top_view import last_word
+from toolkit.report.figures.panels import finish, panels_of, tell
+from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of
+from toolkit.report.figures.view import last_word
 
 # A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
 _SMALLEST_PX = 0.01
-_FAR_PX = 3.0
 _BINS = np.geomspace(_SMALLEST_PX, CAP_PX, 61)
 
 
@@ -26,23 +30,37 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     drawable = {name: kinds for name, kinds in errors.items() if kinds}
     if not drawable:
         return
-    figure = new_figure(9.6, 1.2 + 1.7 * len(drawable))
-    panels = figure.subplots(len(drawable), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, (name, kinds) in zip(panels, drawable.items(), strict=True):
+    figure, panels = panels_of(list(drawable), "reprojection error [px]")
+    for name, kinds in drawable.items():
         for kind, error_px in kinds.items():
-            _histogram(axes, kind, error_px, colour_of(comparison, name))
-        quiet(axes, f"{comparison.sequence.name}: {name}", "", "share [%]")
-        axes.set_xscale("log")
-        axes.set_xlim(_SMALLEST_PX, CAP_PX)
+            _histogram(panels[name], kind, error_px, colour_of(comparison, name))
+        medians = " / ".join(f"{float(np.median(error_px)):.2f}" for error_px in kinds.values())
+        tell(panels, name, (f"median {medians} px", f"{medians} px"))
+    first = next(iter(panels.values()))
+    first.set_xscale("log")
+    first.set_xlim(_SMALLEST_PX, CAP_PX)
+    first.set_ylim(bottom=0.0)
+    for axes in panels.values():
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(1.0, 1.05))
-    panels[-1].set_xlabel("reprojection error: root mean square of the uL, uR, v residuals [px]")
+        axes.xaxis.set_minor_locator(NullLocator())
+    finish(figure, panels, "share [%]", f"{comparison.name}: reprojection error of every sighting", _entries(drawable))
     caption = (
-        "Reprojection error of every sighting. Filled: against the estimator's own landmarks (in-sample). Outlined: "
-        "of the tracks withheld from every estimator. Thin lines: the medians. The axis is logarithmic; its ends "
-        f"stand for all below {_SMALLEST_PX:g} px, and for all that is {CAP_PX:g} px off or more or behind the camera."
+        "Reprojection error of every sighting: the root mean square of its uL, uR and v residuals. Filled: against the "
+        "estimator's own landmarks (in-sample). Outlined: of the tracks withheld from every estimator (held-out). The "
+        "medians are marked and stand above each panel. The axis is logarithmic; its ends stand for all below "
+        f"{_SMALLEST_PX:g} px, and for all that is {CAP_PX:g} px off or more or behind the camera."
     )
     yield NamedFigure("reprojection", caption, figure)
+
+
+def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
+    """Return the legend's entries for the kinds of error that any panel shows."""
+    samples: dict[str, Artist] = {
+        "in-sample": Patch(color=MUTED_COLOUR, alpha=0.35, linewidth=0.0),
+        "held-out": Line2D([], [], color=MUTED_COLOUR, linewidth=1.5),
+    }
+    shown = {kind for kinds in drawable.values() for kind in kinds}
+    return [Entry(kind, (sample,)) for kind, sample in samples.items() if kind in shown]
 
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
@@ -63,15 +81,12 @@ def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
 
 def _histogram(axes: Axes, kind: str, error_px: Array, colour: str) -> None:
     median_px = float(np.median(error_px))
-    label = (
-        f"{kind}: median {median_px:.2f} px\n({100.0 * float(np.mean(error_px > _FAR_PX)):.1f} % above {_FAR_PX:g} px)"
-    )
     counts, _ = np.histogram(np.maximum(error_px, _SMALLEST_PX), bins=_BINS)
     share = 100.0 * counts / error_px.size
     # One outline: sixty bars look the same and take longer to draw.
     if kind == "in-sample":
-        axes.stairs(share, _BINS, fill=True, color=colour, alpha=0.35, label=label)
+        axes.stairs(share, _BINS, fill=True, color=colour, alpha=0.35)
         axes.axvline(median_px, color=colour, linewidth=1.0, alpha=0.5)
     else:
-        axes.stairs(share, _BINS, color=colour, linewidth=1.5, label=label)
+        axes.stairs(share, _BINS, color=colour, linewidth=1.2)
         axes.axvline(median_px, color=colour, linewidth=1.0)

@@ -1,23 +1,35 @@
-"""One look for every figure: a colour an estimator, legible for the colour-blind, quiet axes."""
+"""One look for every figure: a colour an estimator, legible for the colour-blind, quiet axes, legends beside the data.
 
-from typing import NamedTuple
+Figures are as wide as two columns of a paper and are to be set at that width: letters then have 7 to 9 points.
+"""
 
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison
 
-DPI = 110
+DPI = 130
+WIDTH_IN = 7.16  # two columns of an IEEE paper
+TITLE_PT, LABEL_PT, TICK_PT, LEGEND_PT, SMALL_PT = 9.0, 8.5, 8.0, 8.0, 7.0
+_EM_A_LETTER = 0.56  # the mean width of a letter over the size of the type
+GRID_COLOUR, BAND_COLOUR, ZERO_COLOUR, MUTED_COLOUR = "#e4e7ea", "#d5dade", "#9aa4ad", "#5b6670"
 TRUTH_COLOUR = "#1a1a1a"
 LANDMARK_COLOUR = "#8a949f"
 
 # Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it, in other dashes.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
-_Dashes = str | tuple[int, tuple[float, ...]]
+_Dashes = Literal["-", "--", ":"] | tuple[float, tuple[float, ...]]
 _LINE_OF: dict[Output, tuple[_Dashes, ...]] = {
     "causal": ("--", ":"),
-    "final": ("-", (0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5))),
+    "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5))),
 }
 _WIDEST, _THINNEST = 2.8, 1.2
 
@@ -59,16 +71,62 @@ def width_of(comparison: Comparison, estimator: str) -> float:
     return _WIDEST + (_THINNEST - _WIDEST) * order.index(estimator) / (len(order) - 1)
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     """Return an empty figure that arranges its own margins."""
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
 def quiet(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     """Label axes (with units), draw a light grid behind the data and no frame on the open sides."""
-    axes.set_title(title, fontsize=11, loc="left")
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    axes.grid(True, color="#e4e7ea", linewidth=0.8)
+    axes.set_title(title, fontsize=TITLE_PT, loc="left")
+    axes.set_xlabel(x_label, fontsize=LABEL_PT)
+    axes.set_ylabel(y_label, fontsize=LABEL_PT)
+    axes.tick_params(labelsize=TICK_PT)
+    axes.grid(True, color=GRID_COLOUR, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+class Entry(NamedTuple):
+    """An entry of a legend: what it is called, and samples of the lines that are drawn for it, side by side."""
+
+    label: str
+    samples: tuple[Artist, ...]
+
+
+def entries_of(comparison: Comparison, drawn: Iterable[tuple[str, Output]]) -> list[Entry]:
+    """Return an entry for each estimator of which outputs are drawn, the final one's line first."""
+    outputs: dict[str, list[Output]] = {}
+    for name, output in drawn:
+        outputs.setdefault(name, []).append(output)
+    return [
+        Entry(name, tuple(_sample(comparison, name, output) for output in sorted(kinds, reverse=True)))
+        for name, kinds in outputs.items()
+    ]
+
+
+def _sample(comparison: Comparison, name: str, output: Output) -> Line2D:
+    dashes = line_of_estimator(comparison, name, output)
+    return Line2D([], [], color=colour_of(comparison, name), linestyle=dashes, linewidth=1.8)
+
+
+def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **place: Any) -> Legend:
+    """Put a legend somewhere (``loc`` and the like), with as many columns as there is room for unless it is said."""
+    long = 2.4 if all(len(entry.samples) == 1 for entry in entries) else 5.2
+    widest_pt = LEGEND_PT * (long + 2.5 + _EM_A_LETTER * max(len(entry.label) for entry in entries))
+    return owner.legend(
+        handles=[entry.samples if len(entry.samples) > 1 else entry.samples[0] for entry in entries],
+        labels=[entry.label for entry in entries],
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.8)},
+        handlelength=long,
+        ncols=columns or max(1, min(len(entries), int(WIDTH_IN * 72.0 / widest_pt))),
+        columnspacing=1.4,
+        frameon=False,
+        fontsize=LEGEND_PT,
+        **place,
+    )
+
+
+def legend_below(figure: Figure, entries: Sequence[Entry]) -> None:
+    """Put a legend under all panels, over the whole width."""
+    legend(figure, entries, loc="outside lower center")

@@ -1,58 +1,69 @@
-"""The world from above: one figure an estimator over its landmarks, and all trajectories in one."""
+"""The world from above: all trajectories in one figure, with a closer look, and one figure an estimator."""
 
 from collections.abc import Iterator
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from toolkit.estimate import Output, Run
+from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison, plain_name
-from toolkit.geometry import Array
-from toolkit.report.figures.alignment import alignment_words, onto_truth, truth_during
+from toolkit.report.figures.alignment import alignment_words
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
+    MUTED_COLOUR,
+    SMALL_PT,
     TRUTH_COLOUR,
+    WIDTH_IN,
+    Entry,
     NamedFigure,
     colour_of,
+    legend,
     line_of_estimator,
     new_figure,
     quiet,
     width_of,
 )
+from toolkit.report.figures.view import (
+    NOWHERE,
+    Track,
+    View,
+    from_above,
+    landmarks_shown,
+    last_word,
+    track_of,
+    true_track,
+    view_of,
+    where_tracks_coincide,
+)
 
-_LINE_WIDTH = 1.5
-_TRUTH_WIDTH = 4.0
-_LANDMARK_QUANTILES = (0.02, 0.98)
-_MARGIN = 0.06
-_LARGEST_IN = (10.0, 7.5)
-_LEAST_HEIGHT_IN = 3.5
-# Landmarks widen the view by at most this share of the tracks' extent, and by this much where the camera hardly moved.
-_LANDMARK_REACH = 0.5
-_LEAST_REACH_M = 30.0
+_LINE_WIDTH, _TRUTH_WIDTH = 1.5, 4.0
+# Room beside the map for legend and closer look, for the axes' labels, and how high a map may be.
+_BESIDE_IN, _LABELS_IN, _HIGHEST_IN, _LOWEST_IN = 1.9, 0.55, 6.0, 2.3
+_ENTRY_IN, _CLOSER_IN, _FLAT = 0.175, 1.6, 0.6
+_LEAST_SQUARE = 0.015  # of the square in the map, as a share of the map
 
 
-def draw(comparison: Comparison) -> Iterator[NamedFigure]:
-    """Yield a top view for each run that has a trajectory, then the combined one."""
+def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield all trajectories in one figure, where any run has one."""
     drawable = [run for run in comparison.runs if run.trajectory(last_word(run)) is not None]
-    for run in drawable:
-        yield _one(comparison, run)
     if drawable:
         yield _all(comparison, drawable)
 
 
-def last_word(run: Run) -> Output:
-    """Return the kind of output a figure with room for one shows: the final one where there is one."""
-    return "final" if run.final is not None else "causal"
+def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield a top view for each run that has a trajectory."""
+    for run in comparison.runs:
+        if run.trajectory(last_word(run)) is not None:
+            yield _one(comparison, run)
 
 
 def _one(comparison: Comparison, run: Run) -> NamedFigure:
-    figure = new_figure(*_LARGEST_IN)
-    axes = figure.add_subplot()
-    landmarks = _draw_landmarks(axes, comparison, run)
-    tracks = [_draw_truth(axes, comparison), _draw_run(axes, comparison, run, _LINE_WIDTH)]
-    _finish(figure, axes, tracks, landmarks)
-    quiet(axes, f"{run.estimator}{_trouble(run)} on {comparison.sequence.name}, from above", "x [m]", "y [m]")
+    truth = true_track(comparison)
+    tracks = {run.estimator: track_of(comparison, run)}
+    title = f"{run.estimator}{_trouble(run)} on {comparison.name}, from above"
+    figure = _figure(comparison, tracks, truth, run, title)
     mapped = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
     caption = (
         f"Trajectory of {run.estimator} from above, from the dot on; {mapped}. {alignment_words(comparison.sequence)}"
@@ -61,87 +72,120 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
 
 
 def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
-    figure = new_figure(*_LARGEST_IN)
-    axes = figure.add_subplot()
+    truth = true_track(comparison)
+    tracks = {run.estimator: track_of(comparison, run) for run in runs}
     mapping = [run for run in runs if run.status == "ok" and len(run.landmarks)]
-    landmarks = _draw_landmarks(axes, comparison, mapping[-1]) if mapping else np.empty((0, 2))
-    tracks = [_draw_truth(axes, comparison)]
-    for run in runs:
-        track = _draw_run(axes, comparison, run, width_of(comparison, run.estimator))
-        # A run that flew off would squash all the others; its own figure shows where it went.
-        if run.status == "ok" or len(runs) == 1:
-            tracks.append(track)
-    _finish(figure, axes, tracks, landmarks)
-    quiet(axes, f"{comparison.sequence.name}: all estimators, from above", "x [m]", "y [m]")
-    of_whom = f" over the landmarks of {mapping[-1].estimator}" if mapping else ""
-    caption = f"All trajectories{of_whom}, each from its dot on. {alignment_words(comparison.sequence)}"
+    mapper = mapping[-1] if mapping else None
+    figure = _figure(comparison, tracks, truth, mapper, f"{comparison.name}: all estimators, from above")
+    of_whom = "" if mapper is None else f" over the landmarks of {mapper.estimator}"
+    caption = (
+        f"All trajectories{of_whom}, each from its dot on. {alignment_words(comparison.sequence)} The square is "
+        "enlarged beside the map: there most of them lie on one another, and differ most."
+    )
     if any(run.status != "ok" for run in runs):
         caption += " One that is not ok may leave the picture."
     return NamedFigure("top_all", caption, figure)
 
 
+def _figure(
+    comparison: Comparison, tracks: dict[str, Track], truth: Track | None, mapper: Run | None, title: str
+) -> Figure:
+    """Draw tracks over the truth and one run's landmarks, with legend and closer look beside the map."""
+    runs = {run.estimator: run for run in comparison.runs if run.estimator in tracks}
+    # A run that flew off would squash all the others; its own figure shows where it went.
+    shown = [tracks[name] for name, run in runs.items() if run.status == "ok" or len(tracks) == 1]
+    shown += [] if truth is None else [truth]
+    landmarks = NOWHERE if mapper is None else from_above(comparison, mapper, mapper.landmarks.points_world)
+    view = view_of(shown, landmarks_shown(landmarks))
+    closer = where_tracks_coincide(shown, view, comparison.sequence.frames_t_ns)
+    entries = _entries(comparison, runs, truth, mapper)
+    figure, axes, beside, under = _places(view, len(entries), closer)
+    axes.scatter(landmarks[:, 0], landmarks[:, 1], s=3.0, color=LANDMARK_COLOUR, alpha=0.5, linewidths=0, zorder=1)
+    for place in filter(None, (axes, under)):
+        _draw_tracks(place, comparison, tracks, truth)
+    for name, track in tracks.items():
+        axes.plot(*track.xy[:1].T, "o", color=colour_of(comparison, name), ms=5.0, markeredgecolor="white", zorder=4)
+    view.show(axes)
+    quiet(axes, title, "x [m]", "y [m]")
+    legend(beside, entries, columns=1, loc="upper left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.0)
+    if under is not None and closer is not None:
+        _look_closer(axes, under, closer, view)
+    return figure
+
+
+def _entries(comparison: Comparison, runs: dict[str, Run], truth: Track | None, mapper: Run | None) -> list[Entry]:
+    """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
+    entries = [] if truth is None else [Entry("truth", (Line2D([], [], color=TRUTH_COLOUR, lw=_TRUTH_WIDTH),))]
+    for name, run in runs.items():
+        line = line_of_estimator(comparison, name, last_word(run))
+        sample = Line2D([], [], color=colour_of(comparison, name), linestyle=line, linewidth=1.8)
+        entries.append(Entry(f"{name}{_trouble(run)}", (sample,)))
+    if mapper is not None and len(mapper.landmarks):
+        dot = Line2D([], [], color=LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
+        entries.append(Entry(f"landmarks of {mapper.estimator}", (dot,)))
+    return entries
+
+
+def _places(view: View, entries: int, closer: View | None) -> tuple[Figure, Axes, Axes, Axes | None]:
+    """Return a figure with places for the map, the legend and the closer look, as the map's shape allows.
+
+    Beside a tall map there is room for both; under a flat one they stand side by side.
+    """
+    legend_in, closer_in = _ENTRY_IN * entries + 0.1, 0.0 if closer is None else _CLOSER_IN
+    if view.ratio > _FLAT:
+        width_in = WIDTH_IN - _BESIDE_IN - _LABELS_IN
+        height_in = max(min(width_in * view.ratio, _HIGHEST_IN), legend_in + closer_in)
+        figure = new_figure(height_in + _LABELS_IN)
+        rest_in = max(height_in + _LABELS_IN - legend_in, 0.1)
+        grid = figure.add_gridspec(2, 2, width_ratios=(width_in, _BESIDE_IN), height_ratios=(legend_in, rest_in))
+        places = grid[:, 0], grid[0, 1], grid[1, 1]
+    else:
+        map_in = max((WIDTH_IN - _LABELS_IN) * view.ratio, _LOWEST_IN)
+        below_in = max(closer_in, legend_in)
+        figure = new_figure(map_in + below_in + 2.0 * _LABELS_IN)
+        # The closer look stands on the side of what it enlarges, the legend on the other.
+        widths = [WIDTH_IN - _CLOSER_IN - 2.0 * _LABELS_IN, _CLOSER_IN + 2.0 * _LABELS_IN]
+        right = closer is None or bool((closer.low + closer.high)[0] > (view.low + view.high)[0])
+        ratios = {"width_ratios": widths if right else widths[::-1], "height_ratios": (map_in + _LABELS_IN, below_in)}
+        grid = figure.add_gridspec(2, 2, **ratios)
+        places = grid[0, :], grid[1, int(not right)], grid[1, int(right)]
+    the_map, beside, under = places
+    legend_axes = figure.add_subplot(beside)
+    legend_axes.set_axis_off()
+    return (
+        figure,
+        figure.add_subplot(the_map, anchor="NW"),
+        legend_axes,
+        None if closer is None else figure.add_subplot(under),
+    )
+
+
+def _draw_tracks(axes: Axes, comparison: Comparison, tracks: dict[str, Track], truth: Track | None) -> None:
+    if truth is not None:
+        axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
+    output = {run.estimator: last_word(run) for run in comparison.runs}
+    for name, track in tracks.items():
+        width = _LINE_WIDTH if len(tracks) == 1 else width_of(comparison, name)
+        line = line_of_estimator(comparison, name, output[name])
+        axes.plot(*track.xy.T, color=colour_of(comparison, name), linewidth=width, linestyle=line, zorder=3)
+
+
+def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
+    """Show a part of the map enlarged, and in the map where it is."""
+    closer.show(under)
+    quiet(under, "", "", "")
+    under.set_title("the square, enlarged", fontsize=SMALL_PT, loc="left")
+    under.tick_params(labelsize=SMALL_PT, colors=MUTED_COLOUR)
+    for axis in (under.xaxis, under.yaxis):
+        axis.set_major_locator(MaxNLocator(3))
+        axis.set_major_formatter(ScalarFormatter(useOffset=False))
+    under.spines[:].set(visible=True, color=MUTED_COLOUR, linewidth=0.8)
+    # The square as it is may be too small to be seen.
+    half = max(float(closer.size[0]), _LEAST_SQUARE * float(view.size.max())) / 2.0
+    low = (closer.low + closer.high) / 2.0 - half
+    place = (float(low[0]), float(low[1]), 2.0 * half, 2.0 * half)
+    axes.indicate_inset(place, under, edgecolor=MUTED_COLOUR, alpha=1.0, linewidth=0.8, zorder=5)
+
+
 def _trouble(run: Run) -> str:
     return "" if run.status == "ok" else f" ({run.status})"
-
-
-def _draw_truth(axes: Axes, comparison: Comparison) -> Array:
-    truth = truth_during(comparison.sequence)
-    if truth is None:
-        return np.empty((0, 2))
-    positions = truth.T_world_imu[:, :2, 3]
-    axes.plot(*positions.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, label="truth", zorder=2)
-    return positions
-
-
-def _draw_run(axes: Axes, comparison: Comparison, run: Run, width: float) -> Array:
-    """Draw the run's last word, and where it starts; return its positions (N, 2)."""
-    output = last_word(run)
-    trajectory = run.trajectory(output)
-    assert trajectory is not None, "only runs with a trajectory are drawn"
-    positions = _from_above(comparison, run, trajectory.positions)
-    colour, label = colour_of(comparison, run.estimator), f"{run.estimator} {output}{_trouble(run)}"
-    line = line_of_estimator(comparison, run.estimator, output)
-    axes.plot(*positions.T, color=colour, linewidth=width, linestyle=line, label=label, zorder=3)
-    axes.plot(*positions[:1].T, "o", color=colour, markersize=7, markeredgecolor="white", zorder=4)
-    return positions
-
-
-def _draw_landmarks(axes: Axes, comparison: Comparison, run: Run) -> Array:
-    """Draw the landmarks of a run; return the corners (2, 2) of the range that holds all but the farthest."""
-    points = _from_above(comparison, run, run.landmarks.points_world)
-    if points.shape[0] == 0:
-        return np.empty((0, 2))
-    label = f"landmarks of {run.estimator}"
-    axes.scatter(
-        points[:, 0], points[:, 1], s=4.0, color=LANDMARK_COLOUR, alpha=0.6, linewidths=0, label=label, zorder=1
-    )
-    corners: Array = np.quantile(points, _LANDMARK_QUANTILES, axis=0)
-    return corners
-
-
-def _from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
-    """Return x and y (M, 2) of the finite ones among points (N, 3), moved with the run onto the truth."""
-    alignment = onto_truth(run, last_word(run), comparison.sequence)
-    finite = points_world[np.isfinite(points_world).all(axis=1)]
-    above: Array = (finite @ alignment.rotation.T + alignment.translation)[:, :2]
-    return above
-
-
-def _finish(figure: Figure, axes: Axes, tracks: list[Array], landmarks: Array) -> None:
-    """Show all of the tracks and the landmarks near them in equal scale, with the legend beside the map."""
-    track = np.vstack(tracks)
-    if track.shape[0]:
-        reach = max(_LANDMARK_REACH * float(np.ptp(track, axis=0).max()), _LEAST_REACH_M)
-        shown = np.vstack([track, np.clip(landmarks, track.min(axis=0) - reach, track.max(axis=0) + reach)])
-        low, high = shown.min(axis=0), shown.max(axis=0)
-        margin = max(_MARGIN * float((high - low).max()), 0.5)
-        axes.set_xlim(low[0] - margin, high[0] + margin)
-        axes.set_ylim(low[1] - margin, high[1] + margin)
-        width, height = high - low + 2.0 * margin
-        # A long straight drive gets a flat picture, a turn in place a square one.
-        figure.set_figheight(float(np.clip(_LARGEST_IN[0] * height / width, _LEAST_HEIGHT_IN, _LARGEST_IN[1])))
-    axes.set_aspect("equal", adjustable="box")
-    legend = axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, markerscale=2.5)
-    for handle in legend.legend_handles:
-        if handle is not None:
-            handle.set_alpha(1.0)

@@ -14,8 +14,16 @@ from toolkit.metrics import known_metrics
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.run_files import RunFiles, SeedsFiles, Track
 from toolkit.report.html.seeds_payload import mark_of, seeds_case
-from toolkit.report.html.thinning import MOST_LANDMARKS, MOST_POSES, coordinates, evenly, running_median, thinned
-from toolkit.report.records.report import CameraFrame, DrawnMap, DrawnRun, NeesSeries
+from toolkit.report.html.thinning import (
+    MOST_LANDMARKS,
+    MOST_OF_COMPONENTS,
+    MOST_POSES,
+    coordinates,
+    evenly,
+    running_median,
+    thinned,
+)
+from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnRun, NeesSeries
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
@@ -131,6 +139,7 @@ def _rows(files: RunFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
                 "track": None if drawn.trajectory is None else _drawn(_aligned(files.tracks[drawn.trajectory], drawn)),
                 "errors": None if drawn.errors is None else thinned(asdict(drawn.errors), "position_m"),
                 "nees": _nees(drawn.nees),
+                "components": None if drawn.components is UNSET else _components(drawn.components),
                 "nis": drawn.nis if isinstance(drawn.nis, str) else _with_median(asdict(drawn.nis), "per_dof"),
             }
         )
@@ -166,6 +175,13 @@ def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
 def _with_median(series: Json, leading: str) -> Json:
     """Return a thinned series with the running median of all its values, not only of those that are kept."""
     return thinned(series | {"median": running_median(series[leading])}, leading)
+
+
+def _components(series: ComponentSeries) -> Json:
+    """Return the errors by component with their stated deviations, at few enough times for twelve columns."""
+    columns = asdict(series)
+    kept = evenly(len(series.t_s), MOST_OF_COMPONENTS)
+    return {name: [column[i] for i in kept.tolist()] for name, column in columns.items()}
 
 
 def _nees(series: NeesSeries | str) -> Json | str:

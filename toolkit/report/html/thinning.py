@@ -9,6 +9,7 @@ from toolkit.report.report_json import number
 
 MOST_POSES = 1500
 MOST_SAMPLES = 1200
+MOST_OF_COMPONENTS = 400
 MOST_LANDMARKS = 5000
 _MILLIMETRES = 3
 _LARGE_M = 1e7

@@ -50,6 +50,27 @@ class ErrorSeries(_Columns, frozen=True, kw_only=True):
     heading_deg: Numbers
 
 
+class ComponentSeries(_Columns, frozen=True, kw_only=True):
+    """Errors by component along the recording, not aligned but placed as for the NEES, and what is stated of them.
+
+    Estimate minus truth, or without truth minus another estimate, along and about the world's axes.
+    """
+
+    t_s: Times
+    x_m: Numbers
+    y_m: Numbers
+    z_m: Numbers
+    about_x_deg: Numbers
+    about_y_deg: Numbers
+    about_z_deg: Numbers
+    sigma_x_m: Annotated[Numbers, Meta(description="stated standard deviation; null where none is stated")]
+    sigma_y_m: Numbers
+    sigma_z_m: Numbers
+    sigma_about_x_deg: Numbers
+    sigma_about_y_deg: Numbers
+    sigma_about_z_deg: Numbers
+
+
 class NeesSeries(_Columns, frozen=True, kw_only=True):
     """NEES along the recording, each over its degrees of freedom."""
 
@@ -81,6 +102,9 @@ class DrawnRun(Struct, frozen=True, kw_only=True):
     errors: Annotated[ErrorSeries | None, Meta(description="null where there are none, or with the causal entry")]
     nees: Annotated[NeesSeries | str, Meta(description="or why there is none")]
     nis: Annotated[NisSeries | str, Meta(description="or why there is none")]
+    components: Annotated[
+        ComponentSeries | UnsetType, Meta(description="absent where there are none, or with the causal entry")
+    ] = UNSET
 
 
 class StepTimes(Struct, frozen=True, kw_only=True):

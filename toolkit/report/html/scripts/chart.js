@@ -115,9 +115,17 @@ function yRange(picture) {
   if (picture.level !== undefined) [low, high] = [Math.min(low, picture.level), Math.max(high, picture.level)];
   if (Array.isArray(picture.band)) high = Math.max(high, picture.band[1]);
   if (picture.log) return logRange(low, high);
+  if (picture.signed && picture.band) [low, high] = withBand(low, high, picture.band);
   const least = picture.least ?? 1e-6; // what agrees to rounding shall look so
   if (picture.signed) return [Math.min(low, -least) * 1.05, Math.max(high, least) * 1.05];
   return [0, Math.max(high, least) * 1.05];
+}
+
+/** The range with the band in it, unless that would flatten the lines. */
+function withBand(low, high, band) {
+  const [least, most] = rangeOf([band.low, band.high]) ?? [0, 0];
+  const reach = 6 * Math.max(Math.abs(low), Math.abs(high));
+  return [Math.min(low, Math.max(least, -reach)), Math.max(high, Math.min(most, reach))];
 }
 
 /** At least a decade, so that jitter does not look like drama; at most nine below the top. */

@@ -1,6 +1,6 @@
 /** The charts of a case: each with a sentence under it, or the reason why there is none. */
 function chartsOf(one) {
-  const cards = one.error ? [positionCard(one), headingCard(one)] : [];
+  const cards = one.error ? [positionCard(one), headingCard(one), componentsCard(one)] : [];
   cards.push(neesCard(one), nisCard(one), stepsCard(one));
   return cards.filter((card) => card !== null);
 }
@@ -47,6 +47,36 @@ function headingCard(one) {
   const what = one.error.what;
   const describe = () => ({ ...errorLines(one, "heading_deg"), yLabel: `heading ${what} [deg]`, unit: "deg", signed: true, wraps: true, least: 1e-2 });
   return chartCard(one, `Heading ${what}`, describe, "Positive is turned to the left of where it should be.");
+}
+
+const COMPONENTS = [["x_m", "x"], ["y_m", "y"], ["z_m", "z"], ["about_x_deg", "about x"], ["about_y_deg", "about y"], ["about_z_deg", "about z"]];
+
+/** One estimate's error along or about one of the world's axes, with three standard deviations that it states. */
+function componentsCard(one) {
+  const rows = one.rows.filter((row) => row.components);
+  if (!rows.length) return null;
+  let row = rows.findLast((other) => other.status === "ok") ?? rows[0];
+  let name = "x_m";
+  const chooseRow = rows.length > 1 ? dropdown("of", rows.map((other) => [other.id, labelOf(other)]), row.id, (id) => {
+    row = rows.find((other) => other.id === id);
+    changed();
+  }) : null;
+  const chooseName = dropdown("by", COMPONENTS, name, (value) => {
+    name = value;
+    changed();
+  });
+  const describe = () => {
+    const { t_s, [name]: error, [`sigma_${name}`]: sigma } = row.components;
+    const unit = name.endsWith("_m") ? "m" : "deg";
+    const words = COMPONENTS.find(([key]) => key === name)[1];
+    const side = (times) => sigma.map((value) => (value === null ? null : times * value));
+    return {
+      lines: [{ row, t: t_s, x: t_s, y: error }], xLabel: "time [s]", yLabel: `${words}: ${one.error.what} [${unit}]`,
+      unit, signed: true, least: 1e-3, level: 0, band: { x: t_s, low: side(-3), high: side(3) },
+    };
+  };
+  return chartCard(one, "By component, with ±3σ", describe, "Along and about the world's axes, not aligned; a start outside the " +
+    "truth's world is placed by its first pose. Shaded: three standard deviations as stated; an honest estimate is inside nearly always.", chooseRow, chooseName);
 }
 
 const NEES_PARTS = [["pose", "pose"], ["orientation", "rotation"], ["position", "position"]];

@@ -1,0 +1,194 @@
+"""Position and attitude of one estimator by component: its error, and three times the standard deviation it states."""
+
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from toolkit.estimate import Output
+from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.geometry import Array, IntArray, se3_inverse, so3_log
+from toolkit.metrics import Evaluation, Unavailable
+from toolkit.metrics._shared.association import finite_poses
+from toolkit.metrics._shared.consistency import POSE_DOF, body_errors
+from toolkit.models.state import POSITION, ROTATION
+from toolkit.report.figures.alignment import last_good_answer
+from toolkit.report.figures.panels import COLOUR_OF
+from toolkit.report.figures.style import (
+    TITLE_PT,
+    ZERO_COLOUR,
+    Entry,
+    NamedFigure,
+    legend_below,
+    line_of,
+    new_figure,
+    quiet,
+)
+from toolkit.resampling import NS_PER_S
+
+_SIGMAS = 3.0
+_ROWS = ("x", "y", "z")
+# An axis shows all of the error, and of the band at most so many times the largest error.
+_BAND_REACH = 6.0
+_BAND_ALPHA = 0.16
+_LEAST_M, _LEAST_DEG = 1e-3, 1e-3
+
+
+class Components(NamedTuple):
+    """Errors at stamps (n,) in the world's axes (n, 6) and their stated standard deviations (n, 6) or None.
+
+    The first three are rotations about x, y and z in degrees, the others positions along them in metres; each is
+    estimate minus truth.
+    """
+
+    t_ns: IntArray
+    error: Array
+    sigma: Array | None
+
+
+def draw(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield a figure for each estimator with a trajectory that has something to be compared with."""
+    for run in comparison.runs:
+        found: dict[Output, Components] = {}
+        for row in comparison.rows:
+            if row.run is run and not row.repeats_causal:
+                one = components(comparison, row)
+                if one is not None:
+                    found[row.output] = one
+        if found:
+            yield _figure(comparison, run.estimator, run.final_is_causal, found)
+
+
+def components(comparison: Comparison, row: Row) -> Components | None:
+    """Return the errors of an output as the NEES takes them, or without truth its difference from the last answer.
+
+    Returns None where there is neither.
+    """
+    trajectory = row.run.trajectory(row.output)
+    if trajectory is None:
+        return None
+    if comparison.sequence.truth is None:
+        return _difference(comparison, row)
+    try:
+        errors = body_errors(Evaluation(row.run, row.output, comparison.sequence))
+    except Unavailable:
+        return None
+    covs = None if trajectory.cov is None else trajectory.cov[errors.rows]
+    return _in_world_axes(errors.t_ns, errors.T_world_imu, errors.T_estimate_truth, covs)
+
+
+def _difference(comparison: Comparison, row: Row) -> Components | None:
+    reference, trajectory = last_good_answer(comparison), row.run.trajectory(row.output)
+    if reference is None or trajectory is None or trajectory is reference.trajectory:
+        return None
+    t_ns, mine, theirs = np.intersect1d(trajectory.t_ns, reference.trajectory.t_ns, return_indices=True)
+    poses, others = trajectory.T_world_imu[mine], reference.trajectory.T_world_imu[theirs]
+    known = finite_poses(poses) & finite_poses(others)
+    covs = None if trajectory.cov is None else trajectory.cov[mine][known]
+    return _in_world_axes(t_ns[known], poses[known], se3_inverse(poses[known]) @ others[known], covs)
+
+
+def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: Array | None) -> Components | None:
+    """Turn errors in the body frame (n, 4, 4) and their covariances into the world's axes."""
+    if not t_ns.size:
+        return None
+    turn = poses[:, :3, :3]
+    rotation = -np.degrees(_turned(turn, so3_log(T_estimate_truth[:, :3, :3])))
+    error = np.hstack([rotation, -_turned(turn, T_estimate_truth[:, :3, 3])])
+    if covs is None or not np.isfinite(covs[:, :POSE_DOF, :POSE_DOF]).any():
+        return Components(t_ns, error, None)
+    deviations = [_deviation(turn, covs[:, block, block]) for block in (ROTATION, POSITION)]
+    return Components(t_ns, error, np.hstack([np.degrees(deviations[0]), deviations[1]]))
+
+
+def _turned(rotations: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
+
+
+def _deviation(rotations: Array, covs: Array) -> Array:
+    """Return the standard deviations (n, 3) of covariances (n, 3, 3) in the body frame, along the world's axes."""
+    variance = np.einsum("nij,njk,nik->ni", rotations, covs, rotations)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:
+    figure = new_figure(4.6)
+    grid = figure.subplots(3, 2, sharex=True)
+    what = _what(comparison)
+    start_ns = int(comparison.sequence.frames_t_ns[0])
+    for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
+        for i, axis in enumerate(_ROWS):
+            axes = grid[i, column]
+            for output, one in found.items():
+                _plot(axes, one, block.start + i, start_ns, "final" if both else output)
+            _limit(axes, found.values(), block.start + i, least)
+            quiet(
+                axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
+            )
+    grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
+    grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
+    figure.align_ylabels(grid)
+    legend_below(figure, _entries(found, both, what.split()[0]))
+    return NamedFigure(f"components_{plain_name(name)}", _caption(comparison, name), figure)
+
+
+def _what(comparison: Comparison) -> str:
+    """Return how to call what is drawn: the error, or without truth the difference from whom."""
+    reference = None if comparison.sequence.truth is not None else last_good_answer(comparison)
+    return "error" if reference is None else f"difference from {reference.name}"
+
+
+def _plot(axes: Axes, one: Components, i: int, start_ns: int, shown_as: Output) -> None:
+    t_s, colour, line = (one.t_ns - start_ns) / NS_PER_S, COLOUR_OF[shown_as], line_of(shown_as)
+    if one.sigma is not None:
+        band = _SIGMAS * one.sigma[:, i]
+        if shown_as == "final":
+            axes.fill_between(t_s, -band, band, color=colour, alpha=_BAND_ALPHA, linewidth=0.0)
+        for side in (-band, band):
+            axes.plot(t_s, side, color=colour, linestyle=line, linewidth=0.6)
+    axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
+
+
+def _limit(axes: Axes, drawn: Collection[Components], i: int, least: float) -> None:
+    """Show all of the error around zero, and the band unless that would flatten the error."""
+    error = max(float(np.abs(one.error[:, i]).max()) for one in drawn)
+    bands = [_SIGMAS * float(np.nanmax(one.sigma[:, i])) for one in drawn if one.sigma is not None]
+    reach = max(error, least, min(max(bands, default=0.0), _BAND_REACH * max(error, least)))
+    axes.set_ylim(-1.08 * reach, 1.08 * reach)
+    axes.axhline(0.0, color=ZERO_COLOUR, linewidth=0.8, zorder=1)
+
+
+def _entries(found: dict[Output, Components], both: bool, what: str) -> list[Entry]:
+    entries = []
+    for output, one in found.items():
+        shown_as: Output = "final" if both else output
+        name, colour = "causal = final" if both else output, COLOUR_OF[shown_as]
+        entries.append(Entry(f"{name}: {what}", (Line2D([], [], color=colour, linestyle=line_of(shown_as)),)))
+        if one.sigma is not None:
+            band = Patch(facecolor=to_rgba(colour, _BAND_ALPHA if shown_as == "final" else 0.0), edgecolor=colour)
+            band.set(linestyle=line_of(shown_as), linewidth=0.6)
+            entries.append(Entry(f"{name}: ± 3 standard deviations", (band,)))
+    return entries
+
+
+def _caption(comparison: Comparison, name: str) -> str:
+    """Say what the panels show and how the band is to be read."""
+    axes = "by component along and about the world's axes, z up"
+    if comparison.sequence.truth is None:
+        reference = last_good_answer(comparison)
+        of_whom = "" if reference is None else f" from {reference.name}"
+        return (
+            f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "
+            f"deviations that {name} states; a difference far outside it says that one of the two is too sure."
+        )
+    placed = (
+        "as the NEES takes it: where the start is not in the truth's world, its first pose is placed on the truth's"
+    )
+    return (
+        f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: an honest estimator "
+        "is inside nearly always, and fills it."
+    )

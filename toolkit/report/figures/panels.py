@@ -1,0 +1,115 @@
+"""Small panels, one an estimator, all on the same axes: what fourteen lines in one panel would hide."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator
+
+from toolkit.estimate import Output
+from toolkit.report.figures.style import (
+    BAND_COLOUR,
+    LABEL_PT,
+    MUTED_COLOUR,
+    SMALL_PT,
+    TITLE_PT,
+    WIDTH_IN,
+    Entry,
+    legend,
+    legend_below,
+    line_of,
+    new_figure,
+    quiet,
+)
+
+# Okabe & Ito (2008). In panels of one estimator the colour tells the output.
+COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}
+# What a NEES or NIS over its expectation is beyond these is drawn there.
+RANGE = (1e-2, 1e4)
+# From so many panels on there are four in a row, before that three; two or four make a square.
+_MANY = 10
+_PANEL_IN = 1.35
+_FEW_DECADES = 1.7
+
+
+def panels_of(names: Sequence[str], x_label: str = "time [s]") -> tuple[Figure, dict[str, Axes]]:
+    """Return a figure with an empty panel a name, all on the same axes."""
+    columns = columns_for(len(names))
+    rows = -(-len(names) // columns)
+    figure = new_figure(0.85 + _PANEL_IN * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for axes in grid[len(names) :]:
+        axes.set_axis_off()
+    panels = dict(zip(names, grid, strict=False))
+    for name, axes in panels.items():
+        quiet(axes, name, "", "")
+    # A panel with nothing below it has the numbers of the axis, too.
+    for axes in grid[: len(names)][-columns:]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(x_label, fontsize=LABEL_PT)
+    return figure, panels
+
+
+def columns_for(count: int) -> int:
+    """Return how many columns so many panels have."""
+    if count >= _MANY:
+        return 4
+    return 2 if count in (2, 4) else min(3, count)
+
+
+def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entries: Sequence[Entry]) -> None:
+    """Give the figure its title, its vertical axis and its legend, which stands in a spare panel where there is one."""
+    for axes in panels.values():
+        if not axes.has_data():
+            words = "nothing to show"
+            axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+    figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
+    figure.supylabel(what, fontsize=LABEL_PT)
+    spare = figure.axes[len(panels) :]
+    if spare:
+        legend(spare[0], entries, columns=1, loc="center left").set_in_layout(False)
+    else:
+        legend_below(figure, entries)
+
+
+def scale_by_decades(axes: Axes, low: float, high: float) -> None:
+    """Make the vertical axis, and those shared with it, logarithmic between two values, with few and plain numbers."""
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    few = np.log10(high / low) < _FEW_DECADES
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
+    if few:
+        axes.yaxis.set_major_formatter("{x:g}")
+    # Ticks between decades are many, and take longer to draw than all else.
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def tell_shares(panels: dict[str, Axes], shares: dict[str, list[float]]) -> None:
+    """Say of each panel how many percent of what it shows are in the band."""
+    for name, percents in shares.items():
+        words = ", ".join(f"{percent:.0f} %" for percent in percents)
+        tell(panels, name, (f"{words} in band", words))
+
+
+def tell(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
+    """Say something in the upper right of a panel, above the data: the first of the words for which there is room."""
+    room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
+    told = next((one for one in words if len(name) + len(one) <= room), words[-1])
+    panels[name].set_title(told, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+
+
+def output_entries(outputs: Collection[Output]) -> list[Entry]:
+    """Return the legend's entries for the outputs that are drawn; where both agree, one line stands for them."""
+    words: dict[Output, str] = {"causal": "causal", "final": "final, or both"}
+    return [
+        Entry(words[output], (Line2D([], [], color=COLOUR_OF[output], linestyle=line_of(output)),))
+        for output in sorted(outputs)
+    ]
+
+
+def band_entry() -> Entry:
+    """Return the legend's entry for the band of a consistent estimator."""
+    return Entry("95 % band", (Patch(color=BAND_COLOUR, linewidth=0.0),))
