@@ -5,15 +5,21 @@ state deep in the tree: its marginal then costs twice the update. Here the elimi
 then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
 root: the last covariance of the one and the first of the other are nearly free, and the update costs no more.
 
+GTSAM refuses a clique whose own variables, scaled to a unit diagonal, have a condition beyond 7e7. An IMU ties two
+states of neighbouring frames so well, and the world after some minutes so loosely, that both in one clique are beyond
+it, and the last two always are: whoever is eliminated before the last hangs on all that is left. So the newest state is
+followed by a variable that means nothing and that only this state is tied to, by factors that weigh nothing.
+
 A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
-frame is dropped. A state that does so the first time is a matter of rounding in the normal equations, as in seconds of
-an accurate IMU alone: the window is then solved by QR, ten times as long, until vision has been back for as long as it
-reaches. Either way a new tree is built of the factors of the old, with the same estimates.
+frame is dropped. A state that does so the first time is a matter of rounding in the normal equations: the window is
+then solved by QR, ten times as long, until vision has been back for as long as it reaches. Either way a new tree is
+built of the factors of the old, with the same estimates.
 """
 
 from collections.abc import Collection, Iterable
 
 import gtsam
+import numpy as np
 
 from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
@@ -23,6 +29,7 @@ from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
 RELINEARISE_BEYOND = 0.01
+_LAST = gtsam.symbol("r", 0)
 
 
 class FixedLagTree:
@@ -38,6 +45,9 @@ class FixedLagTree:
         self._landmark_stamps_ns: dict[int, int] = {}
         # What the trees before this one marginalised is linear in these variables, where they are linearised.
         self._fixed: set[int] = set()
+        # The variables of the newest state with their sizes; where the factors are that tie the last variable to them.
+        self._newest: dict[int, int] = {}
+        self._tie_slots: list[int] = []
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Take in what a packet at a time adds, and solve; return what had to be recovered.
@@ -53,6 +63,7 @@ class FixedLagTree:
         self._oldest_ns = t_ns - self._lag_ns
         if extension.chained is not None:
             self._chained.add(*extension.chained)
+        self._newest = {key: extension.values.extract([key]).dim() for key in extension.state_keys}
         added = self._solved(extension.factors, extension.values)
         return Recovery(back.log + added.log, back.dropped | added.dropped)
 
@@ -110,14 +121,31 @@ class FixedLagTree:
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())
 
+    def _with_the_last_tied(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, slots: list[int]
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
+        """Return what is added and taken out, and with it the ties of the last variable, from one state to the next."""
+        factors, values, unit = (
+            gtsam.NonlinearFactorGraph(factors),
+            gtsam.Values(values),
+            gtsam.noiseModel.Unit.Create(1),
+        )
+        if not self._isam.valueExists(_LAST):
+            values.insert(_LAST, np.zeros(1))
+        for key, size in self._newest.items():
+            tie = gtsam.JacobianFactor(_LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), unit)
+            factors.add(gtsam.LinearContainerFactor(tie))
+        return factors, values, [*slots, *self._tie_slots]
+
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int]) -> None:
         old_states = [key for key, t_ns in self._state_stamps_ns.items() if t_ns < self._oldest_ns]
         old_landmarks = [key for key, t_ns in self._landmark_stamps_ns.items() if t_ns < self._oldest_ns]
-        # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it. The
-        # states are at every step: CCOLAMD takes no place beyond the number of variables it orders.
-        moved = [*(self._landmark_stamps_ns if old_states else old_landmarks), *self._state_stamps_ns]
+        # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it; and
+        # CCOLAMD takes no place beyond the number of variables it orders.
+        moved = [*self._landmark_stamps_ns, *self._state_stamps_ns]
         known = [key for key in moved if self._isam.valueExists(key)]
-        self._add(factors, values, dropped_slots, _key_list(known))
+        factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
+        self._add(factors, values, slots, _key_list(known))
         # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.
         self._values = self._isam.calculateEstimate()
         leaving = old_landmarks + old_states
@@ -146,7 +174,9 @@ class FixedLagTree:
             new_slots = _new_slots(before, self._isam.getFactorsUnsafe())
             self._chained.placed(new_slots[factors.size() :])
             raise
-        self._chained.placed(list(result.getNewFactorsIndices())[factors.size() :])
+        placed, ours = list(result.getNewFactorsIndices()), factors.size()
+        self._tie_slots = placed[ours - len(self._newest) : ours]
+        self._chained.placed(placed[ours:])
 
     def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return the factors of chained sightings about the latest estimates, or where there are none the new."""
@@ -175,7 +205,7 @@ class FixedLagTree:
         for slot in self._chained.slots:
             others.remove(slot)
         self._chained.placed([])
-        factors = without_gaps(others)
+        factors, self._tie_slots = _without_ties(without_gaps(others)), []
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
         known = {*factors.keyVector(), *self._chained.keys()}
@@ -226,6 +256,7 @@ class FixedLagTree:
         place_of = {t_ns: place + i for i, t_ns in enumerate(stamps_ns)}
         for key, t_ns in states:
             groups.insert2(key, place_of[t_ns])
+        groups.insert2(_LAST, place + len(stamps_ns))
         return groups
 
 
@@ -233,6 +264,15 @@ def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
     """Say whether a factor goes when a landmark does: a sighting, or what is linear and concerns nothing else."""
     keys: list[int] = factor.keys()
     return landmark in keys and (len(keys) == 1 or not isinstance(factor, gtsam.LinearContainerFactor))
+
+
+def _without_ties(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """Return the factors but those on the last variable."""
+    kept = gtsam.NonlinearFactorGraph()
+    for factor in (factors.at(i) for i in range(factors.size())):
+        if _LAST not in factor.keys():  # noqa: SIM118 - not a mapping
+            kept.add(factor)
+    return kept
 
 
 def _oldest_beside_newest(stamps_ns: list[int]) -> list[int]:

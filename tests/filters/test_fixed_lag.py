@@ -76,6 +76,24 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
     assert np.linalg.norm(exact.atPoint3(X(7)) - start.atPoint3(X(7))) > 1.0
 
 
+def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_cholesky():
+    """As with a good IMU after minutes: a clique of two such states is beyond the condition that GTSAM allows one."""
+    window, stiff = FixedLagTree(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    everything, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k in range(6):
+        extension = GraphExtension(state_keys=[X(k)])
+        extension.values.insert(X(k), np.array([1.0 * k, 0.0, 0.0]))
+        if k:
+            extension.factors.add(gtsam.BetweenFactorPoint3(X(k - 1), X(k), np.array([1.0, 0.0, 0.0]), stiff))
+        extension.factors.addPriorPoint3(X(k), np.array([1.1 * k, 0.0, 0.0]), gtsam.noiseModel.Unit.Create(3))
+        everything.push_back(extension.factors)
+        start.insert(extension.values)
+        assert window.add(extension, k * NS_PER_S).log == []
+    exact = start.retract(everything.linearize(start).optimizeDensely())
+    # A condition of 1e12 leaves four digits of sixteen; the positions are some metres.
+    np.testing.assert_allclose(position_of(window, 5), exact.atPoint3(X(5)), atol=1e-3)
+
+
 SCENARIOS = [replace(DRIVE, duration_s=4.0), replace(DRIVE_IMU, duration_s=4.0), replace(FLIGHT, duration_s=2.0)]
 
 
