@@ -35,6 +35,7 @@ from toolkit.measured_motion import (
     motions_between,
 )
 from toolkit.resampling import NS_PER_S, Bridges
+from toolkit.track_budget import parts_of_view, within_budget
 from toolkit.track_noise import TrackNoise
 
 GRAVITY_WORLD = (0.0, 0.0, -9.81)
@@ -201,7 +202,8 @@ class Sequence:
 
     A sequence may still carry the faults of its file (see :mod:`toolkit.audit`); only
     :meth:`packets` insists on finite values and increasing time. ``gravity_world`` (3,) m/s^2; ``bridges``: where
-    motion samples are put in."""
+    motion samples are put in; ``track_budget``: of how many tracks a frame estimators see the sightings, None is all.
+    """
 
     name: str
     rig: StereoRig
@@ -214,6 +216,7 @@ class Sequence:
     truth: Truth | None = None
     gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
     bridges: Bridges | None = None
+    track_budget: int | None = None
 
     def __post_init__(self) -> None:
         freeze_arrays(self, frames_t_ns=(None,), gravity_world=(3,))
@@ -240,10 +243,25 @@ class Sequence:
         """The sightings of the tracks no estimator ever sees."""
         return self.observations.select(is_held_out(self.observations.track_id))
 
-    @cached_property
+    @property
     def visible(self) -> Observations:
         """The sightings the estimators work on."""
-        return self.observations.select(~is_held_out(self.observations.track_id))
+        return self._visible_and_ages[0]
+
+    @cached_property
+    def _visible_and_ages(self) -> tuple[Observations, IntArray]:
+        """The sightings (N,) the estimators work on, and the frames since the first of each track, chosen or not."""
+        seen = self.observations.select(~is_held_out(self.observations.track_id))
+        ages = _ages(seen)
+        if self.track_budget is None:
+            return seen, ages
+        parts = parts_of_view(seen.uv_px, (self.rig.cx_px, self.rig.cy_px), self.track_budget)
+        given = within_budget(self.track_budget, self._frame_starts(seen), seen.track_id, ages, parts)
+        return seen.select(given), read_only(ages[given], np.int64)
+
+    def _frame_starts(self, seen: Observations) -> IntArray:
+        """Return the row (K + 1,) at which the sightings of each frame begin, and where those of the last end."""
+        return np.searchsorted(seen.frame, np.arange(self.frame_count + 1))
 
     def packets(self) -> Iterator[Packet]:
         """Yield one packet a frame, in order of time.
@@ -252,8 +270,8 @@ class Sequence:
         motion samples.
         """
         check_runnable(self)
-        seen, ages = self.visible, _ages(self.visible)
-        first_row = np.searchsorted(seen.frame, np.arange(self.frame_count + 1))
+        seen, ages = self._visible_and_ages
+        first_row = self._frame_starts(seen)
         motions = motions_between(self.motion, self.frames_t_ns, self.bridges)
         for k in range(self.frame_count):
             rows = slice(first_row[k], first_row[k + 1])
@@ -273,7 +291,8 @@ class Sequence:
         With ``digits``, of the same rounded (:func:`toolkit.files.content_digest`).
         """
         seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
-        return content_digest((*seen, self.truth, self.prior, *filter(None, (self.bridges,))), digits)
+        further = filter(None, (self.bridges, self.track_budget))
+        return content_digest((*seen, self.truth, self.prior, *further), digits)
 
 
 def is_held_out(track_ids: IntArray) -> BoolArray:

@@ -10,7 +10,7 @@ from toolkit.errors import DataError
 from toolkit.experiment import Plan
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
-from toolkit.settings import DEFAULTS, Noise, SettingsError, settings_of
+from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 
 
 def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
@@ -98,12 +98,33 @@ def test_a_part_without_two_frames_is_refused_with_what_there_is() -> None:
         prepare(Recording(whole, part=Part(5.0)))
 
 
+def test_a_budget_of_tracks_is_kept_and_told() -> None:
+    prepared = prepare(Recording(load_sequence("drive").truncated(20), tracks=TrackUse(budget=25)))
+    assert np.bincount(prepared.sequence.visible.frame).max() == 25
+    assert prepared.sequence.provenance.facts[-1].startswith(
+        "estimators are given at most 25 tracks a frame (tracks.budget): "
+    )
+    assert prepared.whole.track_budget is None
+
+
 def test_a_plan_reads_its_recordings_by_the_settings() -> None:
-    given = {"first_seed": 5, "seeds": 3, "start": "truth", "noise": {"pixel_sigma_px": 0.7}}
+    given = {
+        "first_seed": 5,
+        "seeds": 3,
+        "start": "truth",
+        "noise": {"pixel_sigma_px": 0.7},
+        "tracks": {"budget": 50},
+    }
     plan = Plan(("drive",), ("ekf",), settings=settings_of(given, "here"), max_frames=9, keep=frozenset({"time-gap"}))
     assert plan.seeds == (5, 6, 7)
     assert plan.recording("drive", 6) == Recording(
-        "drive", 6, keep=frozenset({"time-gap"}), start="truth", max_frames=9, noise=Noise(pixel_sigma_px=0.7)
+        "drive",
+        6,
+        keep=frozenset({"time-gap"}),
+        start="truth",
+        max_frames=9,
+        noise=Noise(pixel_sigma_px=0.7),
+        tracks=TrackUse(budget=50),
     )
     assert Plan(("drive",), ("ekf",)).seeds == (DEFAULTS.first_seed,)
 

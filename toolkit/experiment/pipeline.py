@@ -67,6 +67,7 @@ class Plan:
             max_frames=self.max_frames,
             noise=settings.noise,
             frontend=settings.frontend,
+            tracks=settings.tracks,
             vary=settings.vary,
             card=settings.card and seed == self.seeds[0],
             part=self.part,

@@ -18,7 +18,7 @@ from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
-from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, Varied
+from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.track_errors import Card, card_of, fit_track_noise, in_words
 from toolkit.track_noise import TrackNoise
@@ -69,6 +69,7 @@ class Recording:
     duration_s: float | None = None
     noise: Noise = DEFAULTS.noise
     frontend: Frontend = DEFAULTS.frontend
+    tracks: TrackUse = DEFAULTS.tracks
     vary: Varied = DEFAULTS.vary
     card: bool = False
     part: Part = WHOLE
@@ -104,7 +105,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         elif recording.card:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
-        sequence = _cut(whole, recording)
+        sequence = _within_budget(_cut(whole, recording), recording.tracks.budget)
         return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided, card)
 
 
@@ -186,6 +187,17 @@ def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
         rig = replace(rig, track_noise=_stated_track_noise(asked))
     noise = sequence.noise if asked.motion_scale == 1.0 else sequence.noise.scaled(asked.motion_scale)
     return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
+
+
+def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
+    """Return the sequence with a budget of tracks a frame for estimators, if there is one, which the facts tell."""
+    if budget is None:
+        return sequence
+    thinned = replace(sequence, track_budget=budget)
+    given = len(thinned.visible) / max(len(sequence.visible), 1)
+    fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
+    facts = (*sequence.provenance.facts, fact)
+    return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
 
 
 def _stated_track_noise(asked: Noise) -> TrackNoise:

@@ -57,6 +57,7 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
             duration_s=case.duration_s,
             noise=settings.noise,
             frontend=settings.frontend,
+            tracks=settings.tracks,
         )
         for seed in case.seeds
     ]

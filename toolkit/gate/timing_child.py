@@ -42,9 +42,15 @@ class Timer:
 
         self._settings = settings_of(asked["settings"], "the baseline's settings")
         truth = None if asked["truth"] is None else Path(asked["truth"])
-        noise, start = self._settings.noise, self._settings.start
+        noise, start, tracks = self._settings.noise, self._settings.start, self._settings.tracks
         recording = Recording(
-            asked["source"], asked["seed"], truth, start=start, duration_s=asked["duration_s"], noise=noise
+            asked["source"],
+            asked["seed"],
+            truth,
+            start=start,
+            duration_s=asked["duration_s"],
+            noise=noise,
+            tracks=tracks,
         )
         self._prepared = prepare(recording)
         return {}

@@ -186,6 +186,23 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     ] = False
 
 
+class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
+    """Which of a recording's tracks the estimators work on; those withheld stay as they are."""
+
+    budget: (
+        Annotated[
+            int,
+            Meta(
+                ge=10,
+                le=10_000,
+                description="tracks a frame for estimators at most, spread over image and depth, the oldest first",
+                extra={"none": "all"},
+            ),
+        ]
+        | None
+    ) = None
+
+
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
     """Metrics that take long and are computed on request alone."""
 
@@ -251,6 +268,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     outliers: Outliers = Outliers()
     window: Window = Window()
     noise: Noise = Noise()
+    tracks: TrackUse = TrackUse()
     metrics: Metrics = Metrics()
     frontend: Frontend = Frontend()
     start: Annotated[
