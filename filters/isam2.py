@@ -70,7 +70,7 @@ class Isam2:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
         graph, motion = self._tree.graph(), self._builder.motion
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
-        start = self._tree.isam.calculateBestEstimate()
+        start = self._tree.values()
         values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
         if beside is not None:
             graph.push_back(beside.linearised(values))

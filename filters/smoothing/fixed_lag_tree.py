@@ -3,12 +3,8 @@
 GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
 state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
 then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
-root: the last covariance of the one and the first of the other are nearly free, and the update costs no more.
-
-GTSAM refuses a clique whose own variables, scaled to a unit diagonal, have a condition beyond 7e7. An IMU ties two
-states of neighbouring frames so well, and the world after some minutes so loosely, that both in one clique are beyond
-it, and the last two always are: whoever is eliminated before the last hangs on all that is left. So the newest state is
-followed by a variable that means nothing and that only this state is tied to, by factors that weigh nothing.
+root: the last covariance of the one and the first of the other are nearly free, and the update costs no more. Behind
+the newest comes a variable without a meaning, for the sake of the condition of the cliques (``indeterminate``).
 
 A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
 frame is dropped. A state that does so the first time is a matter of rounding in the normal equations: the window is
@@ -23,13 +19,19 @@ import numpy as np
 
 from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
-from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
+from filters.smoothing.indeterminate import (
+    LAST,
+    Recovery,
+    ties_of_the_last,
+    variable_named,
+    weak_hold,
+    without_gaps,
+)
 from toolkit.errors import EstimatorError
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
 RELINEARISE_BEYOND = 0.01
-_LAST = gtsam.symbol("r", 0)
 
 
 class FixedLagTree:
@@ -125,16 +127,10 @@ class FixedLagTree:
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, slots: list[int]
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
         """Return what is added and taken out, and with it the ties of the last variable, from one state to the next."""
-        factors, values, unit = (
-            gtsam.NonlinearFactorGraph(factors),
-            gtsam.Values(values),
-            gtsam.noiseModel.Unit.Create(1),
-        )
-        if not self._isam.valueExists(_LAST):
-            values.insert(_LAST, np.zeros(1))
-        for key, size in self._newest.items():
-            tie = gtsam.JacobianFactor(_LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), unit)
-            factors.add(gtsam.LinearContainerFactor(tie))
+        factors, values = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values)
+        if not self._isam.valueExists(LAST):
+            values.insert(LAST, np.zeros(1))
+        factors.push_back(ties_of_the_last(self._newest))
         return factors, values, [*slots, *self._tie_slots]
 
     def _update(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, dropped_slots: Iterable[int]) -> None:
@@ -143,7 +139,8 @@ class FixedLagTree:
         # Before an old state can leave, all that stands below it in the tree must be eliminated anew, after it; and
         # CCOLAMD takes no place beyond the number of variables it orders.
         moved = [*self._landmark_stamps_ns, *self._state_stamps_ns]
-        known = [key for key in moved if self._isam.valueExists(key)]
+        new = set(values.keys())
+        known = [key for key in moved if key not in new]
         factors, values, slots = self._with_the_last_tied(factors, values, list(dropped_slots))
         self._add(factors, values, slots, _key_list(known))
         # QR eliminates what it cannot solve for: that shows here, and must before anything is marginalised.
@@ -256,7 +253,7 @@ class FixedLagTree:
         place_of = {t_ns: place + i for i, t_ns in enumerate(stamps_ns)}
         for key, t_ns in states:
             groups.insert2(key, place_of[t_ns])
-        groups.insert2(_LAST, place + len(stamps_ns))
+        groups.insert2(LAST, place + len(stamps_ns))
         return groups
 
 
@@ -270,7 +267,7 @@ def _without_ties(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorG
     """Return the factors but those on the last variable."""
     kept = gtsam.NonlinearFactorGraph()
     for factor in (factors.at(i) for i in range(factors.size())):
-        if _LAST not in factor.keys():  # noqa: SIM118 - not a mapping
+        if LAST not in factor.keys():  # noqa: SIM118 - not a mapping
             kept.add(factor)
     return kept
 

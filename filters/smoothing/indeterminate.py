@@ -4,10 +4,16 @@ GTSAM's stereo factor has no gradient where its landmark is behind the camera. A
 disparity first and at larger ones next is moved by a Gauss-Newton step in metres, taken with the slope of depth at the
 small disparity: it passes the camera where the right disparity is more than twice the first. Linearised there the
 landmark would be indeterminate.
+
+GTSAM also refuses a clique whose own variables, scaled to a unit diagonal, have a condition beyond 7e7. An IMU ties two
+states of neighbouring frames so well, and the world after a minute of driving so loosely, that both in one clique are
+beyond it; and the last two eliminated always are in one, for the one before the last hangs on all that is left. So the
+newest state is followed by a variable that means nothing and that only this state is tied to, by factors that weigh
+nothing.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +28,8 @@ from toolkit.sequence import StereoRig
 
 # What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
 WEAK_SIGMA = 1.0
+# The variable that is eliminated last.
+LAST = gtsam.symbol("r", 0)
 
 
 class Recovery(NamedTuple):
@@ -51,6 +59,15 @@ def weak_hold(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:
     size = at.dim()
     noise = gtsam.noiseModel.Isotropic.Sigma(size, WEAK_SIGMA)
     return gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, np.eye(size), np.zeros(size), noise), at)
+
+
+def ties_of_the_last(state: Mapping[int, int]) -> gtsam.NonlinearFactorGraph:
+    """Return the factors that tie the last variable to a state, whose keys have sizes, and tell nothing of it."""
+    ties, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(1)
+    for key, size in state.items():
+        tie = gtsam.JacobianFactor(LAST, np.eye(1), key, np.zeros((1, size)), np.zeros(1), unit)
+        ties.add(gtsam.LinearContainerFactor(tie))
+    return ties
 
 
 def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:

@@ -4,7 +4,8 @@ Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tre
 Landmarks are eliminated first and states in the order of time, the newest last: new sightings then change few
 cliques, and the marginal of the newest state stands in the root. But a landmark eliminated first hangs on the first
 state that saw it, and each new sighting has all states since then eliminated anew: one that has long been in view goes
-last instead, beside the newest state, where a sighting of it changes the root alone.
+last instead, beside the newest state, where a sighting of it changes the root alone. Behind the newest state comes a
+variable without a meaning, for the sake of the condition of the cliques (``indeterminate``).
 """
 
 from collections import deque
@@ -20,7 +21,14 @@ from filters.smoothing.cached_linearisation import (
     with_linearisations,
 )
 from filters.smoothing.chained_past import ChainedPast
-from filters.smoothing.indeterminate import Recovery, variable_named, weak_hold, without_gaps
+from filters.smoothing.indeterminate import (
+    LAST,
+    Recovery,
+    ties_of_the_last,
+    variable_named,
+    weak_hold,
+    without_gaps,
+)
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import L, kind_of
@@ -55,6 +63,8 @@ class Isam2Tree:
         self._slot_count = 0
         self._cached: dict[int, CachedLinearisation] = {}
         self._sightings: dict[int, list[int]] = {}
+        # Where the factors are that tie the last variable to the newest state.
+        self._tie_slots: list[int] = []
 
     def add(
         self,
@@ -83,16 +93,36 @@ class Isam2Tree:
             for slot, landmark in renewal.replaced.items():
                 self._sightings[landmark].remove(slot)
             stale = list(renewal.replaced)
-        return self._update(factors, values, cached, moved, stale)
+        factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
+        return self._update(factors, values, cached, moved, [*stale, *old_ties])
+
+    def _with_the_last_tied(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: list[int]
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[int]]:
+        """Return what is added, the ties of the last variable among it, and the slots of their predecessors."""
+        factors, values, old = gtsam.NonlinearFactorGraph(factors), gtsam.Values(values), self._tie_slots
+        if not self.isam.valueExists(LAST):
+            values.insert(LAST, np.zeros(1))
+        ties = ties_of_the_last({key: self._motion.variable_sizes[kind_of(key)] for key in newest})
+        first_slot = self._slot_count + factors.size()
+        self._tie_slots = list(range(first_slot, first_slot + ties.size()))
+        factors.push_back(ties)
+        return factors, values, old
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors but chained sightings, of the Python ones themselves and not their linearisations."""
         factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
         for slot, cached in self._cached.items():
             factors.replace(slot, cached.factor)
-        for slot in self._chained.slots() if self._chained else ():
+        for slot in [*self._tie_slots, *(self._chained.slots() if self._chained else ())]:
             factors.remove(slot)
         return without_gaps(factors)
+
+    def values(self) -> gtsam.Values:
+        """Return the latest values of all that means something."""
+        values = self.isam.calculateBestEstimate()
+        values.erase(LAST)
+        return values
 
     def drop(self, landmarks: Iterable[int]) -> Recovery:
         """Take landmarks out, with all their sightings; return what had to be recovered."""
@@ -169,13 +199,13 @@ class Isam2Tree:
         """Return the place of each recent state, and each long-lived landmark it sees, in the elimination.
 
         All else comes first. CCOLAMD takes no place beyond the number of variables it orders, of which the new factors'
-        are the least.
+        are the least; where some are only taken out, two at least are ordered, of which one is the last variable.
         """
         groups, new = gtsam.KeyGroupMap(), list(factors.keys())
-        places = max(len(new) - 1, 0)
-        states = list(self._recent)[max(len(self._recent) - places + 1, 0) :]
+        states = list(self._recent)
         long_lived = [key for key in new if len(self._sightings.get(key, ())) > LONG_LIVED_SIGHTINGS]
-        for place, keys in enumerate([*states[:-1], long_lived, *states[-1:]], start=1):
+        last = [*states[:-1], long_lived, *states[-1:], [LAST]]
+        for place, keys in enumerate(last[-max(len(new) - 1, 1) :], start=1):
             for key in keys:
                 groups.insert2(key, place)
         return groups
@@ -233,6 +263,7 @@ class Isam2Tree:
         self._slot_count = len(kept)
         self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
+        self._tie_slots = [slot_of[old] for old in self._tie_slots]
         if self._chained is not None:
             self._chained.move(slot_of)
         self.isam = self._empty_tree()
@@ -244,6 +275,7 @@ class Isam2Tree:
         pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * self._baseline_m], 3)
         for kind, size in self._motion.variable_sizes.items():
             thresholds.insert((kind, pose if kind == "x" else np.full(size, OTHER_THRESHOLDS[kind])))
+        thresholds.insert((kind_of(LAST), np.ones(1)))
         thresholds.insert(("l", np.full(3, LANDMARK_THRESHOLD_BASELINES * self._baseline_m)))
         params.setRelinearizeThreshold(thresholds)
         params.relinearizeSkip = 1
