@@ -78,7 +78,7 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
 
 def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_cholesky():
     """As with a good IMU after minutes: a clique of two such states is beyond the condition that GTSAM allows one."""
-    window, stiff = FixedLagTree(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
+    window, stiff = unchained(2 * NS_PER_S), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
     everything, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(6):
         extension = GraphExtension(state_keys=[X(k)])
