@@ -268,7 +268,7 @@ def test_the_page_for_the_course_says_of_dataset_10_what_its_velocities_say(real
 def test_on_the_first_lines_drive_the_decoupled_filter_is_marked_and_the_others_are_not(
     first_line: tuple[str, Path],
 ) -> None:
-    """A pose NEES of 37096, 0.51, 1.42 and 1.08: causal and final, which are one row where they are the same."""
+    """A pose NEES of 37096, 0.51, 1.43 and 1.08: causal and final, which are one row where they are the same."""
     drive = re.findall(r"^drive: .*?^results: ", first_line[0], flags=re.M | re.S)[0]
     marks = [(above.split()[0], line.strip()) for above, line in pairwise(drive.splitlines()) if line.strip() in MARKS]
     assert marks == [("ekf", "overconfident")]
