@@ -8,16 +8,16 @@ stays that of the motion, unless the fault is one of the truth.
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
-from toolkit.measured_motion import TwistNoise, TwistSamples
+from toolkit.geometry import Array, BoolArray, se3, se3_inverse, so3_exp
 from toolkit.models.stereo import project, triangulate
-from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence, Truth
+from toolkit.sequence import Observations, Sequence
+from toolkit.simulation.spans import frames_s, ns, samples_s, span_s
+from toolkit.simulation.standstill import standstill as standstill  # noqa: PLC0414 - an injector like those below
 
 Fault = Callable[[Sequence, float, int], Sequence]
 
@@ -32,8 +32,8 @@ def dropped_sightings(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> S
 
 def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """See nothing for so many seconds, and new tracks after that: a tunnel, glare, a covered lens."""
-    seen, begin_s, end_s = sequence.observations, *_span_s(sequence, dose, seed)
-    time_s = _frames_s(sequence)[seen.frame]
+    seen, begin_s, end_s = sequence.observations, *span_s(sequence, dose, seed)
+    time_s = frames_s(sequence)[seen.frame]
     later = time_s >= end_s
     track_id = np.where(later, seen.track_id + seen.track_id.max(initial=-1) + 1, seen.track_id)
     rows = (time_s < begin_s) | later
@@ -58,8 +58,8 @@ def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
     closer than half a metre is lost.
     """
     seen, rig = sequence.observations, sequence.rig
-    rng, (begin_s, end_s) = np.random.default_rng(seed), _span_s(sequence, sequence.duration_s / 3.0, seed)
-    seen_s = _frames_s(sequence)[seen.frame]
+    rng, (begin_s, end_s) = np.random.default_rng(seed), span_s(sequence, sequence.duration_s / 3.0, seed)
+    seen_s = frames_s(sequence)[seen.frame]
     moves = _struck_tracks(sequence, dose, seed) & (seen.uv_px[:, 0] > seen.uv_px[:, 1])
     moves &= (seen_s >= begin_s) & (seen_s < end_s)
     angle, points = rng.uniform(0.0, 2.0 * np.pi), triangulate(seen.uv_px[moves], rig)
@@ -130,15 +130,15 @@ def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Se
 
 def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Lose the motion samples of so many seconds: a full buffer, a loose cable."""
-    begin_s, end_s = _span_s(sequence, dose, seed)
-    t_s = _samples_s(sequence)
+    begin_s, end_s = span_s(sequence, dose, seed)
+    t_s = samples_s(sequence)
     return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
 
 
 def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Repeat the last motion sample for so many seconds: a driver that hangs."""
-    begin_s, end_s = _span_s(sequence, dose, seed)
-    t_s, values = _samples_s(sequence), sequence.motion.values.copy()
+    begin_s, end_s = span_s(sequence, dose, seed)
+    t_s, values = samples_s(sequence), sequence.motion.values.copy()
     stuck = (t_s > begin_s) & (t_s < end_s)
     values[stuck] = values[max(int(np.argmax(stuck)) - 1, 0)]
     return _with_values(sequence, values)
@@ -160,17 +160,17 @@ def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
 
 def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Add so many m/s, or m/s^2, along an axis drawn to a third of the motion samples: wheels that slip, vibration."""
-    begin_s, end_s = _span_s(sequence, sequence.duration_s / 3.0, seed)
-    axis, t_s = np.random.default_rng(seed).standard_normal(3), _samples_s(sequence)
+    begin_s, end_s = span_s(sequence, sequence.duration_s / 3.0, seed)
+    axis, t_s = np.random.default_rng(seed).standard_normal(3), samples_s(sequence)
     added = np.concatenate([dose * axis / np.linalg.norm(axis), np.zeros(3)])
     return _with_values(sequence, sequence.motion.values + ((t_s >= begin_s) & (t_s < end_s))[:, None] * added)
 
 
 def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
     """Write NaN for all motion samples and sightings of so many seconds: a driver that gives up and comes back."""
-    begin_s, end_s = _span_s(sequence, dose, seed)
+    begin_s, end_s = span_s(sequence, dose, seed)
     values, uv_px = sequence.motion.values.copy(), sequence.observations.uv_px.copy()
-    t_s, seen_s = _samples_s(sequence), _frames_s(sequence)[sequence.observations.frame]
+    t_s, seen_s = samples_s(sequence), frames_s(sequence)[sequence.observations.frame]
     values[(t_s > begin_s) & (t_s < end_s)] = np.nan
     uv_px[(seen_s > begin_s) & (seen_s < end_s)] = np.nan
     return _with_values(_with_pixels(sequence, uv_px), values)
@@ -207,7 +207,7 @@ def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Seque
 
     Frames that leave the time of the motion samples are cut off. The truth stays on the motion's clock.
     """
-    late = replace(sequence, frames_t_ns=sequence.frames_t_ns + _ns(dose))
+    late = replace(sequence, frames_t_ns=sequence.frames_t_ns + ns(dose))
     motion_t_ns = sequence.motion.t_ns
     inside = (late.frames_t_ns >= motion_t_ns[0]) & (late.frames_t_ns <= motion_t_ns[-1])
     return late if inside.all() else _with_first_frames_cut(late, inside)
@@ -215,81 +215,11 @@ def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Seque
 
 def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
     """Let frames and samples be stamped on by a clock that has jumped so many seconds: a daemon sets the time."""
-    at_ns = sequence.frames_t_ns[0] + _ns(_span_s(sequence, 0.0, seed)[0])
+    at_ns = sequence.frames_t_ns[0] + ns(span_s(sequence, 0.0, seed)[0])
     motion, frames_t_ns = sequence.motion, sequence.frames_t_ns
-    frames_t_ns = frames_t_ns + np.where(frames_t_ns > at_ns, _ns(dose), 0)
-    samples_t_ns = motion.t_ns + np.where(motion.t_ns > at_ns, _ns(dose), 0)
+    frames_t_ns = frames_t_ns + np.where(frames_t_ns > at_ns, ns(dose), 0)
+    samples_t_ns = motion.t_ns + np.where(motion.t_ns > at_ns, ns(dose), 0)
     return replace(sequence, frames_t_ns=frames_t_ns, motion=replace(motion, t_ns=samples_t_ns))
-
-
-def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
-    """Stop for so many seconds at a frame and go on from there: a red light. For twists, whose motion may just stop.
-
-    The tracks of that frame are seen again in every one, with the noise of the rig. Raises DataError where the
-    motion is an IMU's: braking would need accelerations nobody measured; simulate a scene that halts.
-    """
-    motion, noise = sequence.motion, sequence.noise
-    if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
-        raise DataError(
-            f"{sequence.name}: a standstill can be planted between twists only; simulate a scene that halts"
-        )
-    rng, period_ns = np.random.default_rng(seed), int(np.median(np.diff(sequence.frames_t_ns)))
-    halt = int(np.searchsorted(_frames_s(sequence), _span_s(sequence, 0.0, seed)[0]))
-    pause = _Pause(sequence.frames_t_ns[halt], period_ns, round(_ns(dose) / period_ns))
-    t_ns, rows = pause.inserted(motion.t_ns)
-    density = np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])
-    still = rng.standard_normal((t_ns.size, 6)) * density / np.sqrt(period_ns / NS_PER_S)
-    values = np.where(pause.within(t_ns)[:, None], still, motion.values[rows])
-    return replace(
-        sequence,
-        frames_t_ns=pause.inserted(sequence.frames_t_ns)[0],
-        observations=_seen_standing(sequence, halt, pause.stamps, rng),
-        motion=replace(motion, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:]),
-        truth=None if sequence.truth is None else _truth_standing(sequence.truth, pause),
-    )
-
-
-class _Pause(NamedTuple):
-    """So many stamps, a period apart, put in before the stamp ``at_ns``; what follows is as much later."""
-
-    at_ns: int
-    period_ns: int
-    stamps: int
-
-    def inserted(self, t_ns: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the stamps (N + stamps,) and the row of ``t_ns`` (N,) that each one repeats."""
-        at = int(np.searchsorted(t_ns, self.at_ns))
-        rows = np.concatenate([np.arange(at), np.full(self.stamps, min(at, t_ns.size - 1)), np.arange(at, t_ns.size)])
-        extra_ns = self.at_ns + self.period_ns * np.arange(self.stamps)
-        return np.concatenate([t_ns[:at], extra_ns, t_ns[at:] + self.stamps * self.period_ns]), rows
-
-    def within(self, t_ns: IntArray) -> BoolArray:
-        """Say which stamps (N,) are of the pause."""
-        return np.asarray((t_ns >= self.at_ns) & (t_ns < self.at_ns + self.stamps * self.period_ns))
-
-
-def _seen_standing(sequence: Sequence, halt: int, count: int, rng: np.random.Generator) -> Observations:
-    seen = sequence.observations
-    here = np.flatnonzero(seen.frame == halt)
-    standing = seen.select(np.tile(here, count))
-    noise_px = rng.standard_normal((len(standing), 3)) @ np.linalg.cholesky(sequence.rig.cov_uv_px2).T
-    return Observations.sorted(
-        np.concatenate([seen.frame + count * (seen.frame >= halt), np.repeat(halt + np.arange(count), here.size)]),
-        np.concatenate([seen.track_id, standing.track_id]),
-        np.concatenate([seen.uv_px, standing.uv_px + noise_px]),
-    )
-
-
-def _truth_standing(truth: Truth, pause: _Pause) -> Truth:
-    t_ns, rows = pause.inserted(truth.t_ns)
-    moves = ~pause.within(t_ns)[:, None]
-    return replace(
-        truth,
-        t_ns=t_ns,
-        T_world_imu=truth.T_world_imu[rows],
-        v_world=None if truth.v_world is None else truth.v_world[rows] * moves,
-        bias=None if truth.bias is None else truth.bias[rows],
-    )
 
 
 # The calibration and the truth --------------------------------------------------------------------------------------
@@ -357,25 +287,6 @@ def truth_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Seque
 
 
 # What they share ----------------------------------------------------------------------------------------------------
-
-
-def _span_s(sequence: Sequence, length_s: float, seed: int) -> tuple[float, float]:
-    """Return begin and end (s from the first frame) of a span in the middle half, where one of that length fits."""
-    begin_s = sequence.duration_s * np.random.default_rng(seed).uniform(0.3, 0.6)
-    begin_s = max(min(begin_s, 0.9 * sequence.duration_s - length_s), 0.0)
-    return begin_s, begin_s + length_s
-
-
-def _ns(seconds: float) -> int:
-    return round(seconds * NS_PER_S)
-
-
-def _frames_s(sequence: Sequence) -> Array:
-    return np.asarray((sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
-
-
-def _samples_s(sequence: Sequence) -> Array:
-    return np.asarray((sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
 
 
 def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:

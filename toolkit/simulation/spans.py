@@ -1,0 +1,29 @@
+"""Where in a recording a fault strikes: times in seconds after its first frame."""
+
+import numpy as np
+
+from toolkit.geometry import Array
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
+
+
+def span_s(sequence: Sequence, length_s: float, seed: int) -> tuple[float, float]:
+    """Return begin and end (s from the first frame) of a span in the middle half, where one of that length fits."""
+    begin_s = sequence.duration_s * np.random.default_rng(seed).uniform(0.3, 0.6)
+    begin_s = max(min(begin_s, 0.9 * sequence.duration_s - length_s), 0.0)
+    return begin_s, begin_s + length_s
+
+
+def ns(seconds: float) -> int:
+    """Return seconds as whole nanoseconds."""
+    return round(seconds * NS_PER_S)
+
+
+def frames_s(sequence: Sequence) -> Array:
+    """Return the stamps of the frames (K,), in seconds after the first."""
+    return np.asarray((sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
+
+
+def samples_s(sequence: Sequence) -> Array:
+    """Return the stamps of the motion samples (S,), in seconds after the first frame."""
+    return np.asarray((sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
