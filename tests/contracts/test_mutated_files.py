@@ -26,7 +26,6 @@ from toolkit.cli import main
 from toolkit.datasets import load_references, load_sequence
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import VislamError
-from toolkit.report import run_directory
 
 # A recording as its files: the content by the name in the folder; one file alone has the name "".
 Files = dict[str, bytes]
@@ -272,11 +271,11 @@ def test_the_command_line_survives_a_mutated_recording(
 
 def run_on(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
     """Compare on a recording: what is told is at most one line, the status one that is documented, the rest whole."""
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("error")
-        patch.setattr(run_directory, "drawn", lambda _comparison: ())
         path, out = write(files, Path(folder) / "given"), Path(folder) / "run"
         words = ("compare", str(path), "--estimators", "dead-reckoning", "--max-frames", "4", "--workers", "1")
+        words += ("--figures", "none")
         status = main([*words, "--out", str(out)])
         told = capfd.readouterr()
         assert status in (0, 1, 3), told.err
