@@ -5,12 +5,11 @@ it is imported when an estimator that has one is built, never before, and compil
 """
 
 import fcntl
-import os
+import importlib.util
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -56,7 +55,7 @@ class Compilation:
         first = name not in sys.modules
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            with _one_process_at_a_time():
+            with _one_process_at_a_time(name):
                 module = import_module(name)
         except Exception as error:
             # A numba that does not fit this Python or NumPy says so in errors of many kinds.
@@ -73,17 +72,14 @@ class Compilation:
 
 
 @contextmanager
-def _one_process_at_a_time() -> Iterator[None]:
-    """Have the processes of a user compile one after another: what the first has compiled the others find on disk."""
-    place = Path(tempfile.gettempdir()) / f"vislam-compilation-{os.getuid()}.lock"
-    try:
-        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    except OSError:  # then they compile side by side
+def _one_process_at_a_time(name: str) -> Iterator[None]:
+    """Have processes import a module one after another: what the first has compiled the others find on disk.
+
+    They wait at the module's own file, so that none is left behind.
+    """
+    spec = importlib.util.find_spec(name)
+    with ExitStack() as held:
+        with suppress(OSError):  # no file, or a file system without locks: then they compile side by side
+            file = held.enter_context(Path(spec.origin or "" if spec else "").open("rb"))
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
-        return
-    try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(lock)
