@@ -7,7 +7,7 @@ from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf",)
-RUNG, CHANGE = 60, "+ window of past poses, tracks used at once, kept at their end; usual errors, one step a frame"
+RUNG, CHANGE = 60, "+ past poses, tracks used at once but kept at their end; usual errors, one step"
 
 
 def build(setup: Setup) -> Estimator:
