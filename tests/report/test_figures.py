@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from toolkit.estimate import Landmarks
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, se3
+from toolkit.report.curves import errors_to, onto_truth, truth_during
 from toolkit.report.figures import against_bound, errors_over_time, frame_times, reprojection, top_view
-from toolkit.report.figures.alignment import errors_to, onto_truth, truth_during
 from toolkit.report.figures.style import colour_of, width_of
 from toolkit.settings import Metrics, Settings
 from toolkit.simulation import DRIVE, simulate

@@ -12,8 +12,8 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import about_z, interpolate_poses, se3
 from toolkit.metrics import Evaluation, in_sample
 from toolkit.report import figures
+from toolkit.report.curves import Components
 from toolkit.report.figures import FigureChoice, components, consistency, drawn, error_map, errors_over_time, top_view
-from toolkit.report.figures.components import Components
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.figures.view import NOWHERE, Track, View, view_of, where_tracks_coincide
 from toolkit.sequence import Sequence

@@ -12,7 +12,7 @@ from msgspec import to_builtins
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
-from toolkit.report.figures.components import components
+from toolkit.report.curves import components
 from toolkit.report.records import read_report
 from toolkit.report.report_json import report_document
 

@@ -14,10 +14,16 @@ from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.card import card_record
-from toolkit.report.figures.alignment import Errors, alignment_words, onto_truth, truth_during
-from toolkit.report.figures.components import components
-from toolkit.report.figures.errors_over_time import ErrorCurves, error_curves
-from toolkit.report.figures.view import last_word
+from toolkit.report.curves import (
+    ErrorCurves,
+    Errors,
+    alignment_words,
+    components,
+    error_curves,
+    last_word,
+    onto_truth,
+    truth_during,
+)
 from toolkit.report.messages import (
     consistency_lines,
     header_lines,

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec import UNSET
@@ -19,13 +20,15 @@ from toolkit.experiment.pipeline import Case
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
-from toolkit.report.figures import FigureChoice, FigureFormat, drawn, save
-from toolkit.report.figures.alignment import truth_during
+from toolkit.report.curves import truth_during
 from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest, read_manifest
 from toolkit.report.records.report import CameraFrame
 from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import metrics_document, seeds_document
+
+if TYPE_CHECKING:
+    from toolkit.report.figures import FigureChoice, FigureFormat
 
 METRICS, SEEDS = "metrics.json", "seeds.json"
 REPORT, MANIFEST = "report.json", "manifest.json"
@@ -126,8 +129,8 @@ class MadeBy:
 
     command: str
     asked: Configuration
-    figures: FigureFormat = "png"
-    choice: FigureChoice = "few"
+    figures: "FigureFormat" = "png"
+    choice: "FigureChoice" = "few"
 
 
 def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
@@ -148,11 +151,21 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             frames = _written_frames(comparison, directory)
             _write_text(directory / REPORT, to_line(report_json.report_document(comparison, frames)))
             _write_trajectories(comparison, directory)
-        (directory / "figures").mkdir()
-        captions = save(drawn(comparison, made_by.choice), directory / "figures", made_by.figures)
+        captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
         manifest = manifest_document(comparison, made_by.command, made_by.asked)
         _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))
+
+
+def _written_figures(comparison: Comparison, folder: Path, made_by: MadeBy) -> dict[str, str]:
+    """Draw into a new folder; return file name -> caption."""
+    folder.mkdir()
+    if made_by.choice == "none":
+        return {}
+    # Here alone, for matplotlib takes long to import.
+    from toolkit.report.figures import drawn, save
+
+    return save(drawn(comparison, made_by.choice), folder, made_by.figures)
 
 
 def _take_over(comparison: Comparison, target: Path, directory: Path) -> None:

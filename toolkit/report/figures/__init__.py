@@ -1,6 +1,6 @@
 """The figures of a comparison as files, PNG, PDF or SVG, one module a kind; drawn without a display.
 
-Reading order: style -> alignment, view, panels -> the kinds, which __init__ lists.
+Reading order: style -> view, panels -> the kinds, which __init__ lists; the numbers are those of report.curves.
 """
 
 import warnings

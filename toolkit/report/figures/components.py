@@ -1,7 +1,6 @@
 """Position and attitude of one estimator by component: its error, and three times the standard deviation it states."""
 
 from collections.abc import Collection, Iterator
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,13 +9,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from toolkit.estimate import Output
-from toolkit.experiment.comparison import Comparison, Row, plain_name
-from toolkit.geometry import Array, IntArray, se3_inverse, so3_log
-from toolkit.metrics import Evaluation, Unavailable
-from toolkit.metrics._shared.association import finite_poses
-from toolkit.metrics._shared.consistency import POSE_DOF, body_errors
+from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.figures.alignment import last_good_answer
+from toolkit.report.curves import Components, components, last_good_answer
 from toolkit.report.figures.panels import COLOUR_OF
 from toolkit.report.figures.style import (
     TITLE_PT,
@@ -38,18 +33,6 @@ _BAND_ALPHA = 0.16
 _LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 
 
-class Components(NamedTuple):
-    """Errors at stamps (n,) in the world's axes (n, 6) and their stated standard deviations (n, 6) or None.
-
-    The first three are rotations about x, y and z in degrees, the others positions along them in metres; each is
-    estimate minus truth.
-    """
-
-    t_ns: IntArray
-    error: Array
-    sigma: Array | None
-
-
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield a figure for each estimator with a trajectory that has something to be compared with."""
     for run in comparison.runs:
@@ -61,58 +44,6 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
                     found[row.output] = one
         if found:
             yield _figure(comparison, run.estimator, run.final_is_causal, found)
-
-
-def components(comparison: Comparison, row: Row) -> Components | None:
-    """Return the errors of an output as the NEES takes them, or without truth its difference from the last answer.
-
-    Returns None where there is neither.
-    """
-    trajectory = row.run.trajectory(row.output)
-    if trajectory is None:
-        return None
-    if comparison.sequence.truth is None:
-        return _difference(comparison, row)
-    try:
-        errors = body_errors(Evaluation(row.run, row.output, comparison.sequence))
-    except Unavailable:
-        return None
-    covs = None if trajectory.cov is None else trajectory.cov[errors.rows]
-    return _in_world_axes(errors.t_ns, errors.T_world_imu, errors.T_estimate_truth, covs)
-
-
-def _difference(comparison: Comparison, row: Row) -> Components | None:
-    reference, trajectory = last_good_answer(comparison), row.run.trajectory(row.output)
-    if reference is None or trajectory is None or trajectory is reference.trajectory:
-        return None
-    t_ns, mine, theirs = np.intersect1d(trajectory.t_ns, reference.trajectory.t_ns, return_indices=True)
-    poses, others = trajectory.T_world_imu[mine], reference.trajectory.T_world_imu[theirs]
-    known = finite_poses(poses) & finite_poses(others)
-    covs = None if trajectory.cov is None else trajectory.cov[mine][known]
-    return _in_world_axes(t_ns[known], poses[known], se3_inverse(poses[known]) @ others[known], covs)
-
-
-def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: Array | None) -> Components | None:
-    """Turn errors in the body frame (n, 4, 4) and their covariances into the world's axes."""
-    if not t_ns.size:
-        return None
-    turn = poses[:, :3, :3]
-    rotation = -np.degrees(_turned(turn, so3_log(T_estimate_truth[:, :3, :3])))
-    error = np.hstack([rotation, -_turned(turn, T_estimate_truth[:, :3, 3])])
-    if covs is None or not np.isfinite(covs[:, :POSE_DOF, :POSE_DOF]).any():
-        return Components(t_ns, error, None)
-    deviations = [_deviation(turn, covs[:, block, block]) for block in (ROTATION, POSITION)]
-    return Components(t_ns, error, np.hstack([np.degrees(deviations[0]), deviations[1]]))
-
-
-def _turned(rotations: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
-
-
-def _deviation(rotations: Array, covs: Array) -> Array:
-    """Return the standard deviations (n, 3) of covariances (n, 3, 3) in the body frame, along the world's axes."""
-    variance = np.einsum("nij,njk,nik->ni", rotations, covs, rotations)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:

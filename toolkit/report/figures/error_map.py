@@ -21,7 +21,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable, in_sample
 from toolkit.metrics._shared.residuals import rmse
-from toolkit.report.figures.alignment import alignment_words, errors_to, onto_truth, truth_during
+from toolkit.report.curves import alignment_words, errors_to, last_word, onto_truth, truth_during
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
@@ -40,7 +40,6 @@ from toolkit.report.figures.view import (
     View,
     from_above,
     landmarks_shown,
-    last_word,
     track_of,
     true_track,
     view_of,

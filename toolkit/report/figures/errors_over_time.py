@@ -1,25 +1,14 @@
 """Position and heading error over time against the truth; without truth, the differences between estimators."""
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
-from toolkit.metrics._shared.alignment import Alignment
 from toolkit.metrics._shared.residuals import rmse
-from toolkit.report.figures.alignment import (
-    NOT_ALIGNED,
-    Errors,
-    alignment_words,
-    errors_to,
-    last_good_answer,
-    onto_truth,
-    truth_during,
-)
+from toolkit.report.curves import ErrorCurves, Errors, error_curves
 from toolkit.report.figures.panels import scale_by_decades
 from toolkit.report.figures.style import (
     NamedFigure,
@@ -32,7 +21,6 @@ from toolkit.report.figures.style import (
     width_of,
 )
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Truth
 
 # A run that is not ok is drawn up to this many times the largest error of the runs that are.
 _ROOM_FOR_DIVERGED = 1.5
@@ -41,74 +29,11 @@ _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _ORDER_OF_MAGNITUDE, _BELOW_LEAST, _LEAST_LOGARITHMIC_M = 12.0, 0.2, 1e-5
 
 
-class _Reference(NamedTuple):
-    """What the curves are measured against, how a row is aligned to it first, and how to call the difference.
-
-    ``trajectory`` is the estimate that stands for the truth where there is none.
-    """
-
-    truth: Truth
-    align: Callable[[Row], Alignment]
-    what: str
-    caption: str
-    trajectory: Trajectory | None = None
-
-
-class ErrorCurves(NamedTuple):
-    """The rows with their errors, how to call them ("error", or the difference from whom) and the caption."""
-
-    of_rows: list[tuple[Row, Errors]]
-    what: str
-    caption: str
-
-
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield the figure of errors (with truth) or of differences (without, given two trajectories)."""
     curves = error_curves(comparison)
     if curves is not None:
         yield _figure(comparison, curves)
-
-
-def error_curves(comparison: Comparison) -> ErrorCurves | None:
-    """Return every row's errors (with truth) or differences (without), or None where no row has any."""
-    reference = _truth(comparison) or _answer(comparison)
-    if reference is None:
-        return None
-    curves: list[tuple[Row, Errors]] = []
-    for row in comparison.rows:
-        trajectory = row.run.trajectory(row.output)
-        if trajectory is None or trajectory is reference.trajectory:
-            continue
-        if row.output == "causal" and row.run.final_is_causal:
-            continue
-        errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
-        if errors is not None:
-            curves.append((row, errors))
-    return ErrorCurves(curves, reference.what, reference.caption) if curves else None
-
-
-def _truth(comparison: Comparison) -> _Reference | None:
-    sequence = comparison.sequence
-    truth = truth_during(sequence)
-    if truth is None:
-        return None
-    caption = (
-        f"Position and heading error over time. {alignment_words(sequence)} "
-        "Dashed: causal, what was known at the time. Solid: final, or both where they agree (as a filter's do)."
-    )
-    return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
-
-
-def _answer(comparison: Comparison) -> _Reference | None:
-    answer = last_good_answer(comparison)
-    if answer is None:
-        return None
-    caption = (
-        f"There is no truth: position and heading difference from {answer.name}, not aligned. "
-        "A difference says that two estimators disagree, not which of them is right."
-    )
-    as_truth = Truth(answer.trajectory.t_ns, answer.trajectory.T_world_imu)
-    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {answer.name}", caption, answer.trajectory)
 
 
 def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:

@@ -15,9 +15,9 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, held_out, in_sample
 from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.report.curves import last_word
 from toolkit.report.figures.panels import finish, panels_of, tell
 from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of
-from toolkit.report.figures.view import last_word
 
 # A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
 _SMALLEST_PX = 0.01

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison, plain_name
-from toolkit.report.figures.alignment import alignment_words
+from toolkit.report.curves import alignment_words, last_word
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
     MUTED_COLOUR,
@@ -31,7 +31,6 @@ from toolkit.report.figures.view import (
     View,
     from_above,
     landmarks_shown,
-    last_word,
     track_of,
     true_track,
     view_of,

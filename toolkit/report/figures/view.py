@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from toolkit.estimate import Output, Run
+from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, IntArray
-from toolkit.report.figures.alignment import onto_truth, truth_during
+from toolkit.report.curves import last_word, onto_truth, truth_during
 
 _LANDMARK_QUANTILES = (0.02, 0.98)
 _MARGIN = 0.05
@@ -50,11 +50,6 @@ class Track(NamedTuple):
 
     t_ns: IntArray
     xy: Array
-
-
-def last_word(run: Run) -> Output:
-    """Return the kind of output a figure with room for one shows: the final one where there is one."""
-    return "final" if run.final is not None else "causal"
 
 
 def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:

@@ -1,0 +1,227 @@
+"""What figures and report.json draw over time, as numbers: errors after a fit to the truth, and by component.
+
+The pairs and the fits are the metrics' own.
+With an IMU the vertical is measured and only heading and position are fitted (the fit of ate_yaw_m); from twists
+alone an estimator does not know the vertical, and a whole rigid motion is fitted (that of ate_se3_m).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.estimate import Output, Run, Trajectory
+from toolkit.experiment.comparison import Comparison, Row
+from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
+from toolkit.metrics import Evaluation
+from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_yaw
+from toolkit.metrics._shared.association import associate, finite_poses, median_period_ns
+from toolkit.metrics._shared.consistency import POSE_DOF, body_errors
+from toolkit.metrics._shared.scores import Unavailable
+from toolkit.models.state import POSITION, ROTATION
+from toolkit.sequence import Sequence, Truth
+
+NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
+
+
+class Errors(NamedTuple):
+    """Errors at stamps (N,) and paths (N,) m: distance (N,) m and heading (N,) degrees within +-180."""
+
+    t_ns: IntArray
+    path_m: Array
+    position_m: Array
+    heading_deg: Array
+
+
+class Answer(NamedTuple):
+    """A trajectory that others are measured against where there is no truth, and how to call it."""
+
+    name: str
+    trajectory: Trajectory
+
+
+def last_good_answer(comparison: Comparison) -> Answer | None:
+    """Return the last trajectory made here of a run that is ok: with the defaults, the smoother's.
+
+    Only where there is none is it one that was read from a file; None where no run is ok.
+    """
+    made_here_last = sorted(comparison.rows, key=lambda row: row.run.timings is not None)
+    for row in reversed(made_here_last):
+        trajectory = row.run.trajectory(row.output)
+        if row.status == "ok" and trajectory is not None:
+            return Answer(f"{row.estimator} {row.output}", trajectory)
+    return None
+
+
+def truth_during(sequence: Sequence) -> Truth | None:
+    """Return the truth while the camera ran, or None where there is none."""
+    if sequence.truth is None:
+        return None
+    t_ns = sequence.truth.t_ns
+    during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
+    return Truth(t_ns[during], sequence.truth.T_world_imu[during]) if during.any() else None
+
+
+def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
+    """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
+    fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
+    try:
+        pairs = Evaluation(run, output, sequence).compared
+        return fit(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+    except Unavailable:
+        return NOT_ALIGNED
+
+
+def alignment_words(sequence: Sequence) -> str:
+    """Say how a figure's estimates are aligned."""
+    if sequence.truth is None:
+        return "There is no truth; every estimator starts from the same pose and nothing is aligned."
+    how = "yaw and position" if sequence.motion_kind == "imu" else "SE(3)"
+    return f"Estimates are aligned to the truth by {how}."
+
+
+def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, sequence: Sequence) -> Errors | None:
+    """Return the errors of an aligned trajectory at the reference's stamps, or None where it reaches none."""
+    pairs = associate(trajectory, reference, median_period_ns(sequence.frames_t_ns))
+    if not len(pairs):
+        return None
+    aligned = alignment.apply(pairs.estimate)
+    heading = yaw_of(aligned[:, :3, :3]) - yaw_of(pairs.truth[:, :3, :3])
+    return Errors(
+        pairs.t_ns,
+        pairs.path_m,
+        np.linalg.norm(aligned[:, :3, 3] - pairs.truth[:, :3, 3], axis=1),
+        np.degrees((heading + np.pi) % (2.0 * np.pi) - np.pi),
+    )
+
+
+def last_word(run: Run) -> Output:
+    """Return the kind of output a figure with room for one shows: the final one where there is one."""
+    return "final" if run.final is not None else "causal"
+
+
+class _Reference(NamedTuple):
+    """What the curves are measured against, how a row is aligned to it first, and how to call the difference.
+
+    ``trajectory`` is the estimate that stands for the truth where there is none.
+    """
+
+    truth: Truth
+    align: Callable[[Row], Alignment]
+    what: str
+    caption: str
+    trajectory: Trajectory | None = None
+
+
+class ErrorCurves(NamedTuple):
+    """The rows with their errors, how to call them ("error", or the difference from whom) and the caption."""
+
+    of_rows: list[tuple[Row, Errors]]
+    what: str
+    caption: str
+
+
+def error_curves(comparison: Comparison) -> ErrorCurves | None:
+    """Return every row's errors (with truth) or differences (without), or None where no row has any."""
+    reference = _truth(comparison) or _answer(comparison)
+    if reference is None:
+        return None
+    curves: list[tuple[Row, Errors]] = []
+    for row in comparison.rows:
+        trajectory = row.run.trajectory(row.output)
+        if trajectory is None or trajectory is reference.trajectory:
+            continue
+        if row.output == "causal" and row.run.final_is_causal:
+            continue
+        errors = errors_to(reference.truth, trajectory, reference.align(row), comparison.sequence)
+        if errors is not None:
+            curves.append((row, errors))
+    return ErrorCurves(curves, reference.what, reference.caption) if curves else None
+
+
+def _truth(comparison: Comparison) -> _Reference | None:
+    sequence = comparison.sequence
+    truth = truth_during(sequence)
+    if truth is None:
+        return None
+    caption = (
+        f"Position and heading error over time. {alignment_words(sequence)} "
+        "Dashed: causal, what was known at the time. Solid: final, or both where they agree (as a filter's do)."
+    )
+    return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
+
+
+def _answer(comparison: Comparison) -> _Reference | None:
+    answer = last_good_answer(comparison)
+    if answer is None:
+        return None
+    caption = (
+        f"There is no truth: position and heading difference from {answer.name}, not aligned. "
+        "A difference says that two estimators disagree, not which of them is right."
+    )
+    as_truth = Truth(answer.trajectory.t_ns, answer.trajectory.T_world_imu)
+    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {answer.name}", caption, answer.trajectory)
+
+
+class Components(NamedTuple):
+    """Errors at stamps (n,) in the world's axes (n, 6) and their stated standard deviations (n, 6) or None.
+
+    The first three are rotations about x, y and z in degrees, the others positions along them in metres; each is
+    estimate minus truth.
+    """
+
+    t_ns: IntArray
+    error: Array
+    sigma: Array | None
+
+
+def components(comparison: Comparison, row: Row) -> Components | None:
+    """Return the errors of an output as the NEES takes them, or without truth its difference from the last answer.
+
+    Returns None where there is neither.
+    """
+    trajectory = row.run.trajectory(row.output)
+    if trajectory is None:
+        return None
+    if comparison.sequence.truth is None:
+        return _difference(comparison, row)
+    try:
+        errors = body_errors(Evaluation(row.run, row.output, comparison.sequence))
+    except Unavailable:
+        return None
+    covs = None if trajectory.cov is None else trajectory.cov[errors.rows]
+    return _in_world_axes(errors.t_ns, errors.T_world_imu, errors.T_estimate_truth, covs)
+
+
+def _difference(comparison: Comparison, row: Row) -> Components | None:
+    reference, trajectory = last_good_answer(comparison), row.run.trajectory(row.output)
+    if reference is None or trajectory is None or trajectory is reference.trajectory:
+        return None
+    t_ns, mine, theirs = np.intersect1d(trajectory.t_ns, reference.trajectory.t_ns, return_indices=True)
+    poses, others = trajectory.T_world_imu[mine], reference.trajectory.T_world_imu[theirs]
+    known = finite_poses(poses) & finite_poses(others)
+    covs = None if trajectory.cov is None else trajectory.cov[mine][known]
+    return _in_world_axes(t_ns[known], poses[known], se3_inverse(poses[known]) @ others[known], covs)
+
+
+def _in_world_axes(t_ns: IntArray, poses: Array, T_estimate_truth: Array, covs: Array | None) -> Components | None:
+    """Turn errors in the body frame (n, 4, 4) and their covariances into the world's axes."""
+    if not t_ns.size:
+        return None
+    turn = poses[:, :3, :3]
+    rotation = -np.degrees(_turned(turn, so3_log(T_estimate_truth[:, :3, :3])))
+    error = np.hstack([rotation, -_turned(turn, T_estimate_truth[:, :3, 3])])
+    if covs is None or not np.isfinite(covs[:, :POSE_DOF, :POSE_DOF]).any():
+        return Components(t_ns, error, None)
+    deviations = [_deviation(turn, covs[:, block, block]) for block in (ROTATION, POSITION)]
+    return Components(t_ns, error, np.hstack([np.degrees(deviations[0]), deviations[1]]))
+
+
+def _turned(rotations: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
+
+
+def _deviation(rotations: Array, covs: Array) -> Array:
+    """Return the standard deviations (n, 3) of covariances (n, 3, 3) in the body frame, along the world's axes."""
+    variance = np.einsum("nij,njk,nik->ni", rotations, covs, rotations)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
