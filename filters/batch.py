@@ -29,8 +29,7 @@ from toolkit.sequence import Packet
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ the future; all relinearised to convergence, outliers cut after a schedule"
-IGNORES = {"window": "it keeps every state"}
-HAS = ("disparity_scale", "bridge_gaps")
+RULES = {"window": "it keeps every state", "disparity_scale": True, "bridge_gaps": True}
 DEFAULT = True
 
 

@@ -18,7 +18,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 20, "+ gate and loss, landmark noise in the innovation, biases; the pose before the map"
-IGNORES = {"tracks": "each landmark is a Gaussian of its own, without a state for the error of its track"}
+RULES = {"tracks": "each landmark is a Gaussian of its own, without a state for the error of its track"}
 DEFAULT = True
 
 

@@ -15,7 +15,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
 RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along inverse depth"
-IGNORES = {"tracks": "a landmark in its state has no state for the error of its track"}
+RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
 
 
 def build(setup: Setup) -> Estimator:

@@ -29,7 +29,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 90, "+ relinearisation, every sighting kept at once, every landmark a variable"
-HAS = ("bridge_gaps",)
+RULES = {"bridge_gaps": True}
 
 
 def build(setup: Setup) -> Estimator:

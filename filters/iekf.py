@@ -20,7 +20,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"
-IGNORES = {"tracks": "a landmark in its state has no state for the error of its track"}
+RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
 
 
 def build(setup: Setup) -> Estimator:

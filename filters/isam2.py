@@ -31,8 +31,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
 RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
-IGNORES = {"window": "it keeps every state"}
-HAS = ("bridge_gaps",)
+RULES = {"window": "it keeps every state", "bridge_gaps": True}
 
 
 def build(setup: Setup) -> Estimator:

@@ -22,7 +22,7 @@ from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
 RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose"
-IGNORES = {"tracks": "a landmark in its state has no state for the error of its track"}
+RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
 
 
 def build(setup: Setup) -> Estimator:

@@ -26,7 +26,7 @@ _HELD_VARIANCE = 1e-16
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 10, "+ vision, as the report has it: pose and map by turns, biases held, no gate"
-IGNORES = {
+RULES = {
     "outliers": "the report's filter has neither gate nor loss",
     "tracks": "the report's filter knows white noise only",
 }

@@ -8,7 +8,8 @@ import pytest
 
 from toolkit import discovery
 from toolkit.errors import EstimatorError
-from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, discover, find, find_all, ladder
+from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
+from toolkit.settings import DEFAULTS
 
 PACKAGE = "temporary_estimators"
 
@@ -113,6 +114,23 @@ def test_the_ladder_is_every_estimator_with_a_rung_in_their_order(package):
     assert list(find_all(["ccc", LADDER, "aaa"])) == ["ccc", "bbb", "aaa"]
     with pytest.raises(EstimatorError, match="no estimator is called ddd"):
         find_all([LADDER, "ddd"])
+
+
+def test_a_module_says_which_common_rules_it_treats_otherwise(package):
+    write(package, "says.py", 'RULES = {"window": "it keeps all", "bridge_gaps": True}')
+    write(package, "silent.py", "")
+    says, silent = find("says"), find("silent")
+    assert {rule for rule in RULES if says.obeys(rule)} == {"outliers", "tracks", "bridge_gaps"}
+    assert says.ignores() == {"window": "it keeps all"}
+    assert {rule for rule in RULES if silent.obeys(rule)} == {"outliers", "tracks", "window"}
+    assert not silent.ignores()
+
+
+@pytest.mark.parametrize("rules", ['{"windw": "it keeps all"}', '{"window": False}', '{"window": ""}', '("window",)'])
+def test_a_rule_that_is_unknown_or_goes_without_a_reason_is_refused(package, rules):
+    write(package, "odd.py", f"RULES = {rules}\n\ndef build(setup): ...")
+    with pytest.raises(EstimatorError, match=r"odd: RULES in odd.py maps some of outliers, .* to True"):
+        find("odd").check_usable(DEFAULTS)
 
 
 def test_every_rung_of_the_project_says_what_it_changes():

@@ -4,10 +4,9 @@ An installed package announces, in the entry-point group ``toolkit.estimators``,
 estimators: a file ``my_filter.py`` is the estimator ``my-filter``. The first line of its docstring is its
 summary and its function ``build(setup)`` makes one. Constants of literals say more of it: ``RUNG`` is its place on the
 ladder, in which every rung changes one thing, and ``CHANGE`` what it changes; ``DEFAULT`` says that it is compared
-where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``IGNORES`` names the common rules
-("outliers", "window", "tracks") that it does not obey, each with the reason, and ``HAS`` the parts of the noise model
-("disparity_scale", "bridge_gaps") that it has, as few do; ``CITES`` is what ``vislam cite`` prints for it, keys of
-toolkit/report/references.bib or BibTeX itself.
+where no estimator is named; ``OPTIONS`` names the settings that it alone reads; ``RULES`` says which of the common
+rules below it treats otherwise than estimators do that say nothing: True where it obeys one, else the reason why not;
+``CITES`` is what ``vislam cite`` prints for it, keys of toolkit/report/references.bib or BibTeX itself.
 """
 
 import ast
@@ -28,6 +27,9 @@ from toolkit.settings import DEFAULTS, Scalar, Settings
 ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
 LADDER = "ladder"
+# Settings that are meant for all estimators, and whether one obeys them whose module says nothing of them: the outlier
+# policy, the window, the stated noise of tracks, and two parts of the noise model that few estimators have.
+RULES = {"outliers": True, "window": True, "tracks": True, "disparity_scale": False, "bridge_gaps": False}
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +94,23 @@ class EstimatorEntry:
         options = self.found.constants().get("OPTIONS", ())
         return frozenset(map(str, options)) if isinstance(options, tuple) else frozenset()
 
-    def ignores(self) -> Mapping[str, str]:
-        """Return the common rules that the estimator does not obey, and why: its module's constant ``IGNORES``."""
-        ignores = self.found.constants().get("IGNORES", {})
-        return {str(k): str(v) for k, v in ignores.items()} if isinstance(ignores, dict) else {}
+    def obeys(self, rule: str) -> bool:
+        """Say whether the estimator obeys a common rule, one of :data:`RULES`."""
+        return self._rules().get(rule, RULES[rule]) is True
 
-    def has(self) -> frozenset[str]:
-        """Return the optional parts of the noise model that the estimator has: its module's constant ``HAS``."""
-        parts = self.found.constants().get("HAS", ())
-        return frozenset(map(str, parts)) if isinstance(parts, tuple) else frozenset()
+    def ignores(self) -> Mapping[str, str]:
+        """Return the common rules that the estimator does not obey although most do, and why."""
+        return {rule: why for rule, why in self._rules().items() if isinstance(why, str)}
+
+    def _rules(self) -> Mapping[str, bool | str]:
+        rules = self.found.constants().get("RULES", {})
+        said = rules if isinstance(rules, dict) else {"": False}
+        if not all(rule in RULES and (what is True or (what and isinstance(what, str))) for rule, what in said.items()):
+            raise EstimatorError(
+                f"estimator {self.name}: RULES in {self.found.path.name} maps some of {', '.join(RULES)} to True, "
+                "or to the reason why the estimator does not obey it"
+            )
+        return said
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it.
@@ -108,6 +118,7 @@ class EstimatorEntry:
         So it does where compiled arithmetic is asked for and there is nothing to compile with.
         """
         check_possible(settings.arithmetic)
+        self._rules()
         self.load()
         for option in settings.options_of(self.name):
             if option not in self.options():

@@ -291,7 +291,7 @@ def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, motion_kind: Mo
     Gaps are bridged between measured twists: where there are none, by nobody.
     """
     asked = {"disparity_scale": noise.disparity_scale is not None, "bridge_gaps": noise.bridge_gaps}
-    parts = {part: [name for name, entry in entries.items() if part not in entry.has()] for part in asked}
+    parts = {part: [name for name, entry in entries.items() if not entry.obeys(part)] for part in asked}
     if motion_kind != "twist":
         parts["bridge_gaps"] = list(entries)
     return {part: tuple(names) for part, names in parts.items() if asked[part] and names}
