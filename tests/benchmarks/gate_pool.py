@@ -27,7 +27,7 @@ from toolkit import runner
 from toolkit.audit import audit
 from toolkit.estimate import Run, Trajectory
 from toolkit.estimator import find
-from toolkit.gate.reference import reference_s
+from toolkit.gate.measuring import reference_s
 from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
 from toolkit.measured_motion import ImuSamples, MotionNoise, TwistNoise, TwistSamples

@@ -20,8 +20,8 @@ from toolkit.gate.interleaved import (
     judge_speeds,
     pairs_needed,
     timers,
+    unpacked,
 )
-from toolkit.gate.other_code import unpacked
 from toolkit.gate.releases import installed
 from toolkit.progress import silent
 

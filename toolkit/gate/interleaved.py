@@ -3,13 +3,18 @@
 What else the machine does slows both sides of a pair alike, so that 15 % shows where times measured apart scatter by
 as much. How many pairs are run is decided by how the first ones scatter, not by what they say (Stein, "A two-sample
 test for a linear hypothesis whose power is independent of the variance", Annals of Mathematical Statistics 16, 1945).
-The test is Wilcoxon's signed-rank test, which a run that was interrupted does not spoil.
+The test is Wilcoxon's signed-rank test, which a run that was interrupted does not spoil. The other version of the code,
+a git revision or a wheel, is unpacked beside the installed one while it is timed.
 """
 
+import io
 import json
 import os
 import subprocess
 import sys
+import tarfile
+import tempfile
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -19,10 +24,10 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from toolkit.errors import printable
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import Baseline, BaselineError, Case
 from toolkit.gate.measuring import recordings_of
-from toolkit.gate.other_code import unpacked
 from toolkit.gate.paired import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
@@ -233,3 +238,46 @@ def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, floa
     order: Mapping[int, Process] = dict(enumerate(sides))
     times = {side: float(order[side].ask("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
     return times[0], times[1]
+
+
+@contextmanager
+def unpacked(version: str) -> Iterator[tuple[Path, ...]]:
+    """Unpack a wheel, or a git revision of the checkout one stands in, for a while; yield what to put on the path.
+
+    Raises BaselineError where it is neither.
+    """
+    with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
+        tree = Path(folder).resolve()
+        if Path(version).suffix == ".whl":
+            _unpack_wheel(Path(version), tree)
+        else:
+            _unpack_revision(version, tree)
+        yield tuple(path for path in (tree / "src", tree) if path.is_dir())
+
+
+def _unpack_wheel(wheel: Path, folder: Path) -> None:
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(folder)
+    except (OSError, zipfile.BadZipFile) as error:
+        raise BaselineError(f"{wheel}: it is no wheel that can be read ({error}); build one with pip wheel") from error
+
+
+def _unpack_revision(revision: str, folder: Path) -> None:
+    top = _git("rev-parse", "--show-toplevel", remedy="stand in a checkout, or name a wheel")
+    remedy = "name a revision of this checkout, or a wheel"
+    commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", remedy=remedy)
+    archive = _git("archive", commit.decode().strip(), remedy=remedy, folder=top.decode().removesuffix("\n"))
+    with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
+        packed.extractall(folder, filter="data")
+
+
+def _git(*words: str, remedy: str, folder: str = ".") -> bytes:
+    try:
+        done = subprocess.run(["git", "-C", folder, *words], capture_output=True, check=False)
+    except OSError as error:
+        raise BaselineError(f"git cannot be run ({error}); name a wheel") from error
+    if done.returncode:
+        said = printable(done.stderr.decode(errors="replace").strip()) or "it is not known here"
+        raise BaselineError(f"git {words[0]} {words[-1]}: {said}; {remedy}")
+    return done.stdout

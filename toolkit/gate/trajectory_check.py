@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
-from toolkit.gate.bounded import judge_recorded
+from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import DATA_ROOT
 from toolkit.gate.paired import Where, holm, told_percent
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, Scored, TrajectoryBaseline

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping
 
-from toolkit.gate.bounded import SHOWN
+from toolkit.gate.judging import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import known_metrics
 from toolkit.report.prose import WIDTH, Width, section
