@@ -39,7 +39,7 @@ import gate_pool
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
 from toolkit.gate.judging import changed_metrics
-from toolkit.gate.paired import Pairs, Where, moved_p, rejected, worse_p
+from toolkit.gate.significance import Pairs, Where, moved_p, rejected, worse_p
 from toolkit.progress import silent
 
 CASES = {"flight": 2.5, "drive": 25.0}

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series
+from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series, installed_releases
 from toolkit.gate.checking import judge_all
 from toolkit.gate.judging import Judged, Terms, judge_case
-from toolkit.gate.releases import installed
 from toolkit.gate.verdict import Check
 
 SEEDS = tuple(range(24))
@@ -39,7 +38,7 @@ def baseline() -> Baseline:
         runs = {name: series(rng, len(case.seeds), tuple(keys)) for name in ESTIMATORS}
         hashes = tuple(f"{case.source}-{seed:064d}" for seed in case.seeds)
         measured.append((case, Measured(hashes, tuple(f"{seed:016d}" for seed in case.seeds), runs)))
-    return Baseline(installed(), tuple(measured))
+    return Baseline(installed_releases(), tuple(measured))
 
 
 def edited(measured: Measured, edit: Edit) -> Measured:

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from toolkit.gate.baseline import BaselineError
+from toolkit.gate.baseline import BaselineError, installed_releases, other_releases
 from toolkit.gate.baseline_file import check_releases, load_baseline, to_text
-from toolkit.gate.releases import differences, installed
 from toolkit.metrics import describe
 
 
@@ -106,20 +105,20 @@ def test_a_file_that_is_not_there_is_told(tmp_path):
 def test_other_releases_are_refused_with_the_way_out(baseline):
     check_releases(baseline, "here.json")
     with pytest.raises(BaselineError, match=r"gtsam 4\.2\.0, here .*--allow-other-releases") as raised:
-        check_releases(replace(baseline, releases=installed() | {"gtsam": "4.2.0"}), "here.json")
+        check_releases(replace(baseline, releases=installed_releases() | {"gtsam": "4.2.0"}), "here.json")
     assert raised.value.exit_status == 3
 
 
 @pytest.mark.parametrize(("release", "same"), [("1.2.3", True), ("1.2.9", True), ("1.3.3", False), ("2.2.3", False)])
 def test_numpys_repairs_are_the_same_release(monkeypatch, release, same):
-    monkeypatch.setattr("toolkit.gate.releases.version", lambda name: {"gtsam": "4.3.0", "numpy": "1.2.3"}[name])
-    assert (not differences({"gtsam": "4.3.0", "numpy": release})) == same
-    assert differences({"gtsam": "4.3.1", "numpy": "1.2.3"})
-    assert differences({"numpy": "1.2.3"})
+    monkeypatch.setattr("toolkit.gate.baseline.version", lambda name: {"gtsam": "4.3.0", "numpy": "1.2.3"}[name])
+    assert (not other_releases({"gtsam": "4.3.0", "numpy": release})) == same
+    assert other_releases({"gtsam": "4.3.1", "numpy": "1.2.3"})
+    assert other_releases({"numpy": "1.2.3"})
 
 
 def test_a_folder_gives_the_baseline_of_the_releases_installed(baseline, path):
-    older = replace(baseline, releases=installed() | {"gtsam": "4.2.0"})
+    older = replace(baseline, releases=installed_releases() | {"gtsam": "4.2.0"})
     (path.parent / "older.json").write_text(to_text(older))
     assert load_baseline(path.parent) == baseline
     shutil.copy(path, path.parent / "again.json")

@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.cli.baseline import command_to_keep
-from toolkit.gate.releases import installed
+from toolkit.gate.baseline import installed_releases
 
 Vislam = Callable[..., int]
 MAKE = ("baseline", "drive:1", "data-copy:4", "--estimators", "dead-reckoning,ekf", "--seeds", "5")
@@ -111,7 +111,7 @@ def test_what_is_missing_is_1_and_named(vislam: Vislam, capsys: pytest.CaptureFi
 def test_another_release_is_3_in_one_line_unless_allowed(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], allowed: bool
 ) -> None:
-    changed(lambda document: document.update(releases=installed() | {"gtsam": "4.2.0"}))
+    changed(lambda document: document.update(releases=installed_releases() | {"gtsam": "4.2.0"}))
     if allowed:
         assert vislam(*CHECK, "--allow-other-releases") == 0
         return

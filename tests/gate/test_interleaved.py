@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toolkit.cli import main
-from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series
+from toolkit.gate.baseline import Baseline, BaselineError, Case, Measured, Series, installed_releases
 from toolkit.gate.baseline_file import to_text
 from toolkit.gate.interleaved import (
     FEWEST_PAIRS,
@@ -22,7 +22,6 @@ from toolkit.gate.interleaved import (
     timers,
     unpacked,
 )
-from toolkit.gate.releases import installed
 from toolkit.progress import silent
 
 PROJECT = Path(__file__).parents[2]
@@ -100,7 +99,7 @@ def baseline_of_a_drive() -> Baseline:
     """Return a baseline that was not measured: what is timed needs to know the cases alone."""
     case = Case("drive", True, (0,), ("dead-reckoning",), 1.0)
     series = Series(("ok",), (1.0,), {"causal": {}})
-    return Baseline(installed(), ((case, Measured(("hash",), ("print",), {"dead-reckoning": series})),))
+    return Baseline(installed_releases(), ((case, Measured(("hash",), ("print",), {"dead-reckoning": series})),))
 
 
 def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path):

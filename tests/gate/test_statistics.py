@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from toolkit.gate.paired import holm, paired_p, rejected, smallest_seen
+from toolkit.gate.significance import holm, paired_p, rejected, smallest_seen
 
 
 @pytest.mark.parametrize("n", [2, 5, 24, 400])

@@ -10,9 +10,9 @@ import pytest
 from toolkit.cli import main
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
+from toolkit.gate.significance import Spread
 from toolkit.gate.trajectory_baseline import load_trajectory_baseline, to_text
 from toolkit.gate.trajectory_files import TIME_COVERAGE, time_coverage_percent
-from toolkit.gate.unpaired import Spread
 from toolkit.geometry import se3, se3_exp, so3_exp
 
 START_NS, S = 1_700_000_000 * 10**9, 10**9

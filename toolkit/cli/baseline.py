@@ -108,14 +108,14 @@ def command(options: argparse.Namespace) -> int:
     if options.align or options.gap:
         raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
     from toolkit.experiment.workers import usable_cpus
+    from toolkit.gate.baseline import releases_in_a_name
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
-    from toolkit.gate.releases import label
     from toolkit.progress import of_this_process
     from toolkit.report.gate_files import check_writable, made_here, write_text
 
     cases = _cases(options)
-    out = options.out or Path(f"baseline_{label()}.json")
+    out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
     check_writable(out)
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))

@@ -20,7 +20,7 @@ from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
 from toolkit.experiment.workers import Lost, results_of
-from toolkit.gate.paired import holm
+from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric
 from toolkit.progress import SILENT, Progress

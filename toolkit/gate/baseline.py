@@ -1,7 +1,8 @@
-"""What a baseline keeps: what was run, on which measurements, what came of it, and what counts as worse."""
+"""What a baseline keeps: what was run, with which releases, on which measurements, what came of it, what is worse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import ClassVar, Literal
 
 from toolkit.errors import VislamError
@@ -10,6 +11,8 @@ from toolkit.settings import DEFAULTS, Settings
 
 Worse = Literal["larger", "away from 1"]
 Values = tuple[float | None, ...]
+# Another GTSAM may linearise otherwise, another NumPy draw otherwise; NumPy's third number is for repairs alone.
+_DIGITS_THAT_MATTER = {"gtsam": 3, "numpy": 2}
 
 
 class BaselineError(VislamError):
@@ -124,3 +127,26 @@ class Baseline:
     false_alarm_rate: float = FALSE_ALARM_RATE
     made_by: Mapping[str, str] = field(default_factory=dict)
     settings: Settings = DEFAULTS
+
+
+def installed_releases() -> dict[str, str]:
+    """Return the releases that results depend on, as they are installed."""
+    return {name: version(name) for name in _DIGITS_THAT_MATTER}
+
+
+def other_releases(releases: Mapping[str, str]) -> tuple[str, ...]:
+    """Say what here is another release than in a baseline; nothing where all that matters is the same."""
+    return tuple(
+        f"{name} {releases.get(name, '(not given)')}, here {here}"
+        for name, here in installed_releases().items()
+        if _matters(name, releases.get(name, "")) != _matters(name, here)
+    )
+
+
+def _matters(name: str, release: str) -> list[str]:
+    return release.split(".")[: _DIGITS_THAT_MATTER[name]]
+
+
+def releases_in_a_name() -> str:
+    """Return the installed releases as part of a file name."""
+    return "_".join(f"{name}-{'.'.join(_matters(name, release))}" for name, release in installed_releases().items())

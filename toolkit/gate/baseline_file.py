@@ -12,8 +12,19 @@ from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
 from toolkit import documents
 from toolkit.estimate import Output, Status
-from toolkit.gate import releases
-from toolkit.gate.baseline import Baseline, BaselineError, Bounds, Case, Criterion, Measured, Series, Values, Worse
+from toolkit.gate.baseline import (
+    Baseline,
+    BaselineError,
+    Bounds,
+    Case,
+    Criterion,
+    Measured,
+    Series,
+    Values,
+    Worse,
+    installed_releases,
+    other_releases,
+)
 from toolkit.settings import changes_of, settings_of
 
 _REMEDY = "make the baseline with vislam baseline"
@@ -113,10 +124,10 @@ def load_baseline(path: Path) -> Baseline:
 
 def _of_these_releases(folder: Path) -> Baseline:
     known = {path: load_baseline(path) for path in sorted(folder.glob("*.json"))}
-    fitting = {path: one for path, one in known.items() if not releases.differences(one.releases)}
+    fitting = {path: one for path, one in known.items() if not other_releases(one.releases)}
     if len(fitting) == 1:
         return next(iter(fitting.values()))
-    here = ", ".join(f"{name} {release}" for name, release in releases.installed().items())
+    here = ", ".join(f"{name} {release}" for name, release in installed_releases().items())
     if not fitting:
         raise BaselineError(f"{folder}: none of {len(known)} baselines is for {here}; make one with vislam baseline")
     raise BaselineError(f"{folder}: {', '.join(path.name for path in fitting)} are all for {here}; name one of them")
@@ -124,7 +135,7 @@ def _of_these_releases(folder: Path) -> Baseline:
 
 def check_releases(baseline: Baseline, name: str) -> None:
     """Raise BaselineError where the baseline was made with other releases than are installed."""
-    others = releases.differences(baseline.releases)
+    others = other_releases(baseline.releases)
     if others:
         raise BaselineError(
             f"{name}: made with {'; '.join(others)}, which alone may change results; make a baseline with these "

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 from toolkit.estimator import find_all
 from toolkit.experiment.recording import prepare
-from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured
+from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
 from toolkit.gate.interleaved import compare_speed
 from toolkit.gate.judging import USUAL_TERMS, Judged, Terms, judge_case
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
-from toolkit.gate.paired import judge_pairs
-from toolkit.gate.releases import installed
+from toolkit.gate.significance import judge_pairs
 from toolkit.gate.verdict import Check
 from toolkit.progress import ProgressFor, silent
 from toolkit.settings import DEFAULTS, Settings
@@ -55,7 +54,7 @@ def new_baseline(
         prepare(recordings_of(case, settings)[0])
     how = How(workers, settings=settings)
     measured = tuple((case, _measured(case, metrics_of(case, DEFAULT_BOUNDS), how, progress_for)) for case in cases)
-    return Baseline(installed(), measured, made_by=made_by, settings=settings)
+    return Baseline(installed_releases(), measured, made_by=made_by, settings=settings)
 
 
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
@@ -93,7 +92,7 @@ def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float, ter
         tuple(judged.notes),
         baseline.false_alarm_rate,
         len(tested),
-        installed(),
+        installed_releases(),
         seconds,
         terms.accept_better,
     )

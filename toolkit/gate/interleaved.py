@@ -28,7 +28,7 @@ from toolkit.errors import printable
 from toolkit.gate import timing_child
 from toolkit.gate.baseline import Baseline, BaselineError, Case
 from toolkit.gate.measuring import recordings_of
-from toolkit.gate.paired import POWER, holm
+from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
 from toolkit.progress import ProgressFor

@@ -18,7 +18,7 @@ import numpy as np
 
 from toolkit.estimate import Status
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Criterion, Measured, Series, Values
-from toolkit.gate.paired import Pairs, Where
+from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
 

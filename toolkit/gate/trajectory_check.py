@@ -14,10 +14,9 @@ from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import DATA_ROOT
-from toolkit.gate.paired import Where, holm, told_percent
+from toolkit.gate.significance import FEWEST_RUNS, Spread, Where, holm, told_percent
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, Scored, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
-from toolkit.gate.unpaired import FEWEST_RUNS, Spread
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.geometry import Array
 

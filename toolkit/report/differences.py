@@ -1,7 +1,7 @@
 """What differs between two run directories: settings, versions, data, how runs ended, and metrics beyond chance.
 
 Over seeds metrics are compared pairwise where both sides read the same recordings, else as independent draws; the tests
-are those of the gate (:mod:`toolkit.gate.paired`, :mod:`toolkit.gate.unpaired`), with Holm's correction over all.
+are those of the gate (:mod:`toolkit.gate.significance`, :mod:`toolkit.gate.significance`), with Holm's correction over all.
 """
 
 import math
@@ -14,8 +14,7 @@ from msgspec import UNSET, to_builtins
 
 from toolkit.estimate import Status
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.paired import ROUNDING, Pairs, Where, holm, moved_p
-from toolkit.gate.unpaired import FEWEST_RUNS, Spread
+from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Spread, Where, holm, moved_p
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.html.run_files import RunFiles, SeedsFiles

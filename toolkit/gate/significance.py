@@ -1,14 +1,19 @@
-"""Paired tests on simulated sequences: under each seed both sides read the same measurements.
+"""What chance explains and what it does not: the statistical tests of the gate, on logarithms of metrics.
 
-What is compared is the logarithm of a metric, so that a mean difference is a ratio. Two questions are asked of each.
-Has it *moved*, up or down, by more than another processor's rounding moves it? And has it become *worse* by more than
-its margin? A NEES is worse the farther its mean over the seeds is outside the chi-square band of as many runs, on
-either side (Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section
-5.4); a NIS, the farther it is from 1. Whatever became worse has moved as well: both questions share one rate.
+Simulated sequences are tested in pairs, for under each seed both sides read the same measurements. What is compared is
+the logarithm of a metric, so that a mean difference is a ratio. Two questions are asked of each. Has it *moved*, up or
+down, by more than another processor's rounding moves it? And has it become *worse* by more than its margin? A NEES is
+worse the farther its mean over the seeds is outside the chi-square band of as many runs, on either side (Bar-Shalom, Li
+and Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4); a NIS, the farther it is
+from 1. Whatever became worse has moved as well: both questions share one rate.
 
 Student's paired test is that of any textbook, e.g. Montgomery, "Design and analysis of experiments" (2013),
 section 2.5; the correction is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of
 Statistics 6 (1979). Arrays are tested along their last axis, so that a benchmark can judge thousands of checks at once.
+
+Runs that were made anew on both sides, of a system that answers differently each time, are tested by Welch's test,
+one-sided ("The generalization of 'Student's' problem when several different population variances are involved",
+Biometrika 34, 1947). Identical runs have no spread to judge by; then the answer is certain.
 """
 
 from dataclasses import dataclass
@@ -28,6 +33,8 @@ _WITH_BAND = ("nees_pose_mean",)
 ROUNDING = 1e-6
 # Below this a value is one of rounding, and its logarithm says nothing.
 _LEAST = 1e-12
+# Fewer runs than this on either side tell nothing of their spread, and are held to the bound alone.
+FEWEST_RUNS = 3
 
 
 @dataclass(frozen=True)
@@ -206,3 +213,33 @@ def smallest_seen(differences: Array, rate: float, power: float) -> float:
     if n < 2:
         return float("inf")
     return float((stdtrit(n - 1, 1.0 - rate) + stdtrit(n - 1, power)) * standard_error(differences))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The change of the mean logarithm from some runs to others, its standard error and degrees of freedom."""
+
+    change: float
+    error: float
+    dof: float
+
+    @classmethod
+    def of(cls, before: Array, after: Array) -> "Spread":
+        """Return the spread between runs before (m,) and after (n,), each of at least FEWEST_RUNS."""
+        sides = [log_of(side) for side in (before, after)]
+        shares = np.array([0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides])
+        of_each = np.array([side.size - 1 for side in sides])
+        total = float(shares.sum())
+        dof = total**2 / float((shares**2 / of_each).sum()) if total else float(of_each.sum())
+        return cls(float(sides[1].mean() - sides[0].mean()), float(np.sqrt(total)), dof)
+
+    def beyond_p(self, margin: float, sign: float) -> float:
+        """Return the p-value that the change, up (1) or down (-1), exceeds a margin."""
+        excess = sign * self.change - margin
+        if self.error == 0.0:
+            return 0.0 if excess > 0.0 else 1.0
+        return float(stdtr(self.dof, -excess / self.error))
+
+    def seen(self, margin: float, rate: float) -> float:
+        """Return the change that one test at ``rate`` sees with 95 % power."""
+        return margin + float(stdtrit(self.dof, 1.0 - rate) + stdtrit(self.dof, POWER)) * self.error
