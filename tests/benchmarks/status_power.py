@@ -32,7 +32,7 @@ import numpy as np
 
 from toolkit.errors import VislamError
 from toolkit.estimate import Output, Run, Status
-from toolkit.experiment.consistency import consistency_of
+from toolkit.experiment.comparison import consistency_of
 from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Unit, outcome_of, run_estimator
 from toolkit.metrics import Evaluation, ate, score_run

@@ -16,8 +16,8 @@ from toolkit.progress import SILENT
 from toolkit.sequence import Packet, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, noise_free, simulate
 from toolkit.verify import promises
-from toolkit.verify.trouble import short
-from toolkit.verify.watching import Watched, arrays_of, watch
+from toolkit.verify.promises import Watched, arrays_of, watch
+from toolkit.verify.verification import short
 
 SCENARIOS = {"drive": short(DRIVE, 4.0), "drive-imu": short(DRIVE_IMU, 4.0), "flight": short(FLIGHT, 2.0)}
 SEED = 4

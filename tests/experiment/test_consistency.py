@@ -8,8 +8,7 @@ import pytest
 
 from toolkit.datasets import load_sequence
 from toolkit.estimate import Landmarks, Run, Trajectory
-from toolkit.experiment.comparison import Row
-from toolkit.experiment.consistency import consistency_of
+from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.units import Scored, outcome_of
 from toolkit.metrics import Evaluation, Scores
 from toolkit.metrics._shared.consistency import nis_over_time

@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.estimate import Estimate
-from toolkit.verify import trouble, verification
+from toolkit.verify import verification
 from toolkit.verify.promises import COV_SIZES, covariance_fault, dishonest
 
 # An estimator of some thirty lines, as somebody writes who has read docs/extending.md and nothing else.
@@ -129,7 +129,7 @@ def test_nothing_else_is_called_broken(newcomer, capsys, kind: str) -> None:
 
 def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
     some = ("2 s without sight", "0.25 s that is not a number")
-    monkeypatch.setattr(trouble, "TROUBLE", {name: trouble.TROUBLE[name] for name in some})
+    monkeypatch.setattr(verification, "TROUBLE", {name: verification.TROUBLE[name] for name in some})
     monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
     assert main(["verify", str(newcomer("pass"))]) == 0
     told = capsys.readouterr().out
@@ -159,11 +159,11 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
 
 def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
     some = ("2 s without sight", "a camera 20 ms late")
-    monkeypatch.setattr(trouble, "TROUBLE", {name: trouble.TROUBLE[name] for name in some})
+    monkeypatch.setattr(verification, "TROUBLE", {name: verification.TROUBLE[name] for name in some})
     path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
     from toolkit.verify.subject import subject_of
 
-    found = trouble.deaths("my-filter", subject_of(str(path)).load())
+    found = verification.deaths("my-filter", subject_of(str(path)).load())
     assert set(found) == {"2 s without sight (drive)", "2 s without sight (flight)"}
     assert "AssertionError: no sightings" in found["2 s without sight (drive)"]
 

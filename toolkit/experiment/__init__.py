@@ -1,8 +1,8 @@
 """The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or on a cluster.
 
 Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
-kept of it) -> pipeline -> comparison (what comes of it) -> statistics -> consistency (whose stated uncertainty cannot
-be right). What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
+kept of it) -> pipeline -> comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics.
+What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
 """
 
 from importlib import import_module

@@ -1,29 +1,43 @@
-"""Units of work side by side, in processes of their own (:mod:`toolkit.experiment.processes`).
+"""Units of work side by side, in processes of one numeric thread each (loky's).
 
 A process that dies takes the unit it was busy with along and nothing else: that unit is tried once more when all others
 are done, with nothing beside it, and is lost where its process dies again. Units that need the same recording go to
 the process that has it ready, as long as there is other work for the others.
+
+An interrupt is the parent's alone to handle: it ends the processes it started, and where it is itself killed they end
+by themselves. Loky's processes do not run the caller's main module again, so a script needs no guard.
 """
 
 import os
+import re
+import signal
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Hashable, Sequence
+import time
+from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
+from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
-from toolkit.experiment.processes import WorkerProcess, how_it_ended
 from toolkit.progress import Progress
 
-T = TypeVar("T")
 R = TypeVar("R")
+
+# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
+    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
+}
+_PARENT_POLL_S = 1.0
+T = TypeVar("T")
 Work = Callable[[T, Progress], R]
 # What a process keeps ready for the units for which this is equal; None where it is nothing.
 Needs = Callable[[T], Hashable]
@@ -33,6 +47,69 @@ _POLL_S = 0.1
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
 _STEPS = 100
+
+
+class WorkerProcess:
+    """A process, started with its first work, and anew after it died."""
+
+    def __init__(self) -> None:
+        self._executor: ProcessPoolExecutor | None = None
+
+    def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
+        """Have the process do some work after what it has to do already; where it dies, BrokenProcessPool is raised."""
+        # Started with the first process, Python's own tracker would let interrupts through to it again.
+        resource_tracker.ensure_running()
+        with _interrupts_held_back():
+            if self._executor is None:
+                self._executor = _executor()
+            try:
+                future: Future[R] = self._executor.submit(work, *arguments)
+            except BrokenProcessPool:  # it died with nothing to do
+                self.end()
+                self._executor = _executor()
+                future = self._executor.submit(work, *arguments)
+        return future
+
+    def end(self) -> None:
+        """End the process, whatever it is doing."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, kill_workers=True)
+            self._executor = None
+
+
+def how_it_ended(error: BrokenProcessPool) -> str:
+    """Return how a process ended, of what loky says of it."""
+    named = re.search(r"exit codes of the workers are \{(\w+)\((-?\d+)\)", str(error))
+    if named is None:
+        return "ended"
+    return f"was ended by signal {-int(named[2])}" if int(named[2]) < 0 else f"ended with status {named[2]}"
+
+
+def _executor() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, initializer=_begin, initargs=(os.getpid(),), env=_ENVIRONMENT)
+
+
+def _begin(parent: int) -> None:
+    """Leave interrupts to the parent, and end where it ends; the whole of a process' preparation."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone: one that was killed could not tell it to."""
+    while os.getppid() == parent:
+        time.sleep(_PARENT_POLL_S)
+    os._exit(1)
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[None]:
+    """Have processes started here ignore Ctrl-C from their start; one that comes meanwhile is delivered afterwards."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @dataclass(frozen=True)

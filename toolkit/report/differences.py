@@ -1,7 +1,7 @@
 """What differs between two run directories: settings, versions, data, how runs ended, and metrics beyond chance.
 
 Over seeds metrics are compared pairwise where both sides read the same recordings, else as independent draws; the tests
-are those of the gate (:mod:`toolkit.gate.significance`, :mod:`toolkit.gate.significance`), with Holm's correction over all.
+are those of the gate (:mod:`toolkit.gate.significance`), with Holm's correction over all.
 """
 
 import math

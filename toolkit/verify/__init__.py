@@ -1,5 +1,5 @@
 """What every estimator promises, whoever wrote it, as checks: for ``vislam verify`` and for the contract tests alike.
 
-Reading order: watching (a run with all that went in and came out) -> promises (what must hold of it) -> trouble (what a
-recording may hold) -> threads -> verification (all of it, of one estimator).
+Reading order: promises (a run with all that went in and came out, what must hold of it) -> threads -> subject (whose
+estimator it is) -> verification (all of it, of one estimator).
 """

@@ -1,15 +1,20 @@
-"""What must hold of a watched run. Each function returns what is wrong in a sentence, and nothing where all is well."""
+"""What must hold of a watched run. Each function returns what is wrong in a sentence, and nothing where all is well.
+
+A run is watched where what went into an estimator and what came out is kept, each with a copy made at that moment.
+"""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import zip_longest
 
 import numpy as np
 
 from toolkit.estimate import Estimate, Finished, Run
-from toolkit.estimator import Build
+from toolkit.estimator import Build, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import POSE_DOF, chi2_quantile
-from toolkit.verify.watching import Watched, answers, arrays_of
+from toolkit.sequence import Packet, Sequence
+from toolkit.settings import DEFAULTS, Scalar, Settings
 
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
 COV_SIZES = (6, 9, 12, 15)
@@ -17,6 +22,69 @@ COV_SIZES = (6, 9, 12, 15)
 _ROTATION_TOLERANCE = 1e-12
 # Of the verdict on honesty: how often a consistent estimator is called otherwise.
 _FALSE_ALARM = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """One run over a recording: the setup and packets, every answer, what was said in the end; copies of all before."""
+
+    sequence: Sequence
+    setup: Setup
+    packets: tuple[Packet, ...]
+    given_copies: tuple[Array, ...]
+    online: tuple[Estimate | None, ...]
+    online_copies: tuple[tuple[Array, ...], ...]
+    finished: Finished
+
+
+def setup_of(sequence: Sequence, settings: Settings = DEFAULTS, options: dict[str, Scalar] | None = None) -> Setup:
+    """Return what an estimator is told of a recording that states its own prior, as a simulated one does."""
+    assert sequence.prior is not None
+    return Setup(
+        sequence.rig,
+        sequence.noise,
+        sequence.prior,
+        sequence.gravity_world,
+        sequence.motion_kind,
+        settings,
+        options or {},
+    )
+
+
+def watch(build: Build, sequence: Sequence) -> Watched:
+    """Run an estimator over a recording from its own prior; whatever the estimator raises passes through."""
+    setup, packets = setup_of(sequence), tuple(sequence.packets())
+    given_copies = copies_of((setup, packets))
+    estimator, online, online_copies = build(setup), list[Estimate | None](), list[tuple[Array, ...]]()
+    for packet in packets:
+        online.append(estimator.step(packet))
+        online_copies.append(copies_of(online[-1]))
+    finished = estimator.finish()
+    return Watched(sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)
+
+
+def answers(build: Build, sequence: Sequence) -> Iterator[Estimate | None]:
+    """Yield an estimator's answer to each packet of a recording."""
+    estimator = build(setup_of(sequence))
+    for packet in sequence.packets():
+        yield estimator.step(packet)
+
+
+def arrays_of(value: object) -> Iterator[Array]:
+    """Yield every array in a value of toolkit.estimate or toolkit.sequence."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from arrays_of(item)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from arrays_of(getattr(value, field.name))
+
+
+def copies_of(value: object) -> tuple[Array, ...]:
+    """Return a copy of every array in a value."""
+    return tuple(array.copy() for array in arrays_of(value))
 
 
 def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> str:

@@ -15,8 +15,8 @@ from toolkit import runner
 from toolkit.errors import EstimatorError
 from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.verify.promises import arrays_of
 from toolkit.verify.subject import subject_of
-from toolkit.verify.watching import arrays_of
 
 UNAVAILABLE = "unavailable"
 _DURATION_S, _SEED = 0.8, 4
