@@ -32,7 +32,7 @@ from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse
 from toolkit.metrics import score_run
 from toolkit.models import stereo, twist
 from toolkit.progress import SILENT, silent
-from toolkit.report.gate_text import gate_text
+from toolkit.report.gate import gate_text
 from toolkit.runner import run
 from toolkit.sequence import Packet, StereoFrame
 

@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 import pytest
 
 from toolkit.errors import OutputError
-from toolkit.report.gate_files import check_document, check_writable, write_check
-from toolkit.report.gate_text import gate_markdown, gate_text
+from toolkit.report.gate import check_document, check_writable, gate_markdown, gate_text, write_check
 from toolkit.report.records import read_check
 
 

@@ -14,8 +14,8 @@ from toolkit.errors import DataError
 from toolkit.gate import baseline_file, trajectory_baseline
 from toolkit.metrics import describe
 from toolkit.report.records import read_check
-from toolkit.report.records.metrics import PROMISED_KEYS
 from toolkit.report.records.schemas import RECORDS, schema_files
+from toolkit.report.records.scores import PROMISED_KEYS
 
 Document = dict[str, Any]
 

@@ -11,7 +11,7 @@ from toolkit.documents import parse, to_text
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
-from toolkit.report.records.metrics import PROMISED_KEYS, Metrics
+from toolkit.report.records.scores import PROMISED_KEYS, Metrics
 from toolkit.report.scores_json import metrics_document
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

@@ -112,7 +112,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
     from toolkit.progress import of_this_process
-    from toolkit.report.gate_files import check_writable, made_here, write_text
+    from toolkit.report.gate import check_writable, made_here, write_text
 
     cases = _cases(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
@@ -130,7 +130,7 @@ def _of_trajectories(options: argparse.Namespace) -> int:
     from toolkit.gate.trajectory_baseline import to_text
     from toolkit.gate.trajectory_check import new_trajectory_baseline
     from toolkit.gate.trajectory_files import Scoring
-    from toolkit.report.gate_files import check_writable, made_here, write_text
+    from toolkit.report.gate import check_writable, made_here, write_text
 
     if options.sequences or options.estimators or options.duration or options.set or options.config:
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")

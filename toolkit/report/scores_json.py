@@ -9,14 +9,19 @@ from msgspec import UNSET, UnsetType
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.metrics import Metric, describe, known_metrics
-from toolkit.report.records.metrics import AuditEntry, Judged, Metrics, ScoredRun, SequenceRead, Value
-from toolkit.report.records.seeds import (
+from toolkit.report.records.scores import (
+    AuditEntry,
+    Judged,
     LogEntry,
     MetricOverSeeds,
+    Metrics,
     QuantilesAll,
     RunOverSeeds,
+    ScoredRun,
     Seeds,
     SequenceOfSeeds,
+    SequenceRead,
+    Value,
     WholeRuns,
 )
 from toolkit.sequence import Sequence

@@ -1,6 +1,6 @@
 """The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
-Reading order: metrics (one run of each estimator), seeds (many), report (what the figures draw), card (what
+Reading order: scores (one run of each estimator, or many), report (what the figures draw), card (what
 the tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
 :mod:`toolkit.report.records.schemas` writes docs/schemas.
 """
@@ -11,9 +11,8 @@ from toolkit.documents import read
 from toolkit.report.records.card import CardRecord
 from toolkit.report.records.check import OLDER, CheckDocument
 from toolkit.report.records.manifest import Manifest
-from toolkit.report.records.metrics import Metrics
 from toolkit.report.records.report import Report, SeedsReport
-from toolkit.report.records.seeds import Seeds
+from toolkit.report.records.scores import Metrics, Seeds
 
 __all__ = [
     "CardRecord",

@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 
 from toolkit.estimate import Output
 from toolkit.report.records.card import CardRecord
-from toolkit.report.records.metrics import Undecided
+from toolkit.report.records.scores import Undecided
 
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
 Numbers = tuple[float | None, ...]
