@@ -14,9 +14,8 @@ from toolkit.errors import DataError, OutputError
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.configuration import Configuration
 from toolkit.metrics import Scores
-from toolkit.report.html import write_html
+from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
-from toolkit.report.html.page import SCRIPTS, json_in_html, page_text
 from toolkit.report.html.payload import payload_of
 from toolkit.report.html.run_files import read_run
 from toolkit.report.html.thinning import evenly, running_median, with_peaks

@@ -1,15 +1,45 @@
 """The report as one HTML file that opens from disk: what run directories hold, laid side by side.
 
-Reading order: run_files (what is read) -> payload (what is shown of it) -> page (how it becomes one file). The page
-itself is page.html, style.css and the scripts in ``scripts``, which :mod:`~toolkit.report.html.page` puts together.
+Reading order: run_files (what is read) -> payload (what is shown of it) -> :func:`page_text` (how it becomes one file,
+of page.html, style.css and the scripts in ``scripts``): nothing is fetched, and no text of a recording is code. Beside
+it: leaderboard, the page of an evaluation.
 """
 
+import html
+import json
+import re
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
+from toolkit.errors import printable
 from toolkit.files import replaced_file
 
 __all__ = ["write_html"]
+# In the order in which they build upon each other; together they are the body of one function.
+SCRIPTS = (
+    "dom",
+    "numbers",
+    "state",
+    "hints",
+    "table",
+    "canvas",
+    "gestures",
+    "scene",
+    "top_view",
+    "orbit_view",
+    "axes",
+    "chart",
+    "charts",
+    "seeds",
+    "frames",
+    "words",
+    "case",
+    "main",
+)
+# What could end the script element or open a comment inside it, and what older parsers take for the end of a line.
+_ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 
 def write_html(directories: Sequence[Path], target: Path) -> None:
@@ -19,7 +49,6 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     nothing is left behind then.
     """
     # Here, because pages of other systems' trajectories are made without what reads a run directory.
-    from toolkit.report.html.page import page_text
     from toolkit.report.html.payload import payload_of
     from toolkit.report.html.run_files import read_run
 
@@ -27,3 +56,28 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     text = page_text(payload_of(runs))
     with replaced_file(target) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def page_text(payload: dict[str, Any]) -> str:
+    """Return the page of a payload with its ``title``; refuses NaN and infinity, which are not JSON."""
+    parts = {
+        "title": html.escape(printable(payload["title"])),
+        "style": _source("style.css"),
+        "payload": json_in_html(payload),
+        "script": "\n".join(_source(f"scripts/{name}.js") for name in SCRIPTS),
+    }
+    # One pass: a payload that spells out one of the places must not be taken for one.
+    return re.sub(r"{{ (\w+) }}", lambda place: parts[place[1]], _source("page.html"))
+
+
+def json_in_html(value: object) -> str:
+    """Return a value as JSON that is safe inside a script element: ``</script>`` and ``<!--`` cannot appear."""
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for character, escape in _ESCAPES.items():
+        text = text.replace(character, escape)
+    # Bytes of a file's name that are no text: their escape is one of JSON's, too.
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _source(name: str) -> str:
+    return files("toolkit.report.html").joinpath(name).read_text(encoding="utf-8")
