@@ -12,7 +12,7 @@ at the corrected estimate: global position and heading stay as unknown as they w
 from functools import partial
 
 from filters.kalman import iterated
-from filters.kalman.anchored import AnchoredBelief
+from filters.kalman.invariant import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput

@@ -14,7 +14,7 @@ update is one Gauss-Newton step, and a landmark's first estimate one stereo sigh
 
 from functools import partial
 
-from filters.kalman.anchored import AnchoredBelief
+from filters.kalman.invariant import AnchoredBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.online_output import OnlineOutput

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from filters.kalman import iterated, joint_landmarks
-from filters.kalman.anchored import AnchoredBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.gate import FrameGate
-from filters.kalman.invariant import InvariantBelief
+from filters.kalman.invariant import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates, propagate

@@ -13,9 +13,8 @@ import pytest
 from scipy.linalg import expm
 
 from filters.kalman import iterated, joint_landmarks
-from filters.kalman.anchored import AnchoredBelief
 from filters.kalman.gate import FrameGate
-from filters.kalman.invariant import InvariantBelief
+from filters.kalman.invariant import AnchoredBelief, InvariantBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtLatestEstimates, propagate
