@@ -11,6 +11,8 @@ from toolkit.geometry import Array, IntArray, read_only
 Status = Literal["ok", "diverged", "failed"]
 Output = Literal["causal", "final"]
 Arithmetic = Literal["compiled", "numpy"]
+# Of several runs together.
+ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
 
 
 @dataclass(frozen=True, eq=False)

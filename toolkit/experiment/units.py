@@ -1,13 +1,13 @@
 """A unit of work: one estimator on one recording, run and scored."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from toolkit import runner
 from toolkit.datasets.trajectories import tum
-from toolkit.estimate import Arithmetic, Output, Run, Status
+from toolkit.estimate import Arithmetic, ArithmeticOfRuns, Output, Run, Status
 from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
@@ -72,6 +72,12 @@ class Outcome:
     tum: Mapping[Output, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     arithmetic: Arithmetic | None = None
+
+
+def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
+    """Return what computed in some outcomes of an estimator; None where it has NumPy alone, or never ran."""
+    ran = {outcome.arithmetic for outcome in outcomes} - {None}
+    return "both" if len(ran) > 1 else next(iter(ran), None)
 
 
 def run_unit(unit: Unit, progress: Progress) -> Outcome:

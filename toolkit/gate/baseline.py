@@ -6,7 +6,7 @@ from importlib.metadata import version
 from typing import ClassVar, Literal
 
 from toolkit.errors import VislamError
-from toolkit.estimate import Output, Status
+from toolkit.estimate import ArithmeticOfRuns, Output, Status
 from toolkit.settings import DEFAULTS, Settings
 
 Worse = Literal["larger", "away from 1"]
@@ -91,13 +91,15 @@ class Case:
 class Series:
     """One estimator on one case, by seed: how it ended, its time over the reference's, metrics by kind of output.
 
-    ``why`` says what the first run that did not end well had to say.
+    ``why`` says what the first run that did not end well had to say; ``arithmetic`` what computed where the estimator
+    has compiled code, None where it has not, or the baseline is too old to say.
     """
 
     status: tuple[Status, ...]
     speed: Values
     outputs: Mapping[Output, Mapping[str, Values]]
     why: str = ""
+    arithmetic: ArithmeticOfRuns | None = None
 
 
 @dataclass(frozen=True)

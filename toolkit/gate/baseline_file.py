@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
 from toolkit import documents
-from toolkit.estimate import Output, Status
+from toolkit.estimate import ArithmeticOfRuns, Output, Status
 from toolkit.gate.baseline import (
     Baseline,
     BaselineError,
@@ -64,6 +64,13 @@ class SeriesRecord(Struct, frozen=True, kw_only=True):
 
     status: tuple[Status, ...]
     speed: Annotated[Values, Meta(description="processor time over that of the reference workload")]
+    arithmetic: (
+        Annotated[
+            ArithmeticOfRuns,
+            Meta(description="what the times are of; absent without compiled code, and before it was added"),
+        ]
+        | UnsetType
+    ) = UNSET
     causal: MetricValues | UnsetType = UNSET
     final: MetricValues | UnsetType = UNSET
 
@@ -222,6 +229,7 @@ def _series_record(series: Series) -> SeriesRecord:
     return SeriesRecord(
         status=series.status,
         speed=series.speed,
+        arithmetic=series.arithmetic or UNSET,
         causal=given.get("causal", UNSET),
         final=given.get("final", UNSET),
     )
@@ -233,7 +241,8 @@ def _series(record: SeriesRecord) -> Series:
         outputs["causal"] = record.causal
     if record.final is not UNSET:
         outputs["final"] = record.final
-    return Series(record.status, record.speed, outputs)
+    arithmetic = None if record.arithmetic is UNSET else record.arithmetic
+    return Series(record.status, record.speed, outputs, arithmetic=arithmetic)
 
 
 def json_text(value: object) -> str:

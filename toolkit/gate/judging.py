@@ -16,13 +16,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from toolkit.estimate import Status
+from toolkit.estimate import ArithmeticOfRuns, Status
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Criterion, Measured, Series, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
 
 _NOTHING = ("", "")
+_ARITHMETIC: dict[ArithmeticOfRuns, str] = {
+    "compiled": "compiled",
+    "numpy": "in NumPy",
+    "both": "compiled under some seeds and in NumPy under others",
+}
 _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
 SHOWN = 1e-6
 # Fewer timed runs than this scatter too much to be judged (docs/gate.md).
@@ -73,6 +78,7 @@ def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, term
             why = now.absent.get(estimator, "it was not run")
             judged.verdicts.append(_missing(case, estimator, "", "estimator", why))
         else:
+            judged.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
             _judge_series(case, estimator, was, now.runs[estimator], judged, bounds, terms)
             if terms.speed:
                 judged.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
@@ -92,6 +98,16 @@ def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
         return ""
     which = f" under seed {', '.join(others)}" if case.simulated else ""
     return f"other measurements than the baseline's{which}: the two cannot be compared, make a new baseline"
+
+
+def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -> Iterator[str]:
+    """Say where an estimator's times were made with other arithmetic, as far as both sides tell."""
+    if before.arithmetic and now.arithmetic and before.arithmetic != now.arithmetic:
+        was, is_ = _ARITHMETIC[before.arithmetic], _ARITHMETIC[now.arithmetic]
+        yield (
+            f"{case.source}: {estimator} ran {was} for the baseline and runs {is_} here: its speed is not that of the "
+            "same code"
+        )
 
 
 def _judge_series(

@@ -26,6 +26,7 @@ from toolkit.experiment.units import (
     OUTPUTS,
     Outcome,
     Unit,
+    arithmetic_of,
     outcome_of,
     prepared_of,
     recording_to_prepare,
@@ -173,7 +174,8 @@ def _series(found: Several[Timed], metrics: Several[str]) -> Series:
     }
     # A metric without any value, as a NEES without a covariance, is none that could get lost.
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
-    return Series(tuple(one.status for one in outcomes), tuple(one.speed for one in found), kept, _why(outcomes))
+    status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
+    return Series(status, speed, kept, _why(outcomes), arithmetic_of(outcomes))
 
 
 def _repeated(outcome: Outcome) -> tuple[Output, ...]:

@@ -5,14 +5,15 @@ import platform
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 from msgspec import UNSET
 
+from toolkit.estimate import ArithmeticOfRuns
 from toolkit.experiment.code_version import NUMERIC_PACKAGES, installed_version
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
+from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
 from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
@@ -52,14 +53,10 @@ def _run_here(comparison: Comparison) -> tuple[str, ...]:
     return tuple(name for name in comparison.estimators if name not in others)
 
 
-def _arithmetic(comparison: Comparison) -> dict[str, Literal["compiled", "numpy", "both"]]:
+def _arithmetic(comparison: Comparison) -> dict[str, ArithmeticOfRuns]:
     """Return by estimator what computed, of those that have compiled code."""
-    ran: dict[str, Literal["compiled", "numpy", "both"]] = {}
-    for outcome in comparison.outcomes:
-        if outcome.arithmetic is not None:
-            before = ran.get(outcome.estimator, outcome.arithmetic)
-            ran[outcome.estimator] = outcome.arithmetic if before == outcome.arithmetic else "both"
-    return ran
+    of = {name: [one for one in comparison.outcomes if one.estimator == name] for name in comparison.estimators}
+    return {name: ran for name, outcomes in of.items() if (ran := arithmetic_of(outcomes)) is not None}
 
 
 def _threads(comparison: Comparison) -> dict[str, int | str | None]:

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from toolkit.estimate import ArithmeticOfRuns
 from toolkit.experiment.configuration import Request
 from toolkit.settings import Settings
 
@@ -49,7 +50,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     ]
     arithmetic: (
         Annotated[
-            dict[str, Literal["compiled", "numpy", "both"]],
+            dict[str, ArithmeticOfRuns],
             Meta(description="that ran, by estimator, of those that have compiled code; both only over seeds"),
         ]
         | UnsetType
