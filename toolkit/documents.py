@@ -39,6 +39,15 @@ _NO_CHOICE = "Invalid enum value"
 _PLACED = re.compile(r"(?P<what>.*) - at (`key` in )?`\$(?P<path>[^`]*)`", re.DOTALL)
 
 
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is) -> Record:
+    """Return the record whose fields are ``made`` of the attributes that a value has of the same names."""
+    return record(**{name: made(getattr(value, name)) for name in record.__struct_fields__})
+
+
 def to_text(record: msgspec.Struct) -> str:
     """Return a record as indented JSON; raises ValueError for NaN and infinity, which are not JSON."""
     return json.dumps(msgspec.to_builtins(record), indent=2, allow_nan=False) + "\n"

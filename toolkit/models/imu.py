@@ -16,7 +16,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, skew, so3_exp
 from toolkit.measured_motion import ImuMotion, ImuNoise, Motion
 from toolkit.models.factors import B, V, X, joint_prior, kind_of
-from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction
+from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction, with_velocity_turned
 from toolkit.sequence import Prior
 
 IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
@@ -179,19 +179,11 @@ class ImuModel:
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)
         at.insert(B(k), constant_bias(belief.bias))
-        to_world = _with_velocity_turned(belief.T_world_imu[:3, :3])
+        cov = with_velocity_turned(belief.cov, self.layout, belief.T_world_imu[:3, :3])
         blocks = {X(k): POSE, V(k): _VELOCITY, B(k): self.layout.biases}
-        return joint_prior(at, blocks, to_world @ belief.cov @ to_world.T)
+        return joint_prior(at, blocks, cov)
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
         """Return the covariance (15, 15) with the velocity's error in the body frame, exactly symmetric."""
-        to_body = _with_velocity_turned(R_world_imu.T)
-        cov = to_body @ cov @ to_body.T
-        return np.asarray(0.5 * (cov + cov.T))
-
-
-def _with_velocity_turned(rotation: Array) -> Array:
-    """Return the matrix (15, 15) that turns the velocity's error by a rotation (3, 3) and leaves the others."""
-    turned = np.eye(15)
-    turned[_VELOCITY, _VELOCITY] = rotation
-    return turned
+        cov = with_velocity_turned(cov, self.layout, R_world_imu.T)
+        return 0.5 * (cov + cov.T)

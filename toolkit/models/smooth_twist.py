@@ -18,7 +18,7 @@ from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian, skew
 from toolkit.measured_motion import Motion, TwistChangeNoise, UnmeasuredMotion
 from toolkit.models.factors import B, V, X, joint_prior, kind_of
-from toolkit.models.state import POSE, ROTATION, Belief, Layout, Prediction
+from toolkit.models.state import POSE, ROTATION, Belief, Layout, Prediction, with_velocity_turned
 from toolkit.sequence import Prior
 
 _VELOCITY, _TURN = slice(6, 9), slice(9, 12)
@@ -184,18 +184,10 @@ class SmoothTwist:
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)
         at.insert(B(k), belief.bias[3:])
-        to_world = _with_velocity_turned(belief.T_world_imu[:3, :3])
-        return joint_prior(at, {X(k): POSE, V(k): _VELOCITY, B(k): _TURN}, to_world @ belief.cov @ to_world.T)
+        cov = with_velocity_turned(belief.cov, self.layout, belief.T_world_imu[:3, :3])
+        return joint_prior(at, {X(k): POSE, V(k): _VELOCITY, B(k): _TURN}, cov)
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
         """Return the covariance (12, 12) with the velocity's error in the body frame, exactly symmetric."""
-        to_body = _with_velocity_turned(R_world_imu.T)
-        cov = to_body @ cov @ to_body.T
-        return np.asarray(0.5 * (cov + cov.T))
-
-
-def _with_velocity_turned(rotation: Array) -> Array:
-    """Return the matrix (12, 12) that turns the velocity's error by a rotation (3, 3) and leaves the others."""
-    turned = np.eye(12)
-    turned[_VELOCITY, _VELOCITY] = rotation
-    return turned
+        cov = with_velocity_turned(cov, self.layout, R_world_imu.T)
+        return 0.5 * (cov + cov.T)

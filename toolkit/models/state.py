@@ -30,6 +30,14 @@ class Layout:
         return slice((self.accel_bias or self.gyro_bias).start, self.size)
 
 
+def with_velocity_turned(cov: Array, layout: Layout, rotation: Array) -> Array:
+    """Return a covariance (d, d) whose velocity's error is turned by a rotation (3, 3): to other axes."""
+    assert layout.velocity is not None
+    turn = np.eye(layout.size)
+    turn[layout.velocity, layout.velocity] = rotation
+    return np.asarray(turn @ cov @ turn.T)
+
+
 class Prediction(NamedTuple):
     """A state carried over one interval.
 

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from toolkit.documents import of_attributes
 from toolkit.metrics import Metric, known_metrics
 from toolkit.report.differences import FALSE_ALARM_RATE, Change, Differences, MetricChange
 from toolkit.report.prose import WIDTH, Width, filled
@@ -60,25 +61,12 @@ def diff_document(found: Differences) -> DiffRecord:
         environment=_records(found.environment),
         data=_records(found.data),
         ends=_records(found.ends),
-        metrics=tuple(
-            MetricChangeRecord(
-                estimator=one.estimator,
-                output=one.output,
-                metric=one.metric,
-                before=one.before,
-                after=one.after,
-                change_percent=one.change_percent,
-                moved=one.moved,
-                p=one.p,
-                beyond_chance=one.beyond_chance,
-            )
-            for one in found.metrics
-        ),
+        metrics=tuple(of_attributes(MetricChangeRecord, one) for one in found.metrics),
     )
 
 
 def _records(changes: tuple[Change, ...]) -> tuple[ChangeRecord, ...]:
-    return tuple(ChangeRecord(name=one.name, before=one.before, after=one.after) for one in changes)
+    return tuple(of_attributes(ChangeRecord, one) for one in changes)
 
 
 def diff_text(found: Differences, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:

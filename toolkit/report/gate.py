@@ -11,7 +11,7 @@ from itertools import groupby
 from pathlib import Path
 from xml.etree import ElementTree
 
-from toolkit.documents import to_text
+from toolkit.documents import of_attributes, to_text
 from toolkit.errors import OutputError, printable
 from toolkit.files import check_parent, replaced_file
 from toolkit.gate.judging import SHOWN
@@ -169,30 +169,12 @@ def check_document(check: Check) -> CheckDocument:
         seconds=check.seconds,
         accept_better=check.accept_better,
         notes=check.notes,
-        verdicts=tuple(_verdict(verdict) for verdict in check.verdicts),
+        verdicts=tuple(of_attributes(VerdictRecord, verdict, _finite) for verdict in check.verdicts),
     )
 
 
-def _verdict(verdict: Verdict) -> VerdictRecord:
-    return VerdictRecord(
-        sequence=verdict.sequence,
-        estimator=verdict.estimator,
-        output=verdict.output,
-        metric=verdict.metric,
-        finding=verdict.finding,
-        words=verdict.words,
-        before=_finite(verdict.before),
-        after=_finite(verdict.after),
-        change_percent=_finite(verdict.change_percent),
-        allowed_percent=_finite(verdict.allowed_percent),
-        p=_finite(verdict.p),
-        seen_percent=_finite(verdict.seen_percent),
-        fails=verdict.fails,
-    )
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def gate_junit(check: Check) -> str:
