@@ -167,7 +167,7 @@ print(*card_lines(card), sep="\n")
 
 # %%
 def show_card(card: Card) -> None:
-    """Draw how errors along a track hang together: the structure function with its fit, and the autocorrelation."""
+    """Draw how errors along a track are correlated: the structure function with its fit, and the autocorrelation."""
     names, colours = ("mean column", "disparity", "row"), ("#D55E00", "#0072B2", "#009E73")
     lags = np.arange(1, len(card.structure_px2) + 1)
     _, (apart, alike) = plt.subplots(1, 2, figsize=(10, 3.6))

@@ -36,7 +36,7 @@ RULES = {"outliers": True, "window": True, "tracks": True, "disparity_scale": Fa
 class Setup:
     """All that an estimator knows before the first packet; ``gravity_world`` (3,) m/s^2.
 
-    ``options`` are the settings of this estimator alone, by name; ``progress`` hears of a long ``finish``;
+    ``options`` are the settings of this estimator alone, by name; ``progress`` is told of a long ``finish``;
     ``compilation`` gives what is compiled.
     """
 

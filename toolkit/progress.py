@@ -20,7 +20,7 @@ _LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
 
 
 class Progress(Protocol):
-    """Hears how many of all steps are done."""
+    """Is told how many of all steps are done."""
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Take note; ``stage`` names what is under way where that changes, as in a solver's iterations.
@@ -37,7 +37,7 @@ class Silent:
 
 
 SILENT = Silent()
-# Begins a piece of work of some name; what it gives hears of its progress, and the work ends with the context.
+# Begins a piece of work of some name; what it gives is told of its progress, and the work ends with the context.
 ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 
 

@@ -69,7 +69,7 @@ class StereoRig:
 
     ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
     ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
-    variance is half of theirs. ``track_noise`` says how the errors of one track hang together; None is not at all.
+    variance is half of theirs. ``track_noise`` says how the errors of one track are correlated; None is not at all.
     """
 
     fx_px: float

@@ -1,4 +1,4 @@
-"""How the errors of one track's sightings hang together: white noise, a random walk, and an offset of its own.
+"""How the errors of one track's sightings are correlated: white noise, a random walk, and an offset of its own.
 
 A tracker that follows a patch from image to image adds a little error at every step (a walk), and one that matched left
 and right once, at the track's birth, is wrong by the same disparity for the track's whole life (an offset). White noise
@@ -35,7 +35,7 @@ class TrackNoise:
 
     @property
     def is_correlated(self) -> bool:
-        """Say whether the errors of a track hang together at all."""
+        """Say whether the errors of a track are correlated at all."""
         return bool(self.walk_px.any() or self.offset_px.any())
 
     def scaled(self, factor: float) -> "TrackNoise":

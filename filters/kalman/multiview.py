@@ -96,7 +96,7 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
 
 
 def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
-    """Return tracks together with what makes their rows independent, where the rig's noise hangs together."""
+    """Return tracks together with what makes their rows independent, where the rig's noise is correlated."""
     if rig.track_noise is None:
         return linearised
     mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen)
@@ -104,7 +104,7 @@ def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoR
 
 
 def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
-    """Return the points (F, 3) that fit sightings best whose noise hangs together, from those of white noise.
+    """Return the points (F, 3) that fit sightings of correlated noise best, from those of white noise.
 
     Gauss-Newton, each step no longer than a fifth of the way to the newest pose that saw the point.
     """

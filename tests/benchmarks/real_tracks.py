@@ -1,4 +1,4 @@
-"""How well estimators do on real tracks when noise of tracks is taken for white, and when it hangs together.
+"""How well estimators do on real tracks when noise of tracks is taken for white, and when it is correlated.
 
     python tests/benchmarks/real_tracks.py run results.jsonl [--estimators batch,smart] [--models white,correlated]
     python tests/benchmarks/real_tracks.py table results.jsonl

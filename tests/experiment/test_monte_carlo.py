@@ -120,7 +120,7 @@ def test_equal_estimators_are_told_apart_at_5_percent_and_others_by_the_seeds_sa
     assert needed == 42
     for effect, share in ((0.0, 0.05), (half, 0.9)):
         draws = effect + rng.standard_normal((2000, needed))
-        told = np.mean([paired(draw, np.zeros(needed)).told_apart for draw in draws])
+        told = np.mean([paired(draw, np.zeros(needed)).is_significant for draw in draws])
         # Four standard errors of the share, and one percent by which Student's test needs more than the normal one.
         assert told == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
 

@@ -1,4 +1,4 @@
-"""fixed-lag and isam2 on sightings that hang together along their tracks: against batch, the bound, and themselves."""
+"""fixed-lag and isam2 on sightings correlated along their tracks: against batch, the bound, and themselves."""
 
 from dataclasses import replace
 

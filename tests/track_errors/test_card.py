@@ -27,7 +27,7 @@ def test_errors_that_walk_are_correlated_and_drift_apart_as_fitted(walking: Sequ
     assert card.correlation[0].min() > 0.4
     # In the column a landmark that is too near or too far bends what a walk leaves; rows show it as it is.
     np.testing.assert_allclose(np.sqrt(card.structure_px2[:5, 2]), np.sqrt(card.fitted_px2[:5, 2]), rtol=0.15)
-    assert any("hang together" in line and "noise.tracks=fitted" in line for line in card_lines(card))
+    assert any("are correlated" in line and "noise.tracks=fitted" in line for line in card_lines(card))
     # The measured motion is interpolated between samples, which makes it 0.2 % short.
     assert card.scale is not None and card.scale.value == pytest.approx(1.0, abs=0.006)
 

@@ -10,7 +10,7 @@ import pytest
 from toolkit.cli import main
 from toolkit.estimate import Estimate
 from toolkit.verify import verification
-from toolkit.verify.promises import COV_SIZES, covariance_fault, dishonest
+from toolkit.verify.promises import COV_SIZES, covariance_fault, inconsistency
 
 # An estimator of some thirty lines, as somebody writes who has read docs/extending.md and nothing else.
 NEWCOMER = '''
@@ -101,7 +101,7 @@ def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str],
 def only_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes seconds: seeds, threads and faults."""
     passed = verification.Check("left out", "passed")
-    for name in ("_honest", "_threads", "_trouble"):
+    for name in ("_consistent", "_threads", "_faults"):
         monkeypatch.setattr(verification, name, lambda *_: passed)
 
 
@@ -129,7 +129,7 @@ def test_nothing_else_is_called_broken(newcomer, capsys, kind: str) -> None:
 
 def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
     some = ("2 s without sight", "0.25 s that is not a number")
-    monkeypatch.setattr(verification, "TROUBLE", {name: verification.TROUBLE[name] for name in some})
+    monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
     assert main(["verify", str(newcomer("pass"))]) == 0
     told = capsys.readouterr().out
@@ -151,7 +151,7 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
     Path("others/__init__.py").touch()
     Path("my_filter.py").rename("others/other_filter.py")
     monkeypatch.syspath_prepend(".")
-    for name in ("_honest", "_threads", "_trouble"):
+    for name in ("_consistent", "_threads", "_faults"):
         monkeypatch.setattr(verification, name, lambda *_: verification.Check("left out", "passed"))
     assert main(["verify", "others.other_filter", "--json"]) == 1
     assert list(failed(capsys)) == [COVARIANCES]
@@ -159,11 +159,11 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
 
 def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
     some = ("2 s without sight", "a camera 20 ms late")
-    monkeypatch.setattr(verification, "TROUBLE", {name: verification.TROUBLE[name] for name in some})
+    monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
     from toolkit.verify.subject import subject_of
 
-    found = verification.deaths("my-filter", subject_of(str(path)).load())
+    found = verification.ends_by_fault("my-filter", subject_of(str(path)).load())
     assert set(found) == {"2 s without sight (drive)", "2 s without sight (flight)"}
     assert "AssertionError: no sightings" in found["2 s without sight (drive)"]
 
@@ -171,10 +171,10 @@ def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
 def test_too_sure_and_too_timid_are_told_apart_from_honest() -> None:
     rng = np.random.default_rng(0)
     # Poses of a run share one error in the worst case: a chi-square of 6 over 6 each, over eight runs.
-    alarms = sum(bool(dishonest((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
+    alarms = sum(bool(inconsistency((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
     assert alarms <= 8  # of 2000 at 0.1 % two are expected; a Poisson of 2 exceeds 8 once in four thousand
-    assert "too sure of itself" in dishonest([2.5] * 8)
-    assert "less sure" in dishonest([0.3] * 8)
+    assert "too sure of itself" in inconsistency([2.5] * 8)
+    assert "less sure" in inconsistency([0.3] * 8)
 
 
 def test_a_covariance_with_units_far_apart_is_sound() -> None:

@@ -166,9 +166,9 @@ def _ended_once(afterwards: signal.Handlers) -> Iterator[None]:
             first.append(time.monotonic())
             raise KeyboardInterrupt
 
-    heard = {number: before for number in _ENDING if (before := signal.getsignal(number)) != signal.SIG_IGN}
+    handlers = {number: before for number in _ENDING if (before := signal.getsignal(number)) != signal.SIG_IGN}
     try:
-        for number in heard:
+        for number in handlers:
             signal.signal(number, interrupt)
     except ValueError:  # only the main thread may do this; embedded elsewhere, signals are not ours
         yield
@@ -177,5 +177,5 @@ def _ended_once(afterwards: signal.Handlers) -> Iterator[None]:
         yield
     finally:
         ignored = first and afterwards == signal.SIG_IGN
-        for number, before in heard.items():
+        for number, before in handlers.items():
             signal.signal(number, signal.SIG_IGN if ignored else before or signal.SIG_DFL)

@@ -75,7 +75,7 @@ def _read_matlab(path: Path) -> dict[str, npt.NDArray[np.generic]]:
     content = io.BytesIO(read_input(path))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of damaged bytes the checks of the fields speak
+            warnings.simplefilter("ignore")  # damaged bytes are refused by the checks of the fields
             variables = scipy.io.loadmat(content)  # type: ignore[arg-type]  # a file object is allowed
     except NotImplementedError as error:
         raise DataError(f"{path}: Matlab 7.3 files are not read; save it with -v7") from error

@@ -68,7 +68,7 @@ class Paired:
     error: float
 
     @property
-    def told_apart(self) -> bool:
+    def is_significant(self) -> bool:
         """Say whether Student's paired test, two-sided, finds a difference at 5 %."""
         return abs(self.mean) > float(stdtrit(self.n - 1, 1.0 - _LEVEL / 2.0)) * self.error
 

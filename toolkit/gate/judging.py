@@ -6,8 +6,8 @@ from one part in a million on, and fails beyond its bound in either direction.
 A metric that was changed is told from a trajectory that was, for the same poses cannot have another error. The median
 reprojection of withheld tracks, the errors of the positions and the NEES are all computed from the same poses. Where
 one of them is the same to six digits under every seed, so are the poses, and whatever else moved by a thousandth is
-computed otherwise than it was. A NEES alone may also move with the covariance: it is a witness of the others, and never
-accused.
+computed otherwise than it was. A NEES may also move with the covariance alone: it shows that poses are the same, and is
+never itself called changed.
 """
 
 import math
@@ -36,7 +36,7 @@ _SPEED = "speed"
 Sides = tuple[Array, Array]
 
 _STILL, _MOVED = 1e-6, 1e-3
-_WITNESSES = {"ate_": ("heldout_", "nees_"), "rpe_": ("heldout_", "nees_"), "heldout_": ("ate_", "nees_")}
+_SAME_POSES_BY = {"ate_": ("heldout_", "nees_"), "rpe_": ("heldout_", "nees_"), "heldout_": ("ate_", "nees_")}
 
 
 @dataclass(frozen=True)
@@ -147,11 +147,11 @@ def _judge_metric(case: Case, pairs: Pairs, judged: Judged, terms: Terms) -> Non
     judged.verdicts.append(judge_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
 
 
-def _changed(where: Where, values: tuple[Array, Array], witness: str) -> Verdict:
+def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdict:
     was, is_ = (float(np.median(side)) for side in values)
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, "changed metric",
-        f"{was:.7g} became {is_:.7g} while {witness} is the same in every run: the poses did not change, "
+        f"{was:.7g} became {is_:.7g} while {unchanged} is the same in every run: the poses did not change, "
         "but how this is computed from them; make a new baseline if that is meant",
         was, is_, 100.0 * (is_ / was - 1.0) if was else None,
     )  # fmt: skip
@@ -276,10 +276,10 @@ def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:
     """
     found = {}
     for key, sides in values.items():
-        families = next((given for family, given in _WITNESSES.items() if key.startswith(family)), ())
-        witnesses = [other for other in values if other.startswith(families) and _is_still(values[other])]
-        if families and witnesses and _has_moved(sides):
-            found[key] = witnesses[0]
+        families = next((given for family, given in _SAME_POSES_BY.items() if key.startswith(family)), ())
+        unchanged = [other for other in values if other.startswith(families) and _is_still(values[other])]
+        if families and unchanged and _has_moved(sides):
+            found[key] = unchanged[0]
     return found
 
 

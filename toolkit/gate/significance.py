@@ -138,7 +138,7 @@ def _is_nearer(pairs: Pairs) -> bool:
 
 def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
     change = 100.0 * float(np.expm1(pairs.differences.mean()))
-    words = "" if finding == "same" else f"{told_percent(change)} over {pairs.before.size} seeds"
+    words = "" if finding == "same" else f"{percent_text(change)} over {pairs.before.size} seeds"
     if finding in FAILURES:
         words += f", and chance explains that with p = {p:.2g}"
     where = pairs.where
@@ -149,7 +149,7 @@ def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
     )  # fmt: skip
 
 
-def told_percent(change: float) -> str:
+def percent_text(change: float) -> str:
     """Return a change in percent, with so many digits that one which counts is not printed as none."""
     return f"{change:+.1f} %" if abs(change) >= 0.1 else f"{change:+.1g} %"
 

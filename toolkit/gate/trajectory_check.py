@@ -14,7 +14,7 @@ from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import DATA_ROOT
-from toolkit.gate.significance import FEWEST_RUNS, Spread, Where, holm, told_percent
+from toolkit.gate.significance import FEWEST_RUNS, Spread, Where, holm, percent_text
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, Scored, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
 from toolkit.gate.verdict import Check, Finding, Verdict
@@ -213,7 +213,7 @@ def _tested(
     change = 100.0 * float(np.expm1(spread.change))
     runs = f"{one.before.size} runs before, {one.after.size} now"
     p = min(p_values)
-    words = "" if finding == "same" else f"{told_percent(change)}, {runs}; chance explains that with p = {p:.2g}"
+    words = "" if finding == "same" else f"{percent_text(change)}, {runs}; chance explains that with p = {p:.2g}"
     where = one.where
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, words,

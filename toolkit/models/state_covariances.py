@@ -7,7 +7,7 @@ from a square root information matrix for data association"). GTSAM's Marginals 
 each state, which takes a hundred times as long.
 
 Rounding may grow on the way back, where steps between states are known far better than the states, as where the errors
-of sightings hang together and the camera stands. So the covariance of the first state, where the way ends, is also had
+of sightings are correlated and the camera stands. So the covariance of the first state, where the way ends, is also had
 by itself: where the two differ, all are refused.
 """
 

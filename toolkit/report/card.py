@@ -60,7 +60,7 @@ def _noise(card: Card) -> str:
     if card.noise.offset_px.any():
         parts.append(f"each disparity is off by {card.noise.offset_px[1]:.2f} px for the track's whole life")
     return (
-        f"errors of a track hang together: {' and '.join(parts)}, beside white noise of "
+        f"errors of a track are correlated: {' and '.join(parts)}, beside white noise of "
         f"{_channels(card.noise.white_px)} (correlation from frame to frame {lags}; {card.gain:.1f} +- "
         f"{card.gain_error:.1f} in log-likelihood a track better than white). Told white noise, an estimator takes "
         "every further sighting of a track for news, a smoother most of all: it is too sure of itself and need not "

@@ -95,7 +95,7 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
     )
 
 
-def last_word(run: Run) -> Output:
+def shown_output(run: Run) -> Output:
     """Return the kind of output a figure with room for one shows: the final one where there is one."""
     return "final" if run.final is not None else "causal"
 

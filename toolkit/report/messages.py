@@ -276,7 +276,7 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
     decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else metric.decimals
     figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
     told = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
-    if found.told_apart:
+    if found.is_significant:
         return told
     if found.seeds_needed > _MOST_SEEDS:
         return f"{told}: as good as equal, {_MOST_SEEDS} seeds would not tell them apart"

@@ -20,7 +20,7 @@ from toolkit.report.curves import (
     alignment_words,
     components,
     error_curves,
-    last_word,
+    shown_output,
     onto_truth,
     truth_during,
 )
@@ -238,7 +238,7 @@ def _steps(comparison: Comparison) -> Iterator[StepTimes]:
 
 def _map(run: Run) -> DrawnMap:
     """Return where a run's landmarks are; they move with the run's last word onto the truth."""
-    return DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=last_word(run))
+    return DrawnMap(estimator=run.estimator, landmarks=landmarks_file(run.estimator), output=shown_output(run))
 
 
 def _over_seeds(group: Row) -> DrawnOverSeeds:

@@ -1,6 +1,6 @@
 """The simulated recordings: `drive` (a car, twist or IMU) and `flight` (hand-held or aerial, IMU).
 
-Both also as `-realistic`, with tracks whose errors hang together as those of real trackers do (docs/tracks.md).
+Both also as `-realistic`, with tracks whose errors are correlated as those of real trackers do (docs/tracks.md).
 
 Trajectory and landmarks belong to the scenario; the seed draws the prior's error, the biases, all noise,
 the chance ends of tracks and the outliers, each from a stream of its own, and other ones for every scenario: two
@@ -178,7 +178,7 @@ def _provenance(scenario: Scenario, seed: int) -> Provenance:
     )
     if scenario.track_noise is not None:
         facts += (
-            "errors of a track hang together, which the stated noise does not say (docs/tracks.md), and "
+            "errors of a track are correlated, which the stated noise does not say (docs/tracks.md), and "
             f"{scenario.slip_share:.0%} of the tracks slip to another point",
         )
     return Provenance("simulated", f"scenario {scenario.name}, {scenario.duration_s:g} s, seed {seed}", facts)

@@ -285,7 +285,7 @@ def gave_up(run: Run, frames_t_ns: IntArray) -> str:
     return ""
 
 
-def dishonest(nees_means: list[float]) -> str:
+def inconsistency(nees_means: list[float]) -> str:
     """Say whether mean pose NEES over 6, one a run, show too much or too little certainty, by more than chance.
 
     The band is for poses of a run that share one error, the worst case, and holds 99.9 % of consistent estimators.

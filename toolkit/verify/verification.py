@@ -29,7 +29,7 @@ SEED = 4
 DURATION_S, MAX_TRACKS = 6.0, 40
 
 # By what a user calls it; each as the audit leaves it, as before every comparison.
-TROUBLE: Mapping[str, Callable[[Sequence], Sequence]] = {
+PLANTED_FAULTS: Mapping[str, Callable[[Sequence], Sequence]] = {
     "a fifth of the sightings lost": partial(faults.dropped_sightings, dose=0.2),
     "2 s without sight": partial(faults.blackout, dose=2.0),
     "nothing ever seen": partial(faults.dropped_sightings, dose=1.0),
@@ -59,16 +59,16 @@ def short(scenario: Scenario, duration_s: float = DURATION_S) -> Scenario:
 SCENARIOS: tuple[Scenario, ...] = (short(DRIVE, 4.0), short(DRIVE_IMU, 4.0), short(FLIGHT, 2.0))
 
 
-def deaths(name: str, build: Build) -> dict[str, str]:
-    """Return, by the trouble it was in, why an estimator did not go on to the end."""
+def ends_by_fault(name: str, build: Build) -> dict[str, str]:
+    """Return, by planted fault, why an estimator did not go on to the end."""
     found = {}
     for scenario in (DRIVE, FLIGHT):
         sound = simulate(short(scenario), SEED)
-        for trouble, plant in TROUBLE.items():
+        for fault, plant in PLANTED_FAULTS.items():
             prepared = prepare(Recording(plant(sound)))
             run = runner.run(name, build, prepared.sequence, prepared.prior, SILENT)
             if why := gave_up(run, prepared.sequence.frames_t_ns):
-                found[f"{trouble} ({scenario.name})"] = why
+                found[f"{fault} ({scenario.name})"] = why
     return found
 
 
@@ -176,11 +176,11 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
         checks += _of_runs(build, watched) if watched else []
         if watched:
             progress.advance(len(SCENARIOS), steps, "NEES")
-            checks.append(_honest(subject.name, build))
+            checks.append(_consistent(subject.name, build))
             progress.advance(len(SCENARIOS) + 1, steps, "threads")
             checks.append(_threads(word))
             progress.advance(len(SCENARIOS) + 2, steps, "faults")
-            checks.append(_trouble(subject.name, build))
+            checks.append(_faults(subject.name, build))
     return Verification(subject.name, tuple(checks))
 
 
@@ -219,7 +219,7 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}{where}: {error}"
 
 
-def _honest(name: str, build: Build) -> Check:
+def _consistent(name: str, build: Build) -> Check:
     """Judge the mean NEES of several draws, causal where there is a causal output."""
     scenario, means = short(DRIVE, _NEES_DURATION_S), list[float]()
     why = _NO_COVARIANCE
@@ -237,7 +237,7 @@ def _honest(name: str, build: Build) -> Check:
             why = str(lacking)
     if len(means) < _FEWEST_NEES:
         return Check(_NEES, "not applicable", why)
-    found = promises.dishonest(means)
+    found = promises.inconsistency(means)
     if not found and len(means) < SEEDS:
         found = f"{SEEDS - len(means)} of {SEEDS} seeds have none: {why}"
     return Check(_NEES, "failed", found, _NEES_REMEDY) if found else Check(_NEES, "passed", f"{np.mean(means):.2f}")
@@ -247,9 +247,9 @@ def _threads(word: str) -> Check:
     return _check(_THREADS, _THREADS_REMEDY, lambda: other_bits(word))
 
 
-def _trouble(name: str, build: Build) -> Check:
+def _faults(name: str, build: Build) -> Check:
     def told() -> str:
-        found = deaths(name, build)
-        return "; ".join(f"{trouble}: {why}" for trouble, why in found.items())
+        found = ends_by_fault(name, build)
+        return "; ".join(f"{fault}: {why}" for fault, why in found.items())
 
     return _check(_TROUBLE, _TROUBLE_REMEDY, told)

@@ -21,7 +21,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable, in_sample
 from toolkit.metrics._shared.residuals import rmse
-from toolkit.report.curves import alignment_words, errors_to, last_word, onto_truth, truth_during
+from toolkit.report.curves import alignment_words, errors_to, shown_output, onto_truth, truth_during
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
@@ -105,10 +105,10 @@ def draw_maps(comparison: Comparison) -> Iterator[NamedFigure]:
 
 def _by_position(comparison: Comparison, run: Run) -> _Coloured | None:
     """Return a run's trajectory coloured by its distance to the truth, or None without a truth or a trajectory."""
-    truth, trajectory = truth_during(comparison.sequence), run.trajectory(last_word(run))
+    truth, trajectory = truth_during(comparison.sequence), run.trajectory(shown_output(run))
     if truth is None or trajectory is None:
         return None
-    alignment = onto_truth(run, last_word(run), comparison.sequence)
+    alignment = onto_truth(run, shown_output(run), comparison.sequence)
     errors = errors_to(truth, trajectory, alignment, comparison.sequence)
     if errors is None:
         return None
@@ -119,11 +119,11 @@ def _by_position(comparison: Comparison, run: Run) -> _Coloured | None:
 
 def _by_pixel(comparison: Comparison, run: Run) -> _Coloured | None:
     """Return a run's landmarks coloured by their reprojection error, or None where it has none."""
-    if run.trajectory(last_word(run)) is None:
+    if run.trajectory(shown_output(run)) is None:
         return None
     try:
         with np.errstate(all="ignore"):  # a diverged run may overflow; the metric caps what comes of it
-            ids, error_px = in_sample.errors_of_landmarks(Evaluation(run, last_word(run), comparison.sequence))
+            ids, error_px = in_sample.errors_of_landmarks(Evaluation(run, shown_output(run), comparison.sequence))
     except Unavailable:
         return None
     points = run.landmarks.points_world[np.searchsorted(run.landmarks.track_ids, ids)]
@@ -197,8 +197,8 @@ def _panels(runs: Sequence[Run], view: View) -> tuple[Figure, list[Axes]]:
 def _columns(count: int, ratio: float) -> int:
     """Return how many panels of a height over width stand in a row: a figure of pleasing shape without empty places."""
 
-    def displeasure(columns: int) -> float:
+    def misfit(columns: int) -> float:
         rows = -(-count // columns)
         return abs(math.log(rows * ratio / columns / _SHAPE)) + (rows * columns - count) / count
 
-    return min(range(1, min(count, _MOST_COLUMNS) + 1), key=displeasure)
+    return min(range(1, min(count, _MOST_COLUMNS) + 1), key=misfit)

@@ -15,7 +15,7 @@ from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, held_out, in_sample
 from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.report.curves import last_word
+from toolkit.report.curves import shown_output
 from toolkit.report.figures.panels import finish, panels_of, tell
 from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of
 
@@ -65,9 +65,9 @@ def _entries(drawable: dict[str, dict[str, Array]]) -> list[Entry]:
 
 def _errors_px(comparison: Comparison, run: Run) -> dict[str, Array]:
     """Return the errors (n,) px by kind, without the kinds the run has none of."""
-    if run.trajectory(last_word(run)) is None:
+    if run.trajectory(shown_output(run)) is None:
         return {}
-    evaluation = Evaluation(run, last_word(run), comparison.sequence)
+    evaluation = Evaluation(run, shown_output(run), comparison.sequence)
     kinds: dict[str, Callable[[Evaluation], Array]] = {"in-sample": in_sample.errors, "held-out": held_out.errors}
     found = {}
     for kind, errors_of in kinds.items():

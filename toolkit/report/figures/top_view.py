@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison, plain_name
-from toolkit.report.curves import alignment_words, last_word
+from toolkit.report.curves import alignment_words, shown_output
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
     MUTED_COLOUR,
@@ -46,7 +46,7 @@ _LEAST_SQUARE = 0.015  # of the square in the map, as a share of the map
 
 def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield all trajectories in one figure, where any run has one."""
-    drawable = [run for run in comparison.runs if run.trajectory(last_word(run)) is not None]
+    drawable = [run for run in comparison.runs if run.trajectory(shown_output(run)) is not None]
     if drawable:
         yield _all(comparison, drawable)
 
@@ -54,7 +54,7 @@ def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
 def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield a top view for each run that has a trajectory."""
     for run in comparison.runs:
-        if run.trajectory(last_word(run)) is not None:
+        if run.trajectory(shown_output(run)) is not None:
             yield _one(comparison, run)
 
 
@@ -116,7 +116,7 @@ def _entries(comparison: Comparison, runs: dict[str, Run], truth: Track | None, 
     """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
     entries = [] if truth is None else [Entry("truth", (Line2D([], [], color=TRUTH_COLOUR, lw=_TRUTH_WIDTH),))]
     for name, run in runs.items():
-        line = line_of_estimator(comparison, name, last_word(run))
+        line = line_of_estimator(comparison, name, shown_output(run))
         sample = Line2D([], [], color=colour_of(comparison, name), linestyle=line, linewidth=1.8)
         entries.append(Entry(f"{name}{_trouble(run)}", (sample,)))
     if mapper is not None and len(mapper.landmarks):
@@ -162,7 +162,7 @@ def _places(view: View, entries: int, closer: View | None) -> tuple[Figure, Axes
 def _draw_tracks(axes: Axes, comparison: Comparison, tracks: dict[str, Track], truth: Track | None) -> None:
     if truth is not None:
         axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
-    output = {run.estimator: last_word(run) for run in comparison.runs}
+    output = {run.estimator: shown_output(run) for run in comparison.runs}
     for name, track in tracks.items():
         width = _LINE_WIDTH if len(tracks) == 1 else width_of(comparison, name)
         line = line_of_estimator(comparison, name, output[name])

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, IntArray
-from toolkit.report.curves import last_word, onto_truth, truth_during
+from toolkit.report.curves import shown_output, onto_truth, truth_during
 
 _LANDMARK_QUANTILES = (0.02, 0.98)
 _MARGIN = 0.05
@@ -54,7 +54,7 @@ class Track(NamedTuple):
 
 def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     """Return x and y (M, 2) of the finite ones among points (N, 3), moved with the run onto the truth."""
-    alignment = onto_truth(run, last_word(run), comparison.sequence)
+    alignment = onto_truth(run, shown_output(run), comparison.sequence)
     finite = points_world[np.isfinite(points_world).all(axis=1)]
     above: Array = (finite @ alignment.rotation.T + alignment.translation)[:, :2]
     return above
@@ -62,7 +62,7 @@ def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
 
 def track_of(comparison: Comparison, run: Run) -> Track:
     """Return a run's last word from above, without poses that are not finite; the run must have a trajectory."""
-    trajectory = run.trajectory(last_word(run))
+    trajectory = run.trajectory(shown_output(run))
     assert trajectory is not None, "only runs with a trajectory are drawn"
     finite = np.isfinite(trajectory.positions).all(axis=1)
     return Track(trajectory.t_ns[finite], from_above(comparison, run, trajectory.positions))

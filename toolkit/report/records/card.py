@@ -22,7 +22,7 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     depth_m: Quantiles
     intervals: Annotated[int, Meta(ge=0)]
     intervals_without_common_track: Annotated[int, Meta(ge=0)]
-    correlated: Annotated[bool, Meta(description="whether the errors of a track hang together")]
+    correlated: Annotated[bool, Meta(description="whether the errors of a track are correlated")]
     white_px: Channels
     walk_px: Annotated[Channels, Meta(description="per root frame")]
     offset_px: Channels
