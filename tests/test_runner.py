@@ -136,10 +136,10 @@ def test_a_run_is_judged_by_what_it_gave_alone(sequence):
     poses[::2, 0, 3] = 50.0
     astray = Trajectory(sequence.frames_t_ns, poses)
     run = Run("astray", "ok", astray, astray, Landmarks.none(), None)
-    again = runner.judged(run, sequence)
+    again = runner.with_divergence(run, sequence)
     assert again.status == "diverged"
     assert again.log[-1].startswith("the trajectory diverged: ")
-    assert runner.judged(replace(run, causal=None), sequence).log == again.log
+    assert runner.with_divergence(replace(run, causal=None), sequence).log == again.log
 
 
 class Unconverged(Perfect):

@@ -120,7 +120,7 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         raise
     except Exception as error:
         return replace(_failed(name, said, clock.timings(), error), arithmetic=compilation.ran)
-    run = _judged(name, said, finished, clock.timings(), sequence)
+    run = _ended(name, said, finished, clock.timings(), sequence)
     return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)
 
 
@@ -140,7 +140,7 @@ def _failed(name: str, said: list[Estimate], timings: Timings, error: Exception)
     return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(said), tuple(log))
 
 
-def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
+def _ended(name: str, said: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
     causal = Trajectory.of(said) if said else None
     status: Status = "ok"
     log = list(finished.log)
@@ -148,20 +148,22 @@ def _judged(name: str, said: list[Estimate], finished: Finished, timings: Timing
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
     run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
-    return judged(run, sequence)
+    return with_divergence(run, sequence)
 
 
-def judged(run: Run, sequence: Sequence) -> Run:
+def with_divergence(run: Run, sequence: Sequence) -> Run:
     """Return a run that came to its end with the status ``diverged``, and why in its log, where it contradicts itself.
 
     ``sequence`` is what it read; the truth is not looked at.
     """
-    reasons = [contradiction(trajectory, sequence) for trajectory in _to_judge(run)] + [gate_collapse(run.info)]
+    reasons = [contradiction(trajectory, sequence) for trajectory in _trajectories_to_check(run)] + [
+        gate_collapse(run.info)
+    ]
     found = [f"the trajectory diverged: {reason}" for reason in dict.fromkeys(reasons) if reason is not None]
     return replace(run, status="diverged", log=(*run.log, *found)) if found else run
 
 
-def _to_judge(run: Run) -> Iterator[Trajectory]:
+def _trajectories_to_check(run: Run) -> Iterator[Trajectory]:
     """Yield what contradicts nothing in a run that works.
 
     A final state without a covariance is at least as certain as the causal one was.

@@ -232,7 +232,7 @@ def measure_turns(times: Path, revision: str) -> None:
 def print_speeds_in_turn(times: Path) -> None:
     """Print how often a check fails whose new code takes so many times as long in one estimator."""
     rows = [json.loads(line) for line in times.read_text(encoding="utf-8").splitlines()]
-    every = [interleaved.Timed(case, name, np.array(pairs)) for case, name, pairs in rows]
+    every = [interleaved.TimedPairs(case, name, np.array(pairs)) for case, name, pairs in rows]
     rng = np.random.default_rng(0)
     checks = 400
     print(f"{checks} checks of {len(every)} estimators on sequences, {len(every[0].cpu_s)} pairs of each in the pool")
@@ -247,13 +247,13 @@ def print_speeds_in_turn(times: Path) -> None:
         print(f"{slower:5.2f} times the time: {100.0 * failed.sum() / checks:5.1f} % fail; {np.mean(counts):.0f} pairs")
 
 
-def _drawn_turns(one: interleaved.Timed, ratio: float, rng: np.random.Generator) -> interleaved.Timed:
+def _drawn_turns(one: interleaved.TimedPairs, ratio: float, rng: np.random.Generator) -> interleaved.TimedPairs:
     """Return pairs in a row from a random start, either side as the old code, as many as the gate would run."""
     begin, flip = int(rng.integers(len(one.cpu_s))), int(rng.integers(2))
     pairs = np.roll(one.cpu_s, -begin, axis=0)[:, :: 1 - 2 * flip] * np.array([1.0, ratio])
-    rolled = interleaved.Timed(one.case, one.estimator, pairs)
+    rolled = interleaved.TimedPairs(one.case, one.estimator, pairs)
     count = interleaved.pairs_needed(rolled.differences[: interleaved.FEWEST_PAIRS])
-    return interleaved.Timed(one.case, one.estimator, pairs[:count])
+    return interleaved.TimedPairs(one.case, one.estimator, pairs[:count])
 
 
 def main(words: list[str]) -> None:

@@ -39,7 +39,7 @@ from toolkit.metrics import Evaluation, ate, score_run
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.progress import SILENT
 from toolkit.resampling import NS_PER_S
-from toolkit.runner import judged
+from toolkit.runner import with_divergence
 from toolkit.sequence import Observations
 from toolkit.sequence import Sequence as Recorded
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -227,7 +227,7 @@ def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
         run: Run = pickle.loads(kept.read_bytes())
         log = tuple(line for line in run.log if not line.startswith("the trajectory diverged"))
         status: Status = "ok" if run.status == "diverged" else run.status
-        return judged(replace(run, status=status, log=log), prepared.sequence)
+        return with_divergence(replace(run, status=status, log=log), prepared.sequence)
     run = run_estimator(Unit(prepared, 0, name), prepared, SILENT)
     if kept is not None:
         kept.write_bytes(pickle.dumps(run))

@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.gate.baseline import COVERAGE, DEFAULT_BOUNDS, Baseline, Case, Measured, Series, installed_releases
 from toolkit.gate.checking import judge_all
-from toolkit.gate.judging import Judged, Terms, judge_case
+from toolkit.gate.judging import CaseVerdicts, CheckTerms, judge_case
 from toolkit.gate.verdict import Check
 
 SEEDS = tuple(range(24))
@@ -61,7 +61,7 @@ def edited(measured: Measured, edit: Edit) -> Measured:
 
 def judged(baseline: Baseline, now: list[Measured], *, speed: bool = True, accept_better: bool = False) -> Check:
     """Judge measurements that were never made against a baseline."""
-    every, terms = Judged(), Terms(speed, accept_better)
+    every, terms = CaseVerdicts(), CheckTerms(speed, accept_better)
     for (case, before), after in zip(baseline.cases, now, strict=True):
         one = judge_case(case, before, after, baseline.bounds, terms)
         every.verdicts += one.verdicts

@@ -15,7 +15,7 @@ from toolkit.gate.interleaved import (
     FEWEST_PAIRS,
     MARGIN,
     MOST_PAIRS,
-    Timed,
+    TimedPairs,
     compare_speed,
     judge_speeds,
     pairs_needed,
@@ -29,13 +29,13 @@ PROJECT = Path(__file__).parents[2]
 SPREAD, INTERRUPTED, SLOWED = 0.04, 0.1, 0.5
 
 
-def timed(ratio: float, rng: np.random.Generator, count: int = 0) -> Timed:
+def timed(ratio: float, rng: np.random.Generator, count: int = 0) -> TimedPairs:
     """Return pairs of an estimator that takes ``ratio`` times as long as it did; so many, or as many as are needed."""
     noise = np.exp(SPREAD * rng.standard_normal((MOST_PAIRS, 2)))
     noise *= np.where(rng.random(noise.shape) < INTERRUPTED, 1.0 + SLOWED * rng.random(noise.shape), 1.0)
-    every = Timed("drive", "ekf", 0.1 * noise * np.array([1.0, ratio]))
+    every = TimedPairs("drive", "ekf", 0.1 * noise * np.array([1.0, ratio]))
     count = count or pairs_needed(every.differences[:FEWEST_PAIRS])
-    return Timed("drive", "ekf", every.cpu_s[:count])
+    return TimedPairs("drive", "ekf", every.cpu_s[:count])
 
 
 def findings(ratio: float, checks: int, seed: int) -> list[list[str]]:

@@ -10,7 +10,7 @@ import pytest
 from toolkit.cli import main
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
-from toolkit.gate.significance import Spread
+from toolkit.gate.significance import MeanChange
 from toolkit.gate.trajectory_baseline import load_trajectory_baseline, to_text
 from toolkit.gate.trajectory_files import TIME_COVERAGE, time_coverage_percent
 from toolkit.geometry import se3, se3_exp, so3_exp
@@ -186,7 +186,7 @@ def test_runs_without_a_change_raise_an_alarm_no_more_often_than_stated():
     rng = np.random.default_rng(3)
     checks = 2000
     alarms = sum(
-        Spread.of(*np.exp(0.2 * rng.standard_normal((2, 5)))).beyond_p(0.0, 1.0) <= 0.05 for _ in range(checks)
+        MeanChange.of(*np.exp(0.2 * rng.standard_normal((2, 5)))).beyond_p(0.0, 1.0) <= 0.05 for _ in range(checks)
     )
     # Welch's test is a little off at five runs; three standard deviations above 5 %.
     assert 0.03 * checks <= alarms <= 0.05 * checks + 3.0 * np.sqrt(0.05 * checks)

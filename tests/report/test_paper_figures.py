@@ -15,7 +15,7 @@ from toolkit.report import figures
 from toolkit.report.curves import Components
 from toolkit.report.figures import FigureChoice, components, consistency, drawn, error_map, errors_over_time, top_view
 from toolkit.report.figures.style import NamedFigure
-from toolkit.report.figures.view import NOWHERE, Track, View, view_of, where_tracks_coincide
+from toolkit.report.figures.view import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
 from toolkit.sequence import Sequence
 
 ComparisonOf = Callable[..., Comparison]
@@ -126,9 +126,9 @@ def test_all_panels_of_a_map_share_a_scale_of_colours(comparison: Comparison) ->
     assert list(error_map.draw_trajectories(replace(comparison, outcomes=comparison.outcomes[3:]))) == []
 
 
-def straight(offset_m: float, widening_m: float = 0.0) -> Track:
+def straight(offset_m: float, widening_m: float = 0.0) -> PathFromAbove:
     t_ns = np.arange(101)
-    return Track(t_ns, np.stack([t_ns.astype(float), offset_m + widening_m * t_ns / 100.0], axis=1))
+    return PathFromAbove(t_ns, np.stack([t_ns.astype(float), offset_m + widening_m * t_ns / 100.0], axis=1))
 
 
 def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None:
@@ -143,7 +143,7 @@ def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None
 
 
 def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
-    nowhere = Track(np.empty(0, np.int64), np.empty((0, 2)))
+    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
     (both, one) = (view_of(tracks, NOWHERE) for tracks in ([straight(0.0), nowhere], [straight(0.0)]))
     np.testing.assert_array_equal(both, one)
     assert np.isfinite(view_of([nowhere], NOWHERE)).all()
@@ -152,7 +152,7 @@ def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:
 def test_lines_that_are_apart_need_no_closer_look() -> None:
     view = View(np.array([0.0, -50.0]), np.array([100.0, 50.0]))
     assert where_tracks_coincide([straight(0.0), straight(20.0)], view, np.arange(101)) is None
-    nowhere = Track(np.empty(0, np.int64), np.empty((0, 2)))
+    nowhere = PathFromAbove(np.empty(0, np.int64), np.empty((0, 2)))
     assert where_tracks_coincide([straight(0.0), nowhere], view, np.arange(101)) is None
 
 

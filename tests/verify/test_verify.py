@@ -100,7 +100,7 @@ def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str],
 @pytest.fixture
 def only_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes seconds: seeds, threads and faults."""
-    passed = verification.Check("left out", "passed")
+    passed = verification.CheckedPromise("left out", "passed")
     for name in ("_consistent", "_threads", "_faults"):
         monkeypatch.setattr(verification, name, lambda *_: passed)
 
@@ -152,7 +152,7 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
     Path("my_filter.py").rename("others/other_filter.py")
     monkeypatch.syspath_prepend(".")
     for name in ("_consistent", "_threads", "_faults"):
-        monkeypatch.setattr(verification, name, lambda *_: verification.Check("left out", "passed"))
+        monkeypatch.setattr(verification, name, lambda *_: verification.CheckedPromise("left out", "passed"))
     assert main(["verify", "others.other_filter", "--json"]) == 1
     assert list(failed(capsys)) == [COVARIANCES]
 

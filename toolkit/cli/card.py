@@ -18,8 +18,8 @@ def add_to(subcommands: Subcommands) -> None:
         "card",
         help="say what the tracks of a recording are like",
         description="Fit the noise of a recording's tracks and say what they are like: how errors along a track "
-        "are correlated, how many are at odds with the motion, how vision's scale compares with the measured motion. No "
-        "truth is used.",
+        "are correlated, how many are at odds with the motion, how vision's scale compares with the measured motion. "
+        "No truth is used.",
         epilog=epilog("vislam card drive-realistic --max-frames 60"),
     )
     parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")

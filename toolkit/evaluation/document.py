@@ -19,7 +19,7 @@ from toolkit.evaluation.scoring import METRICS, Terms
 from toolkit.evaluation.standings import Cell, EvaluatedRun, Evaluation, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import Values
-from toolkit.gate.trajectory_baseline import Scored
+from toolkit.gate.trajectory_baseline import ScoredSequence
 from toolkit.gate.trajectory_files import Scoring
 from toolkit.metrics import Metric
 
@@ -241,7 +241,7 @@ class EvaluatedRuns:
         """Return the sequences there are runs of."""
         return tuple(self._runs)
 
-    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+    def scored(self, sequence: str, scoring: Scoring, before: ScoredSequence | None) -> ScoredSequence:
         """Return the scores of a sequence's runs; raises DataError where one failed, or they were scored otherwise."""
         self._check_terms(scoring)
         runs = self._runs.get(sequence, ())
@@ -252,7 +252,7 @@ class EvaluatedRuns:
             raise DataError(f"{failed.run} failed: {failed.log[0]}")
         truth = next(one for one in self.record.sequences if one.sequence == runs[0].sequence)
         scores: Mapping[str, Values] = {key: tuple(run.metrics.get(key) for run in runs) for key in scoring.metrics}
-        return Scored(truth.truth, truth.truth_hash, tuple(run.file or run.run for run in runs), scores)
+        return ScoredSequence(truth.truth, truth.truth_hash, tuple(run.file or run.run for run in runs), scores)
 
     def _check_terms(self, scoring: Scoring) -> None:
         terms = self.record.terms

@@ -75,7 +75,7 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class PreparedCase:
     """A source of a plan, ready to be read: under its first seed, with what other systems estimated from it."""
 
     source: str | Recorded
@@ -113,7 +113,7 @@ def workers_of(plan: Plan) -> Pool:
     return workers
 
 
-def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[Case, ...]:
+def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent) -> tuple[PreparedCase, ...]:
     """Make every source ready, so that whatever is wrong with a plan is found before the first estimator starts.
 
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
@@ -150,15 +150,15 @@ def _unless_lost(result: Prepared | Lost, recording: Recording) -> Prepared:
     return result
 
 
-def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping[str, PosesFile]) -> Case:
+def _case(plan: Plan, source: str | Recorded, prepared: Prepared, files: Mapping[str, PosesFile]) -> PreparedCase:
     """Return a prepared source with what other systems estimated from it."""
     brought = {} if isinstance(source, Recorded) or len(plan.seeds) > 1 else load_references(source)
     check_names(brought, files)
     references = reference_runs(brought, prepared.sequence)
-    return Case(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
+    return PreparedCase(source, prepared, references + external_runs(files, prepared.whole, prepared.sequence))
 
 
-def stores_of(plan: Plan, cases: Sequence[Case], directories: Sequence[Path]) -> list[OutcomeStore]:
+def stores_of(plan: Plan, cases: Sequence[PreparedCase], directories: Sequence[Path]) -> list[OutcomeStore]:
     """Return where the outcomes of each case are kept, of a comparison over seeds; of one seed the runs are needed.
 
     Raises DataError where what is kept in a directory is damaged, OutputError where another process writes there.
@@ -169,14 +169,14 @@ def stores_of(plan: Plan, cases: Sequence[Case], directories: Sequence[Path]) ->
     return [OutcomeStore(directory, one) for directory, one in zip(directories, conditions, strict=True)]
 
 
-def _hash_under_seed_0(plan: Plan, case: Case) -> str:
+def _hash_under_seed_0(plan: Plan, case: PreparedCase) -> str:
     prepared = case.prepared if plan.seeds[0] == 0 else prepare(plan.recording(case.source, 0))
     return prepared.sequence.content_hash()
 
 
 def comparisons(
     plan: Plan,
-    cases: Sequence[Case],
+    cases: Sequence[PreparedCase],
     workers: Pool,
     progress_for: ProgressFor = silent,
     stores: Sequence[Store] = (),
@@ -206,7 +206,7 @@ def comparisons(
 
 
 def _found_and_missing(
-    plan: Plan, cases: Sequence[Case], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
+    plan: Plan, cases: Sequence[PreparedCase], entries: Mapping[str, EstimatorEntry], stores: Sequence[Store]
 ) -> tuple[list[list[Outcome]], list[Unit], list[int]]:
     """Return the outcomes that are there, by case, the units that have to be run, and the case of each of these."""
     outcomes: list[list[Outcome]] = [[] for _ in cases]
@@ -223,12 +223,12 @@ def _found_and_missing(
     return outcomes, units, owner
 
 
-def _label(cases: Sequence[Case], missing: int, there: int) -> str:
+def _label(cases: Sequence[PreparedCase], missing: int, there: int) -> str:
     names = ", ".join(dict.fromkeys(case.name for case in cases))
     return f"{names}: {missing} runs" + (f" ({there} are there)" if there else "")
 
 
-def _units(plan: Plan, case: Case, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
+def _units(plan: Plan, case: PreparedCase, entries: Mapping[str, EstimatorEntry]) -> Iterator[Unit]:
     """Yield the work of a case: seed by seed, the estimators that take longest first."""
     names = [*plan.own, *sorted(entries, key=lambda name: -(entries[name].rung() or 0))]
     # A worker of a cluster stands in another folder.
@@ -257,7 +257,7 @@ def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:
 
 
 def _comparison(
-    plan: Plan, case: Case, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
+    plan: Plan, case: PreparedCase, outcomes: Iterable[Outcome], entries: Mapping[str, EstimatorEntry], workers: int
 ) -> Comparison:
     sequence = case.prepared.sequence
     ordered = in_order(outcomes, (*entries, *plan.own), plan.seeds)

@@ -8,7 +8,7 @@ from toolkit.estimator import find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
 from toolkit.gate.interleaved import compare_speed
-from toolkit.gate.judging import USUAL_TERMS, Judged, Terms, judge_case
+from toolkit.gate.judging import USUAL_TERMS, CaseVerdicts, CheckTerms, judge_case
 from toolkit.gate.measuring import measure, metrics_of, recordings_of
 from toolkit.gate.significance import judge_pairs
 from toolkit.gate.verdict import Check
@@ -31,9 +31,9 @@ class How:
     speed_against: str | None = None
 
     @property
-    def terms(self) -> Terms:
+    def terms(self) -> CheckTerms:
         """On which terms each case is judged; time that is told otherwise is not judged twice."""
-        return Terms(self.speed and self.speed_against is None, self.accept_better)
+        return CheckTerms(self.speed and self.speed_against is None, self.accept_better)
 
 
 def new_baseline(
@@ -63,7 +63,7 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
     Raises BaselineError where another version of the code is asked for and cannot be had or timed.
     """
     began, how = time.monotonic(), replace(how, settings=baseline.settings)
-    judged = Judged()
+    judged = CaseVerdicts()
     if how.speed_against is not None:
         speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
         judged.verdicts += speeds.verdicts
@@ -77,7 +77,9 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
     return judge_all(judged, baseline, name, time.monotonic() - began, how.terms)
 
 
-def judge_all(judged: Judged, baseline: Baseline, name: str, seconds: float, terms: Terms = USUAL_TERMS) -> Check:
+def judge_all(
+    judged: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
+) -> Check:
     """Test what awaits its test, all at once, and put the verdicts together."""
     tested = judge_pairs(judged.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {

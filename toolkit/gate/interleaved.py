@@ -44,7 +44,7 @@ _TAILS_PERCENT, _TAILS_OF_NORMAL = (10.0, 90.0), 1.2816
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedPairs:
     """One estimator on one case: seconds of processor time of the old and the new code, pair by pair (n, 2)."""
 
     case: str
@@ -62,7 +62,7 @@ class Timed:
 class Turns:
     """What was timed, and what to know beside it."""
 
-    timed: tuple[Timed, ...]
+    timed: tuple[TimedPairs, ...]
     notes: tuple[str, ...]
 
 
@@ -88,7 +88,7 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
     """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    found: list[Timed] = []
+    found: list[TimedPairs] = []
     notes: list[str] = []
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
         lacking = _lacking(version, sides, names)
@@ -101,11 +101,11 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
                 for done, name in enumerate(present):
                     progress.advance(done, len(present))
                     timed = _time(sides, case.source, name)
-                    (found if isinstance(timed, Timed) else notes).append(timed)  # type: ignore[arg-type]
+                    (found if isinstance(timed, TimedPairs) else notes).append(timed)  # type: ignore[arg-type]
     return Turns(tuple(found), tuple(notes))
 
 
-def judge_speeds(found: Sequence[Timed], version: str, rate: float) -> Iterator[Verdict]:
+def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
     """Yield the verdict on each estimator; the chance of any false alarm among them is at most ``rate``."""
     slower, faster = (
         holm(np.array([_beyond_p(sign * timed.differences) for timed in found], dtype=float)).tolist()
@@ -222,15 +222,15 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
         )
 
 
-def _time(sides: Sequence[Process], source: str, estimator: str) -> Timed | str:
+def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | str:
     """Time both sides in turn; return why that is not possible where a run does not end well."""
     first = [side.ask("run", estimator=estimator) for side in sides]  # warms up, and is not counted
     if any(one["status"] != "ok" for one in first):
         return f"{source}: {estimator} ends {first[0]['status']} there and {first[1]['status']} here, and is not timed"
     pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
-    more = pairs_needed(Timed(source, estimator, pairs).differences)
+    more = pairs_needed(TimedPairs(source, estimator, pairs).differences)
     further = [_pair(sides, estimator, k) for k in range(FEWEST_PAIRS, more)]
-    return Timed(source, estimator, np.array([*pairs.tolist(), *further]))
+    return TimedPairs(source, estimator, np.array([*pairs.tolist(), *further]))
 
 
 def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, float]:

@@ -40,18 +40,18 @@ _SAME_POSES_BY = {"ate_": ("heldout_", "nees_"), "rpe_": ("heldout_", "nees_"), 
 
 
 @dataclass(frozen=True)
-class Terms:
+class CheckTerms:
     """On which terms to judge: whether time counts, and whether what moved passes unless it is worse."""
 
     speed: bool = True
     accept_better: bool = False
 
 
-USUAL_TERMS = Terms()
+USUAL_TERMS = CheckTerms()
 
 
 @dataclass
-class Judged:
+class CaseVerdicts:
     """What is decided about a case already, what awaits the tests of the whole check, and what is worth a note."""
 
     verdicts: list[Verdict] = field(default_factory=list)
@@ -59,9 +59,11 @@ class Judged:
     notes: list[str] = field(default_factory=list)
 
 
-def judge_case(case: Case, before: Measured, now: Measured, bounds: Bounds, terms: Terms = USUAL_TERMS) -> Judged:
+def judge_case(
+    case: Case, before: Measured, now: Measured, bounds: Bounds, terms: CheckTerms = USUAL_TERMS
+) -> CaseVerdicts:
     """Judge one case on the terms given."""
-    judged = Judged()
+    judged = CaseVerdicts()
     if now.unreadable:
         judged.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
         return judged
@@ -111,7 +113,7 @@ def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -
 
 
 def _judge_series(
-    case: Case, estimator: str, before: Series, now: Series, judged: Judged, bounds: Bounds, terms: Terms
+    case: Case, estimator: str, before: Series, now: Series, judged: CaseVerdicts, bounds: Bounds, terms: CheckTerms
 ) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
     judged.verdicts += _ends(case, estimator, before, now, judged, terms)
@@ -135,7 +137,7 @@ def _judge_series(
     judged.verdicts += judge_coverage(case, estimator, before, now, bounds)
 
 
-def _judge_metric(case: Case, pairs: Pairs, judged: Judged, terms: Terms) -> None:
+def _judge_metric(case: Case, pairs: Pairs, judged: CaseVerdicts, terms: CheckTerms) -> None:
     """Put a metric among the tests, or hold it to its bound."""
     if case.simulated:
         judged.tests.append(pairs)
@@ -157,7 +159,9 @@ def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdi
     )  # fmt: skip
 
 
-def _ends(case: Case, estimator: str, before: Series, now: Series, judged: Judged, terms: Terms) -> Iterator[Verdict]:
+def _ends(
+    case: Case, estimator: str, before: Series, now: Series, judged: CaseVerdicts, terms: CheckTerms
+) -> Iterator[Verdict]:
     """Fail where runs end otherwise than they did; where that is accepted, note those that end well now."""
     pairs = list(zip(case.seeds, before.status, now.status, strict=True))
     worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]

@@ -46,7 +46,7 @@ _UPDATES, _JOINT, _SAMPLES, _POSES = 30, 20, 1500, 100
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedOutcome:
     """An outcome with its processor time over the reference workload's, and the fingerprint of what was read."""
 
     outcome: Outcome
@@ -106,7 +106,7 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
     return gathered(present, found, tuple(metrics), absent)
 
 
-def timed(unit: Unit, progress: Progress) -> Timed:
+def timed(unit: Unit, progress: Progress) -> TimedOutcome:
     """Run and score the estimator of a unit between two reference workloads."""
     prepared = prepared_of(unit)
     reference_s()  # warms up what every later one finds warm
@@ -114,7 +114,7 @@ def timed(unit: Unit, progress: Progress) -> Timed:
     run = run_estimator(unit, prepared, progress)
     reference = (before_s + reference_s()) / 2.0
     outcome = replace(outcome_of(run, prepared.sequence, unit.seed), run=None)
-    return Timed(outcome, _over(run, reference), fingerprint(prepared.sequence))
+    return TimedOutcome(outcome, _over(run, reference), fingerprint(prepared.sequence))
 
 
 def fingerprint(sequence: Sequence) -> str:
@@ -133,7 +133,7 @@ def metrics_of(case: Case, bounds: Bounds) -> tuple[str, ...]:
     return (*(bounds.simulated if case.simulated else bounds.recorded), COVERAGE)
 
 
-def gathered(case: Case, found: Iterable[Timed], metrics: Several[str], absent: dict[str, str]) -> Measured:
+def gathered(case: Case, found: Iterable[TimedOutcome], metrics: Several[str], absent: dict[str, str]) -> Measured:
     """Arrange outcomes, which come in any order, by estimator and seed; keep the metrics of interest."""
     by_run = {(one.outcome.estimator, one.outcome.seed): one for one in found}
     read = {one.outcome.seed: one for one in by_run.values() if one.outcome.sequence_hash}
@@ -151,10 +151,10 @@ def _why_absent(name: str) -> str:
     return ""
 
 
-def _timed(result: Timed | Lost, unit: Unit) -> Timed:
+def _timed(result: TimedOutcome | Lost, unit: Unit) -> TimedOutcome:
     """Return what came of a unit; of one whose process died nothing but its status."""
     if isinstance(result, Lost):
-        return Timed(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
+        return TimedOutcome(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
     return result
 
 
@@ -164,7 +164,7 @@ def _over(run: Run, reference: float) -> float | None:
     return run.timings.cpu_s / reference if run.timings is not None and run.status in ended else None
 
 
-def _series(found: Several[Timed], metrics: Several[str]) -> Series:
+def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
     """Return the series of one estimator; a final output that only repeats the causal one is left out."""
     outcomes = [one.outcome for one in found]
     outputs = [{o: s.scores.values for o, s in one.outputs.items() if o not in _repeated(one)} for one in outcomes]

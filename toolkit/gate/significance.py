@@ -216,7 +216,7 @@ def smallest_seen(differences: Array, rate: float, power: float) -> float:
 
 
 @dataclass(frozen=True)
-class Spread:
+class MeanChange:
     """The change of the mean logarithm from some runs to others, its standard error and degrees of freedom."""
 
     change: float
@@ -224,7 +224,7 @@ class Spread:
     dof: float
 
     @classmethod
-    def of(cls, before: Array, after: Array) -> "Spread":
+    def of(cls, before: Array, after: Array) -> "MeanChange":
         """Return the spread between runs before (m,) and after (n,), each of at least FEWEST_RUNS."""
         sides = [log_of(side) for side in (before, after)]
         shares = np.array([0.0 if np.ptp(side) == 0.0 else side.var(ddof=1) / side.size for side in sides])

@@ -60,7 +60,7 @@ class TrajectoryBaselineRecord(Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredSequence:
     """A sequence: its truth and that one's hash, the files of its runs, and the scores of each by metric."""
 
     truth: str
@@ -73,7 +73,7 @@ class Scored:
 class TrajectoryBaseline:
     """What was scored and how, by sequence, and what counts as worse; ``bounds`` are in percent, by metric."""
 
-    sequences: Mapping[str, Scored]
+    sequences: Mapping[str, ScoredSequence]
     scoring: Scoring
     bounds: Mapping[str, float]
     coverage_points: float = COVERAGE_POINTS
@@ -85,7 +85,7 @@ def load_trajectory_baseline(path: Path) -> TrajectoryBaseline:
     """Read the file; raises BaselineError where there is none, or it is not one."""
     record = documents.read(path, TrajectoryBaselineRecord, remedy=_REMEDY, error=BaselineError)
     return TrajectoryBaseline(
-        {one.sequence: Scored(one.truth, one.truth_hash, one.files, one.scores) for one in record.sequences},
+        {one.sequence: ScoredSequence(one.truth, one.truth_hash, one.files, one.scores) for one in record.sequences},
         Scoring(record.align, record.gap_s),
         record.bounds,
         record.coverage_points,

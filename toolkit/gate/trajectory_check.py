@@ -14,8 +14,8 @@ from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import DATA_ROOT
-from toolkit.gate.significance import FEWEST_RUNS, Spread, Where, holm, percent_text
-from toolkit.gate.trajectory_baseline import BOUND_PERCENT, Scored, TrajectoryBaseline
+from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, holm, percent_text
+from toolkit.gate.trajectory_baseline import BOUND_PERCENT, ScoredSequence, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.geometry import Array
@@ -49,7 +49,7 @@ class GivenRuns(Protocol):
     def sequences(self) -> tuple[str, ...]:
         """Return the sequences there are; raises DataError where there are none."""
 
-    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+    def scored(self, sequence: str, scoring: Scoring, before: ScoredSequence | None) -> ScoredSequence:
         """Return the scores of a sequence; ``before`` is what the baseline has of it.
 
         Raises DataError where there is no run, or one cannot be used.
@@ -68,7 +68,7 @@ class FolderOfRuns:
         """Return the sequences there are files of; raises DataError where there are none."""
         return tuple(self._files)
 
-    def scored(self, sequence: str, scoring: Scoring, before: Scored | None) -> Scored:
+    def scored(self, sequence: str, scoring: Scoring, before: ScoredSequence | None) -> ScoredSequence:
         """Score the files of a sequence; the truth is where it is given, or else where the baseline had it."""
         files = self._files.get(sequence, ())
         if not files:
@@ -78,8 +78,8 @@ class FolderOfRuns:
         truth = read_stamped(path)
         names = tuple(str(file.relative_to(self.folder)) for file in files)
         if before is not None and truth.digest != before.truth_hash:
-            return Scored(path.as_posix(), truth.digest, names, {})
-        return Scored(path.as_posix(), truth.digest, names, _scores_of(files, truth, scoring))
+            return ScoredSequence(path.as_posix(), truth.digest, names, {})
+        return ScoredSequence(path.as_posix(), truth.digest, names, _scores_of(files, truth, scoring))
 
     @cached_property
     def _files(self) -> dict[str, tuple[Path, ...]]:
@@ -147,7 +147,7 @@ class _Compared:
         return float(np.log1p(self.criterion.percent / 100.0))
 
 
-def _now(sequence: str, before: Scored, given: GivenRuns, scoring: Scoring) -> Mapping[str, Values]:
+def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scoring) -> Mapping[str, Values]:
     """Return the scores of a sequence's runs; raises DataError where one cannot be used, or the truth is another."""
     now = given.scored(sequence, scoring, before)
     if now.truth_hash != before.truth_hash:
@@ -178,7 +178,7 @@ def _lost(before: Values, now: Values) -> str:
     return f"it has no value in {gone} of {len(now)} runs" if lost else ""
 
 
-def _coverage(sequence: str, before: Scored, now: Mapping[str, Values], allowed: float) -> Iterator[Verdict]:
+def _coverage(sequence: str, before: ScoredSequence, now: Mapping[str, Values], allowed: float) -> Iterator[Verdict]:
     """Fail where the worst run covers less of the time than the worst one of the baseline did."""
     was, is_ = (float(_array(side[TIME_COVERAGE]).min()) for side in (before.scores, now))
     worse = was - is_ > allowed
@@ -190,7 +190,7 @@ def _coverage(sequence: str, before: Scored, now: Mapping[str, Values], allowed:
 def _judged(compared: list[_Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
     """Yield a verdict for each metric: by a test where there are runs enough, else by its bound alone."""
     tested = [one for one in compared if one.is_tested]
-    spreads = [Spread.of(one.before, one.after) for one in tested]
+    spreads = [MeanChange.of(one.before, one.after) for one in tested]
     up, down = (
         holm(np.array([spread.beyond_p(one.margin, sign) for spread, one in zip(spreads, tested, strict=True)]))
         for sign in (1.0, -1.0)
@@ -204,7 +204,7 @@ def _judged(compared: list[_Compared], rate: float, *, accept_better: bool) -> I
 
 
 def _tested(
-    one: _Compared, spread: Spread, p_values: tuple[float, float], rate: float, each: float, *, accept_better: bool
+    one: _Compared, spread: MeanChange, p_values: tuple[float, float], rate: float, each: float, *, accept_better: bool
 ) -> Verdict:
     worse, better = (p <= rate for p in p_values)
     finding: Finding = "regressed" if worse else "same"

@@ -39,14 +39,14 @@ class NoSoundStartError(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedStart:
     """The first state, its covariance as an Estimate has it, and from how many frames."""
 
     first: Estimate
     cov: Array
 
 
-def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess, sequence: Sequence) -> Adjusted:
+def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess, sequence: Sequence) -> AdjustedStart:
     """Adjust the first frames from a guess and return the state at the first.
 
     Raises NoSoundStartError where the graph is indeterminate, or most tracks do not fit the solution.
@@ -71,7 +71,7 @@ def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess
         cov = joint_cov(gtsam.Marginals(graph, values), model.keys(0))
     except RuntimeError as refusal:
         raise _unless_indeterminate(refusal) from refusal
-    return Adjusted(first, max(scale2, 1.0) * INFLATION * model.estimate_cov(cov, first.T_world_imu[:3, :3]))
+    return AdjustedStart(first, max(scale2, 1.0) * INFLATION * model.estimate_cov(cov, first.T_world_imu[:3, :3]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from toolkit.initialization.adjustment import (
     GAUGE_SIGMA,
     GYRO_BIAS_SIGMA,
     TURN_SIGMA,
-    Adjusted,
+    AdjustedStart,
     NoSoundStartError,
     adjusted,
 )
@@ -61,7 +61,7 @@ def start_from_measurements(sequence: Sequence) -> Prior:
     return Prior(first.T_world_imu, first.v_world, first.bias, whole, source)
 
 
-def _adjusted(packets: list[Packet], sequence: Sequence) -> Adjusted:
+def _adjusted(packets: list[Packet], sequence: Sequence) -> AdjustedStart:
     """Adjust the first frames, each unknown guessed linearly; raises NoSoundStartError where they do not tell."""
     tracks = _tracks_worth_using([packet.frame for packet in packets])
     if len(packets) < FEWEST_FRAMES or tracks.size < FEWEST_TRACKS:

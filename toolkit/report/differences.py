@@ -14,7 +14,7 @@ from msgspec import UNSET, to_builtins
 
 from toolkit.estimate import Status
 from toolkit.gate.baseline import Criterion
-from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, Pairs, Spread, Where, holm, moved_p
+from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.html.run_files import RunFiles, SeedsFiles
@@ -201,7 +201,7 @@ def _tested(before: _Line, after: _Line, metric: Metric, *, paired: bool) -> flo
         return float(moved_p(Pairs(Where("", "", "", metric.key), Criterion("larger", 0.0), *sides)))
     if min(len(was), len(is_)) < FEWEST_RUNS:
         return None
-    spread = Spread.of(_array(was), _array(is_))
+    spread = MeanChange.of(_array(was), _array(is_))
     return min(1.0, 2.0 * min(spread.beyond_p(ROUNDING, sign) for sign in (1.0, -1.0)))
 
 

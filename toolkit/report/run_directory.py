@@ -16,7 +16,7 @@ from toolkit.estimate import Landmarks, Output, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
-from toolkit.experiment.pipeline import Case
+from toolkit.experiment.pipeline import PreparedCase
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
@@ -94,7 +94,7 @@ def _files_of_an_earlier_version(manifest: Manifest) -> frozenset[str]:
     )
 
 
-def directories_for(cases: Sequence[Case], out: Path) -> tuple[Path, ...]:
+def directories_for(cases: Sequence[PreparedCase], out: Path) -> tuple[Path, ...]:
     """Return the run directory of each case: ``out`` for a single one, else folders in it by the sequences' names.
 
     Raises OutputError where one cannot be written or holds something else.

@@ -73,7 +73,7 @@ def ends_by_fault(name: str, build: Build) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckedPromise:
     """One promise: what it is, what came of it, what was found, and what to do where it is broken."""
 
     name: str
@@ -87,7 +87,7 @@ class Verification:
     """All checks of one estimator."""
 
     estimator: str
-    checks: tuple[Check, ...]
+    checks: tuple[CheckedPromise, ...]
 
     @property
     def passed(self) -> bool:
@@ -172,7 +172,11 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
                 watched.append(watch(build, simulate(scenario, SEED)))
             except Exception as error:  # anybody's code, which may raise anything
                 raised = raised or f"{scenario.name}: {_told(error)}"
-        checks = [Check("it runs to the end", "failed" if raised else "passed", raised, _RUNS_REMEDY if raised else "")]
+        checks = [
+            CheckedPromise(
+                "it runs to the end", "failed" if raised else "passed", raised, _RUNS_REMEDY if raised else ""
+            )
+        ]
         checks += _of_runs(build, watched) if watched else []
         if watched:
             progress.advance(len(SCENARIOS), steps, "NEES")
@@ -184,13 +188,13 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
     return Verification(subject.name, tuple(checks))
 
 
-def _of_runs(build: Build, watched: list[Watched]) -> Iterator[Check]:
+def _of_runs(build: Build, watched: list[Watched]) -> Iterator[CheckedPromise]:
     for name, broken, remedy in _OF_A_RUN:
         yield _check(name, remedy, partial(_first, watched, partial(broken, build)))
     if any(promises.states_covariance(one) for one in watched):
         yield _check(_COVARIANCE, _COVARIANCE_REMEDY, lambda: _first(watched, promises.unsound_covariance))
     else:
-        yield Check(_COVARIANCE, "not applicable", _NO_COVARIANCE)
+        yield CheckedPromise(_COVARIANCE, "not applicable", _NO_COVARIANCE)
 
 
 def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
@@ -201,12 +205,12 @@ def _first(watched: list[Watched], broken: Callable[[Watched], str]) -> str:
     return ""
 
 
-def _check(name: str, remedy: str, find: Callable[[], str]) -> Check:
+def _check(name: str, remedy: str, find: Callable[[], str]) -> CheckedPromise:
     try:
         found = find()
     except Exception as error:  # anybody's code, which may raise anything
         found = _told(error)
-    return Check(name, "failed", found, remedy) if found else Check(name, "passed")
+    return CheckedPromise(name, "failed", found, remedy) if found else CheckedPromise(name, "passed")
 
 
 def _told(error: Exception) -> str:
@@ -219,7 +223,7 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}{where}: {error}"
 
 
-def _consistent(name: str, build: Build) -> Check:
+def _consistent(name: str, build: Build) -> CheckedPromise:
     """Judge the mean NEES of several draws, causal where there is a causal output."""
     scenario, means = short(DRIVE, _NEES_DURATION_S), list[float]()
     why = _NO_COVARIANCE
@@ -236,18 +240,22 @@ def _consistent(name: str, build: Build) -> Check:
         except Unavailable as lacking:
             why = str(lacking)
     if len(means) < _FEWEST_NEES:
-        return Check(_NEES, "not applicable", why)
+        return CheckedPromise(_NEES, "not applicable", why)
     found = promises.inconsistency(means)
     if not found and len(means) < SEEDS:
         found = f"{SEEDS - len(means)} of {SEEDS} seeds have none: {why}"
-    return Check(_NEES, "failed", found, _NEES_REMEDY) if found else Check(_NEES, "passed", f"{np.mean(means):.2f}")
+    return (
+        CheckedPromise(_NEES, "failed", found, _NEES_REMEDY)
+        if found
+        else CheckedPromise(_NEES, "passed", f"{np.mean(means):.2f}")
+    )
 
 
-def _threads(word: str) -> Check:
+def _threads(word: str) -> CheckedPromise:
     return _check(_THREADS, _THREADS_REMEDY, lambda: other_bits(word))
 
 
-def _faults(name: str, build: Build) -> Check:
+def _faults(name: str, build: Build) -> CheckedPromise:
     def told() -> str:
         found = ends_by_fault(name, build)
         return "; ".join(f"{fault}: {why}" for fault, why in found.items())

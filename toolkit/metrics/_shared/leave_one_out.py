@@ -37,7 +37,7 @@ _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
 _PER_VIEW = ("uv_px", "numerator", "numerator_0", "denominator", "denominator_0")
 
 
-class Prediction(NamedTuple):
+class PredictedSightings(NamedTuple):
     """Predicted (uL, uR, v) (N, 3) px, derivatives by the point (N, 3, 3), and whether it is in front (N,)."""
 
     uv_px: Array
@@ -73,13 +73,13 @@ class Views:
     centre_px: Array
     sqrt_information: Array
 
-    def predict(self, points: Array) -> Prediction:
+    def predict(self, points: Array) -> PredictedSightings:
         """Predict each view's measurement from a point of its own (N, 3)."""
         depth = np.einsum("ni,ni->n", self.denominator, points) + self.denominator_0
         ratio = ((self.numerator @ points[..., None])[..., 0] + self.numerator_0) / depth[:, None]
         slope = (self.numerator - ratio[:, :, None] * self.denominator[:, None, :]) / depth[:, None, None]
         uv_px = self.focal_px * ratio + self.centre_px
-        return Prediction(uv_px, self.focal_px[:, None] * slope, depth > 0.0)
+        return PredictedSightings(uv_px, self.focal_px[:, None] * slope, depth > 0.0)
 
     def normal_equations(self, points: Array) -> NormalEquations:
         """Linearise every view at its track's point (M, 3), with Huber's weights."""
@@ -134,7 +134,7 @@ def errors_left_out(observations: Observations, evaluation: Evaluation) -> tuple
     return rows, reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
 
 
-def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> Prediction:
+def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig: StereoRig) -> PredictedSightings:
     """Predict each sighting (N, 3) px of tracks (N,), sorted by track, from the others of its track.
 
     ``T_world_cam`` (N, 4, 4) is the left camera's pose at each sighting. Every track needs at least two

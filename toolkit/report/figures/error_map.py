@@ -36,7 +36,7 @@ from toolkit.report.figures.style import (
 )
 from toolkit.report.figures.view import (
     NOWHERE,
-    Track,
+    PathFromAbove,
     View,
     from_above,
     landmarks_shown,
@@ -56,7 +56,7 @@ class _Coloured(NamedTuple):
     """What a panel shows: where a run went, and what is coloured, at points (n, 2) m by values (n,)."""
 
     run: Run
-    track: Track
+    track: PathFromAbove
     points: Array
     value: Array
 

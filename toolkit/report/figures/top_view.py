@@ -27,7 +27,7 @@ from toolkit.report.figures.style import (
 )
 from toolkit.report.figures.view import (
     NOWHERE,
-    Track,
+    PathFromAbove,
     View,
     from_above,
     landmarks_shown,
@@ -87,7 +87,11 @@ def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
 
 
 def _figure(
-    comparison: Comparison, tracks: dict[str, Track], truth: Track | None, mapper: Run | None, title: str
+    comparison: Comparison,
+    tracks: dict[str, PathFromAbove],
+    truth: PathFromAbove | None,
+    mapper: Run | None,
+    title: str,
 ) -> Figure:
     """Draw tracks over the truth and one run's landmarks, with legend and closer look beside the map."""
     runs = {run.estimator: run for run in comparison.runs if run.estimator in tracks}
@@ -112,7 +116,9 @@ def _figure(
     return figure
 
 
-def _entries(comparison: Comparison, runs: dict[str, Run], truth: Track | None, mapper: Run | None) -> list[Entry]:
+def _entries(
+    comparison: Comparison, runs: dict[str, Run], truth: PathFromAbove | None, mapper: Run | None
+) -> list[Entry]:
     """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
     entries = [] if truth is None else [Entry("truth", (Line2D([], [], color=TRUTH_COLOUR, lw=_TRUTH_WIDTH),))]
     for name, run in runs.items():
@@ -159,7 +165,9 @@ def _places(view: View, entries: int, closer: View | None) -> tuple[Figure, Axes
     )
 
 
-def _draw_tracks(axes: Axes, comparison: Comparison, tracks: dict[str, Track], truth: Track | None) -> None:
+def _draw_tracks(
+    axes: Axes, comparison: Comparison, tracks: dict[str, PathFromAbove], truth: PathFromAbove | None
+) -> None:
     if truth is not None:
         axes.plot(*truth.xy.T, color=TRUTH_COLOUR, linewidth=_TRUTH_WIDTH, zorder=2)
     output = {run.estimator: shown_output(run) for run in comparison.runs}

@@ -45,7 +45,7 @@ class View(NamedTuple):
         axes.set_aspect("equal", adjustable="box")
 
 
-class Track(NamedTuple):
+class PathFromAbove(NamedTuple):
     """Positions from above (N, 2) m at stamps (N,)."""
 
     t_ns: IntArray
@@ -60,18 +60,18 @@ def from_above(comparison: Comparison, run: Run, points_world: Array) -> Array:
     return above
 
 
-def track_of(comparison: Comparison, run: Run) -> Track:
+def track_of(comparison: Comparison, run: Run) -> PathFromAbove:
     """Return a run's last word from above, without poses that are not finite; the run must have a trajectory."""
     trajectory = run.trajectory(shown_output(run))
     assert trajectory is not None, "only runs with a trajectory are drawn"
     finite = np.isfinite(trajectory.positions).all(axis=1)
-    return Track(trajectory.t_ns[finite], from_above(comparison, run, trajectory.positions))
+    return PathFromAbove(trajectory.t_ns[finite], from_above(comparison, run, trajectory.positions))
 
 
-def true_track(comparison: Comparison) -> Track | None:
+def true_track(comparison: Comparison) -> PathFromAbove | None:
     """Return the truth from above while the camera ran, or None."""
     truth = truth_during(comparison.sequence)
-    return None if truth is None else Track(truth.t_ns, truth.T_world_imu[:, :2, 3])
+    return None if truth is None else PathFromAbove(truth.t_ns, truth.T_world_imu[:, :2, 3])
 
 
 def landmarks_shown(points: Array) -> Array:
@@ -82,7 +82,7 @@ def landmarks_shown(points: Array) -> Array:
     return corners
 
 
-def view_of(tracks: Sequence[Track], landmarks: Array) -> View:
+def view_of(tracks: Sequence[PathFromAbove], landmarks: Array) -> View:
     """Return the view of all of the tracks and of landmarks (M, 2) near them."""
     track = np.vstack([NOWHERE, *(one.xy for one in tracks)])
     if not track.size:
@@ -94,7 +94,7 @@ def view_of(tracks: Sequence[Track], landmarks: Array) -> View:
     return View(low - margin, high + margin)
 
 
-def where_tracks_coincide(tracks: Sequence[Track], view: View, at_ns: IntArray) -> View | None:
+def where_tracks_coincide(tracks: Sequence[PathFromAbove], view: View, at_ns: IntArray) -> View | None:
     """Return a square around the place to look closer at: where most tracks are one line, and differ most in it.
 
     Returns None where no two of them ever are.
@@ -116,7 +116,7 @@ def where_tracks_coincide(tracks: Sequence[Track], view: View, at_ns: IntArray) 
     return View(centre - half, centre + half)
 
 
-def _at(track: Track, at_ns: IntArray) -> Array:
+def _at(track: PathFromAbove, at_ns: IntArray) -> Array:
     """Return the positions (K, 2) at stamps, between those of a track; NaN outside."""
     given = [np.interp(at_ns, track.t_ns, component, left=np.nan, right=np.nan) for component in track.xy.T]
     return np.stack(given, axis=1)

@@ -15,7 +15,7 @@ from msgspec.structs import asdict
 from toolkit.geometry import Array
 from toolkit.metrics import known_metrics
 from toolkit.report.html.highlights import highlights
-from toolkit.report.html.run_files import RunFiles, SeedsFiles, Track
+from toolkit.report.html.run_files import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.html.thinning import (
     MOST_LANDMARKS,
     MOST_OF_COMPONENTS,
@@ -153,8 +153,8 @@ def _rows_of(estimator: str, rows: list[Json]) -> list[str]:
     return [row["id"] for row in rows if row["estimator"] == estimator]
 
 
-def _aligned(track: Track, drawn: DrawnRun) -> Track:
-    return Track(track.t_s, _moved(track.positions, drawn))
+def _aligned(track: DrawnPath, drawn: DrawnRun) -> DrawnPath:
+    return DrawnPath(track.t_s, _moved(track.positions, drawn))
 
 
 def _moved(points: Array, drawn: DrawnRun) -> Array:
@@ -162,7 +162,7 @@ def _moved(points: Array, drawn: DrawnRun) -> Array:
     return moved
 
 
-def _drawn(track: Track) -> Json:
+def _drawn(track: DrawnPath) -> Json:
     kept = evenly(track.t_s.size, MOST_POSES)
     return {"t_s": [round(t, 4) for t in track.t_s[kept].tolist()], **coordinates(track.positions[kept])}
 

@@ -33,7 +33,7 @@ _Rows = list[tuple[str, Output]]
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class DrawnPath:
     """Positions (N, 3) m in their own world at times (N,) s from the first frame."""
 
     t_s: Array
@@ -48,7 +48,7 @@ class RunFiles:
     scores: Metrics
     report: Report
     manifest: Manifest
-    tracks: dict[str, Track]
+    tracks: dict[str, DrawnPath]
     landmarks: dict[str, Array]
     images: dict[str, bytes]
 
@@ -115,9 +115,9 @@ def _check_same_runs(directory: Path, name: str, scored: _Rows, drawn: _Rows) ->
         raise DataError(f"{directory}: {REPORT} does not have the runs of {name}; repeat the comparison")
 
 
-def _track(path: Path, start_ns: int) -> Track:
+def _track(path: Path, start_ns: int) -> DrawnPath:
     table = _numbers(path, _TUM_COLUMNS, None)
-    return Track(table[:, 0] - start_ns / NS_PER_S, table[:, 1:4])
+    return DrawnPath(table[:, 0] - start_ns / NS_PER_S, table[:, 1:4])
 
 
 def _landmarks(path: Path) -> Array:
