@@ -20,8 +20,8 @@ from toolkit.report.curves import (
     alignment_words,
     components,
     error_curves,
-    shown_output,
     onto_truth,
+    shown_output,
     truth_during,
 )
 from toolkit.report.messages import (

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array, IntArray
-from toolkit.report.curves import shown_output, onto_truth, truth_during
+from toolkit.report.curves import onto_truth, shown_output, truth_during
 
 _LANDMARK_QUANTILES = (0.02, 0.98)
 _MARGIN = 0.05
