@@ -17,9 +17,9 @@ from toolkit.metrics import Scores
 from toolkit.report.html import SCRIPTS, json_in_html, page_text, write_html
 from toolkit.report.html.highlights import highlights
 from toolkit.report.html.payload import payload_of
-from toolkit.report.html.run_files import read_run
 from toolkit.report.html.thinning import evenly, running_median, with_peaks
 from toolkit.report.run_directory import MadeBy, write_run
+from toolkit.report.run_files import read_run
 
 Json = dict[str, Any]
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

@@ -14,8 +14,8 @@ from toolkit.errors import DataError
 from toolkit.gate import baseline_file, trajectory_baseline
 from toolkit.metrics import describe
 from toolkit.report.records import read_check
-from toolkit.report.records.schemas import RECORDS, schema_files
 from toolkit.report.records.scores import PROMISED_KEYS
+from toolkit.report.schemas import RECORDS, schema_files
 
 Document = dict[str, Any]
 
@@ -123,7 +123,7 @@ def test_a_document_cut_anywhere_is_told(name: str, tmp_path: Path) -> None:
 
 
 def test_the_published_schemas_are_those_of_the_records() -> None:
-    told = "docs/schemas differs from the records: python -m toolkit.report.records.schemas docs/schemas renews it"
+    told = "docs/schemas differs from the records: python -m toolkit.report.schemas docs/schemas renews it"
     assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), told
 
 

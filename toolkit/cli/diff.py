@@ -41,8 +41,8 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.metrics import known_metrics, metrics_called
     from toolkit.report.diff_text import diff_document, diff_text
     from toolkit.report.differences import differences
-    from toolkit.report.html.run_files import read_run
     from toolkit.report.prose import width_of_output
+    from toolkit.report.run_files import read_run
 
     try:
         columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)

@@ -51,7 +51,7 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.report.bundle import unpack_bundle
     from toolkit.report.diff_text import diff_document
     from toolkit.report.differences import differences
-    from toolkit.report.html.run_files import read_run
+    from toolkit.report.run_files import read_run
 
     with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
         there = Path(folder) / "there"

@@ -19,8 +19,8 @@ from toolkit.errors import DataError
 from toolkit.experiment.outcome_store import OUTCOMES
 from toolkit.files import replaced_file
 from toolkit.inputs import open_input
-from toolkit.report.html.run_files import RunFiles, SeedsFiles, read_run
 from toolkit.report.run_directory import MANIFEST
+from toolkit.report.run_files import RunFiles, SeedsFiles, read_run
 
 BUNDLE, LOCK = "bundle.json", "requirements.txt"
 _NEVER_IN = ("figures/",)

@@ -17,7 +17,7 @@ from toolkit.gate.baseline import Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
-from toolkit.report.html.run_files import RunFiles, SeedsFiles
+from toolkit.report.run_files import RunFiles, SeedsFiles
 
 Files = RunFiles | SeedsFiles
 FALSE_ALARM_RATE = 0.05

@@ -6,8 +6,8 @@ from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
 from toolkit.files import replaced_file
-from toolkit.report.html.run_files import SeedsFiles, read_run
 from toolkit.report.records import Report
+from toolkit.report.run_files import SeedsFiles, read_run
 
 TRUTH = "truth"
 

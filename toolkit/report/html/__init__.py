@@ -1,8 +1,8 @@
 """The report as one HTML file that opens from disk: what run directories hold, laid side by side.
 
-Reading order: run_files (what is read) -> payload (what is shown of it) -> :func:`page_text` (how it becomes one file,
-of page.html, style.css and the scripts in ``scripts``): nothing is fetched, and no text of a recording is code. Beside
-it: leaderboard, the page of an evaluation.
+Reading order: payload (what is shown of what :mod:`toolkit.report.run_files` reads) -> :func:`page_text` (one file made
+of page.html, style.css and the scripts in ``scripts``): nothing is fetched, and no text of a recording is code.
+Beside it: leaderboard, the page of an evaluation.
 """
 
 import html
@@ -50,7 +50,7 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     """
     # Here, because pages of other systems' trajectories are made without what reads a run directory.
     from toolkit.report.html.payload import payload_of
-    from toolkit.report.html.run_files import read_run
+    from toolkit.report.run_files import read_run
 
     runs = [read_run(directory) for directory in directories]
     text = page_text(payload_of(runs))

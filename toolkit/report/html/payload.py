@@ -15,7 +15,6 @@ from msgspec.structs import asdict
 from toolkit.geometry import Array
 from toolkit.metrics import known_metrics
 from toolkit.report.html.highlights import highlights
-from toolkit.report.html.run_files import DrawnPath, RunFiles, SeedsFiles
 from toolkit.report.html.thinning import (
     MOST_LANDMARKS,
     MOST_OF_COMPONENTS,
@@ -27,6 +26,7 @@ from toolkit.report.html.thinning import (
 )
 from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.records.scores import Judged, RunOverSeeds
+from toolkit.report.run_files import DrawnPath, RunFiles, SeedsFiles
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles

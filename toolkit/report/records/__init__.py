@@ -1,8 +1,8 @@
 """The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
-Reading order: scores (one run of each estimator, or many), report (what the figures draw), card (what
-the tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
-:mod:`toolkit.report.records.schemas` writes docs/schemas.
+Reading order: scores (one run of each estimator, or many), report (what the figures draw), card (what the
+tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
+:mod:`toolkit.report.schemas` writes docs/schemas.
 """
 
 from pathlib import Path

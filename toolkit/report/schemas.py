@@ -1,4 +1,4 @@
-"""The JSON schemas of all documents as files: ``python -m toolkit.report.records.schemas docs/schemas``."""
+"""The JSON schemas of all documents as files: ``python -m toolkit.report.schemas docs/schemas``."""
 
 import json
 import sys
