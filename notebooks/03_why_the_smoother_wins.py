@@ -192,7 +192,7 @@ for part, px in (("white", card.noise.white_px), ("walk", card.noise.walk_px), (
 # %% [markdown]
 # Each channel (c mean column, d disparity, v row) walks about a tenth of a pixel a frame, and nothing of it is white.
 #
-# An estimator that is told white noise takes the twentieth sighting of a track for as much news as the second. But
+# An estimator told white noise takes the twentieth sighting of a track for as much information as the second. But
 # most of it is the error of the one before, once more. It averages what does not average out: its answer is worse than
 # it could be, and its covariance shrinks faster than its error. The smoother believes in *all* sightings at once, so
 # **it suffers most**; a filter that forgets is spared a part.

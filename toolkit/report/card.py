@@ -63,8 +63,8 @@ def _noise(card: Card) -> str:
         f"errors of a track are correlated: {' and '.join(parts)}, beside white noise of "
         f"{_channels(card.noise.white_px)} (correlation from frame to frame {lags}; {card.gain:.1f} +- "
         f"{card.gain_error:.1f} in log-likelihood a track better than white). Told white noise, an estimator takes "
-        "every further sighting of a track for news, a smoother most of all: it is too sure of itself and need not "
-        "win; noise.tracks=fitted tells it"
+        "every further sighting of a track for new information, a smoother most of all: it is too sure of itself "
+        "and need not win; noise.tracks=fitted tells it"
     )
 
 
