@@ -51,6 +51,35 @@ def add_to(subcommands: Subcommands) -> None:
         "run directory with report, metrics, trajectories, landmarks and figures.",
         epilog=epilog("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive"),
     )
+    _add_what_to_compare(parser)
+    add_part_arguments(parser)
+    add_repair_arguments(parser)
+    parser.add_argument(
+        "--start",
+        choices=("measurements", "truth"),
+        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
+    )
+    add_tracks_argument(parser)
+    _add_seeds(parser)
+    parser.add_argument(
+        "--columns",
+        metavar="NAME,...",
+        type=names,
+        default=(),
+        help="of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
+    )
+    add_settings_arguments(parser)
+    add_workers_argument(parser)
+    _add_what_is_shown(parser)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+    )
+    parser.set_defaults(command=command)
+
+
+def _add_what_to_compare(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "sequences",
         metavar="SEQUENCE",
@@ -75,14 +104,9 @@ def add_to(subcommands: Subcommands) -> None:
         help="run directory (default: runs/<date and time>); with --seeds every run is kept there as it ends, and the "
         "same command continues where it stopped",
     )
-    add_part_arguments(parser)
-    add_repair_arguments(parser)
-    parser.add_argument(
-        "--start",
-        choices=("measurements", "truth"),
-        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
-    )
-    add_tracks_argument(parser)
+
+
+def _add_seeds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", metavar="N", type=at_least(0), help="of simulated sequences (default: 0)")
     parser.add_argument(
         "--seeds", metavar="N", type=at_least(1), help="repeat simulated sequences over N seeds, from --seed"
@@ -98,15 +122,9 @@ def add_to(subcommands: Subcommands) -> None:
         default=None,
         help="with --seeds, write the trajectories of every seed (of a single one they always are)",
     )
-    parser.add_argument(
-        "--columns",
-        metavar="NAME,...",
-        type=names,
-        default=(),
-        help="of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
-    )
-    add_settings_arguments(parser)
-    add_workers_argument(parser)
+
+
+def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--figures",
         choices=("few", "all", "none"),
@@ -124,12 +142,6 @@ def add_to(subcommands: Subcommands) -> None:
         "--json", action="store_true", help="print what metrics.json or seeds.json holds, a line a SEQUENCE, no table"
     )
     printed.add_argument("--quiet", action="store_true", help="print nothing; the run directory has everything")
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
-    )
-    parser.set_defaults(command=command)
 
 
 def command(options: argparse.Namespace) -> int:
