@@ -130,7 +130,7 @@ def test_processes_equal_one_process_bit_for_bit(units: Units) -> None:
 
 
 def _assert_equal(one: Outcome, other: Outcome) -> None:
-    for name in ("seed", "estimator", "status", "log", "sequence_hash", "final_is_causal"):
+    for name in ("seed", "estimator", "status", "log", "arithmetic", "sequence_hash", "final_is_causal"):
         assert getattr(one, name) == getattr(other, name)
     assert one.outputs.keys() == other.outputs.keys() != set()
     for output, scored in one.outputs.items():
