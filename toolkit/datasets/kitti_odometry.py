@@ -30,6 +30,8 @@ NO_MOTION = "no motion input: all estimators assume a motion that is smooth, and
 # Grey or colour, and the rows of calib.txt that are theirs.
 _FOLDERS = (("image_0", "image_1", 0), ("image_2", "image_3", 2), ("image_l", "image_r", 0))
 _PERIOD_S = 0.1
+# No camera's axis meets its image this near the border: calib.txt is of larger images than these.
+_BORDER = 0.1
 # Axes right, down, forward of a camera, from forward, left, up.
 T_FLU_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 
@@ -104,11 +106,22 @@ def _pair(layout: _Layout) -> RectifiedPair:
         raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
     fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
     size_px = size_of(_first_readable(layout))
+    if not all(_BORDER < c / size < 1.0 - _BORDER for c, size in zip((cx_px, cy_px), size_px, strict=True)):
+        raise DataError(
+            f"{layout.root / 'calib.txt'}: its principal point, {cx_px:g} {cy_px:g}, is not that of images of "
+            f"{size_px[0]}x{size_px[1]} px; where these were scaled or cut, do the same to P0 to P3"
+        )
     return already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
 
 
 def _listed(layout: _Layout, stamps: IntArray) -> Listed:
     listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
+    if not listed.pairs:
+        numbers = _numbers(layout) or [0]
+        raise DataError(
+            f"{layout.root}: no image has a stamp: they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has "
+            f"{stamps.size}, from number 0 on; cut both or neither"
+        )
     check_frame_count(layout.root, len(listed.pairs))
     return listed
 
@@ -165,14 +178,23 @@ def _stamps(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:
     """Return the stamp (N,) of each image number, and what must be known of them."""
     file = layout.root / "times.txt"
     if not is_regular(file):
-        last = max((int(p.stem) for p in images_in(layout.left) if p.stem.isdecimal()), default=-1)
         period_ns = round(_PERIOD_S * 1e9)
-        return period_ns * np.arange(last + 1), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
+        return period_ns * np.arange(_count(layout)), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
     try:
         seconds = np.array([float(word) for word in read_text_input(file, "times.txt is text").split()])
     except ValueError as error:
         raise DataError(f"{file}: {error}; expected seconds, one a line") from error
     return stamps_ns(file, "stamp", seconds), ()
+
+
+def _numbers(layout: _Layout) -> list[int]:
+    """Return the numbers of the left images, in order."""
+    return sorted(int(path.stem) for path in images_in(layout.left) if path.stem.isdecimal())
+
+
+def _count(layout: _Layout) -> int:
+    """Return how many images the sequence has, by the last number, for some may be missing."""
+    return max(_numbers(layout), default=-1) + 1
 
 
 def _truth(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
@@ -182,8 +204,8 @@ def _truth(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
     if file is None:
         return None
     T_world_cam = read_poses(file).T_world_imu
-    if len(T_world_cam) != stamps.size:
+    if len(T_world_cam) not in (stamps.size, _count(layout)):
         raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence")
     T_cam_flu = np.linalg.inv(T_FLU_CAM)
-    used = np.flatnonzero(np.isin(stamps, t_ns))
+    used = np.flatnonzero(np.isin(stamps[: len(T_world_cam)], t_ns))
     return Truth(stamps[used], T_FLU_CAM @ T_world_cam[used] @ T_cam_flu)

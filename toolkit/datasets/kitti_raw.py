@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, observations
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_stamps, rig_of
 from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
 from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, size_of, track_images
+from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, NoSamples, TwistSamples
 from toolkit.models.noise import twist_noise, unmeasured_motion
 from toolkit.progress import SILENT, Progress
@@ -107,7 +108,9 @@ def _whole(path: Path) -> _Layout:
 
 def _listed(layout: _Layout) -> Listed:
     stamps = read_stamps(layout.images(0).parent / "timestamps.txt")
-    listed = pairs_by_name(layout.images(0), layout.images(1), stamps)
+    right = layout.images(1).parent / "timestamps.txt"
+    right_stamps = read_stamps(right) if is_regular(right) else stamps
+    listed = pairs_by_stamps(layout.images(0), layout.images(1), stamps, right_stamps)
     check_frame_count(layout.root, len(listed.pairs))
     return listed
 

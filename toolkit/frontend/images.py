@@ -91,6 +91,8 @@ def _decoded(path: Path) -> npt.NDArray[np.uint8 | np.uint16] | Unusable:
         return Unusable(path, "damaged or truncated")
     import cv2
 
+    # A damaged image is named in the report; OpenCV would complain on the terminal as well.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         raw = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     except cv2.error:

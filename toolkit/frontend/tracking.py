@@ -139,7 +139,10 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
         wanted += as_called.tried
     folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
     if swapped > _MOST_SWAPPED * matched and swapped > _LEAST_MATCHED * wanted:
-        raise DataError(f"{folders}: left and right images are exchanged; exchange the two folders")
+        raise DataError(
+            f"{folders}: left and right images are exchanged; exchange the two folders, or turn the images if all are "
+            "upside down"
+        )
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "

@@ -16,13 +16,15 @@ from toolkit.datasets.io.truth_file import load_truth
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
 
 # Long enough that the noise of single truth poses hardly counts, short enough that the gyro's mean is the rotation.
 _STEP_NS = NS_PER_S // 10
+# Poses about a step that are further apart do not tell its rotation.
+_MOST_STEPS = 5
 _AXES = "xyz"
 # Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
 _HEADINGS = (
@@ -123,10 +125,20 @@ def rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
     at_ns = np.arange(first, last + 1, _STEP_NS, dtype=np.int64)
     if at_ns.size < 3:
         return float("inf")
+    known = _without_gap(truth.t_ns, at_ns)
+    if not known.any():
+        return float("inf")
     R_world_imu = interpolate_poses(truth.t_ns, truth.T_world_imu, at_ns)[:, :3, :3]
     steps = so3_log(np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:])
-    off = steps * (NS_PER_S / _STEP_NS) - _mean_rates(sample_t_ns, gyro_radps, at_ns)
+    off = (steps * (NS_PER_S / _STEP_NS) - _mean_rates(sample_t_ns, gyro_radps, at_ns))[known]
     return float(np.sqrt(((off - np.median(off, axis=0)) ** 2).mean()))
+
+
+def _without_gap(t_ns: IntArray, at_ns: IntArray) -> BoolArray:
+    """Say of each step (N - 1,) between instants (N,) whether poses stand close about it: some have gaps of minutes."""
+    before = t_ns[np.searchsorted(t_ns, at_ns[:-1], side="right") - 1]
+    after = t_ns[np.minimum(np.searchsorted(t_ns, at_ns[1:]), t_ns.size - 1)]
+    return np.asarray(after - before <= _MOST_STEPS * _STEP_NS)
 
 
 def _usable(imu: ImuSamples) -> tuple[IntArray, Array]:

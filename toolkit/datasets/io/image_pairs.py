@@ -90,6 +90,33 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     return Listed(tuple(pairs), len(numbers), tuple(remarks))
 
 
+def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> Listed:
+    """Pair images whose names are numbers and whose stamps, by number, are the nearest.
+
+    Where one camera has dropped an image the other has, numbers no longer tell what belongs together. A stamp of the
+    right camera that is missing leaves its image to the left one of the same number.
+    """
+    partner = _partners(t_ns, {number: right_t_ns.get(number, stamp) for number, stamp in t_ns.items()} | right_t_ns)
+    if all(number == other for number, other in partner.items()):
+        return pairs_by_name(left, right, t_ns)
+    lefts, rights = ({int(p.stem): p for p in images_in(side) if p.stem.isdecimal()} for side in (left, right))
+    paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
+    remarks = ["the cameras' images are numbered differently and paired by their stamps"]
+    if len(paired) < len(lefts):
+        remarks.append(f"{len(lefts) - len(paired)} left images have no right one of the same time and are left out")
+    pairs = tuple(StampedPair(stamp, path, rights.get(other, right / path.name)) for stamp, path, other in paired)
+    return Listed(pairs, len(lefts), tuple(remarks))
+
+
+def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:
+    """Return the number of the right stamp nearest to each left one, by number; none beyond half an interval."""
+    numbers, stamps = (np.array(list(items), dtype=np.int64) for items in (right_t_ns.keys(), right_t_ns.values()))
+    asked = np.array(sorted(t_ns.values()), dtype=np.int64)
+    reach_ns = 0.5 * float(np.median(np.diff(asked))) if asked.size > 1 else np.inf
+    off_ns = {number: np.abs(stamps - stamp) for number, stamp in t_ns.items()}
+    return {number: int(numbers[off.argmin()]) for number, off in off_ns.items() if off.min() <= reach_ns}
+
+
 def rig_of(pair: RectifiedPair, T_imu_left: Array) -> StereoRig:
     """Return the rig of rectified images; ``T_imu_left`` (4, 4) is where the left camera is mounted."""
     T_imu_rect = T_imu_left.copy()
@@ -131,8 +158,10 @@ def _files(folder: Path) -> _Files:
         found = [path for path in images_in(folder / "data") if path.stem.isdigit()]
         t_ns = np.array([int(path.stem[:19]) for path in found], dtype=np.int64)
         return _Files(folder, t_ns, tuple(path.name for path in found))
-    t_ns = read_stamps(table, header_lines=1)
-    rows = [row for row in read_text_input(table, "copy it again").splitlines()[1:] if row.strip() and row[0] != "#"]
+    lines = read_text_input(table, "copy it again").splitlines()
+    headings = 0 if lines and lines[0][:1].isdigit() else 1
+    t_ns = read_stamps(table, headings)
+    rows = [row for row in lines[headings:] if row.strip() and row[0] != "#"]
     names = tuple(row.partition(",")[2].strip() for row in rows)
     if len(names) != t_ns.size or any("/" in name or "\\" in name for name in names):
         raise DataError(f"{table}: expected a stamp and the name of an image in each row; export it again")
