@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -75,6 +76,17 @@ def test_poses_of_the_download_are_found_beside_the_sequences(drive: Path, tmp_p
     assert load_sequence(str(root)).truth is not None
 
 
+@pytest.mark.parametrize("stamps", [FRAMES - 3, FRAMES + 4])
+def test_poses_of_all_images_serve_where_there_are_fewer_or_more_stamps(drive: Path, stamps: int) -> None:
+    (drive / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(stamps)))
+    sequence = load_sequence(str(drive))
+    used = min(stamps, FRAMES)
+    assert sequence.frame_count == used
+    assert sequence.truth is not None
+    np.testing.assert_array_equal(sequence.truth.t_ns, sequence.frames_t_ns)
+    np.testing.assert_allclose(sequence.truth.T_world_imu[:, 0, 3], STEP_M * np.arange(used), atol=1e-9)
+
+
 def test_what_is_not_there_is_assumed_and_said_or_left_out(drive: Path) -> None:
     (drive / "times.txt").unlink()
     (drive / "poses.txt").unlink()
@@ -92,6 +104,18 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
+def renumber(drive: Path, first: int) -> None:
+    for path in sorted(drive.glob("image_?/*.png"), reverse=True):
+        path.rename(path.with_name(f"{first + int(path.stem):06d}.png"))
+
+
+def halve(drive: Path) -> None:
+    for path in drive.glob("image_?/*.png"):
+        image = cv2.imread(str(path))
+        assert image is not None
+        cv2.imwrite(str(path), image[::2, ::2])
+
+
 BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: cannot be read"),
     ("no P1", lambda d: edit(d / "calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
@@ -102,7 +126,9 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("few poses", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 8 images"),
     ("poses cut", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1"), "poses.txt"),
     ("times", lambda d: (d / "times.txt").write_text("0 0.1 x"), "times.txt: could not convert"),
-    ("no times", lambda d: (d / "times.txt").write_text(""), "0 frame"),
+    ("no times", lambda d: (d / "times.txt").write_text(""), "numbered 0 to 7, and times.txt has 0"),
+    ("numbered from 50", lambda d: renumber(d, 50), "numbered 50 to 57, and times.txt has 8"),
+    ("images halved", halve, "principal point, 160 100, is not that of images of 160x100 px"),
     ("no right images", lambda d: shutil.rmtree(d / "image_1"), "8 of 8 image pairs cannot be used"),
     (
         "exchanged",

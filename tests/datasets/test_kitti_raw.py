@@ -153,6 +153,21 @@ def test_packets_out_of_order_are_for_the_audit(drive: Path) -> None:
     assert (np.diff(prepared.sequence.motion.t_ns) > 0).all()
 
 
+def test_images_of_a_camera_that_dropped_one_are_paired_by_their_stamps(drive: Path) -> None:
+    before = load_sequence(str(drive))
+    right = drive / "image_01"
+    stamps = (right / "timestamps.txt").read_text().splitlines(keepends=True)
+    (right / "timestamps.txt").write_text("".join(stamps[:2] + stamps[3:]))
+    names = sorted((right / "data").iterdir())
+    names[2].unlink()
+    for path, name in zip(names[3:], names[2:], strict=False):
+        path.rename(name)
+    sequence = load_sequence(str(drive))
+    assert sequence.frames_t_ns.tolist() == [*before.frames_t_ns[:2].tolist(), *before.frames_t_ns[3:].tolist()]
+    assert any("paired by their stamps" in fact for fact in sequence.provenance.facts)
+    assert any("1 left images have no right one" in fact for fact in sequence.provenance.facts)
+
+
 def edit(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text

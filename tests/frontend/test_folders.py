@@ -191,6 +191,7 @@ USED: list[tuple[str, Callable[[Path], object]]] = [
     ("8 against 16 bit", lambda d: every(d, 1, lambda i: i.astype(np.uint16) * 256)),
     ("rows backwards", lambda d: [reverse_rows(d / f"mav0/cam{c}/data.csv") for c in (0, 1)]),
     ("no table", lambda d: [(d / f"mav0/cam{c}/data.csv").unlink() for c in (0, 1)]),
+    ("no headings", lambda d: [edit(d / f"mav0/cam{c}/data.csv", "#timestamp [ns],filename\n", "") for c in (0, 1)]),
     ("crlf", lambda d: edit(d / "mav0/cam0/data.csv", "\n", "\r\n")),
 ]
 
@@ -246,7 +247,7 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("no extrinsic", lambda d: edit(d / YAML.format(1), "T_BS", "T_SB"), "T_BS"),
     ("one turned", lambda d: turn_extrinsic(d / YAML.format(1)), "deg apart|not to the right of cam0"),
     ("empty imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").write_text("%YAML:1.0\n"), "imu0/sensor.yaml"),
-    ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "0 frame"),
+    ("other clock", lambda d: edit(d / "mav0/imu0/data.csv", "1403715", "1303715"), "two clocks"),
     ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
     ("stamps in seconds", lambda d: edit(d / "mav0/cam0/data.csv", "\n14", "\n1.4"), "not in whole nanoseconds"),
     ("wrong tilt", lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),

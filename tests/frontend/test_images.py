@@ -51,6 +51,17 @@ def test_what_cannot_be_used_says_why(
         assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize("suffix", [".pgm", ".bmp", ".tiff"])
+def test_a_truncated_image_of_any_kind_is_named_and_the_decoder_says_nothing(
+    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"1{suffix}"
+    cv2.imwrite(str(path), GREY)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert "damaged or truncated" in reason(path)
+    assert capfd.readouterr().err == ""
+
+
 def test_colour_becomes_brightness(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "c.png"), cv2.merge([GREY, GREY, GREY]))
     np.testing.assert_array_equal(read_image(tmp_path / "c.png", 8), GREY)

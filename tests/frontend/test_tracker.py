@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -38,6 +39,41 @@ def test_disparities_and_rows_are_those_of_the_scene_through_every_lens(filmed: 
         assert np.median(off_px(filmed, seen, k)) < 0.1
         assert np.percentile(off_px(filmed, seen, k), 95) < 0.4
         assert np.abs(seen.corners_px[:, 1] - seen.corners_px[:, 3]).mean() < 0.1
+
+
+def slanted() -> tuple[Any, Any]:
+    """Return both images of a surface whose disparity falls by 0.25 px a column."""
+    texture = cv2.GaussianBlur(np.random.default_rng(4).normal(125.0, 250.0, (300, 900)), (0, 0), 2.5)
+    columns, rows = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
+    # uR = uL - disparity(uL) = 1.25 uL - 80
+    of_left = (columns + 80.0) / 1.25
+    sides = (columns, of_left.astype(np.float32))
+    images = (cv2.remap(texture, u + np.float32(300.0), rows + 30, cv2.INTER_CUBIC) for u in sides)
+    left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in images)
+    return left, right
+
+
+def test_disparities_of_a_slanted_surface_are_its_own(plain: Filmed) -> None:
+    """What is compressed on one side and not on the other: a window that only shifts is off by 0.16 px."""
+    tracker = Tracker(plain.rig, DEFAULTS.frontend)
+    for _ in range(2):
+        seen = tracker.step(*slanted())
+        assert seen is not None
+        assert len(seen.track_ids) > 60
+        off = seen.corners_px[:, 2] - (1.25 * seen.corners_px[:, 0] - 80.0)
+        # of images rounded to grey values
+        assert np.median(np.abs(off)) < 0.03
+        assert np.percentile(np.abs(off), 95) < 0.15
+
+
+def test_a_right_image_that_does_not_show_the_first_patch_ends_the_track(plain: Filmed, papered: Filmed) -> None:
+    as_before, other = (Tracker(plain.rig, DEFAULTS.frontend) for _ in range(2))
+    for one in (as_before, other):
+        one.step(*plain.images[0])
+    kept = as_before.step(*plain.images[1])
+    faded = other.step(plain.images[1][0], papered.images[4][1])
+    assert kept is not None
+    assert faded is None or np.isin(kept.track_ids, faded.track_ids).sum() < 0.7 * len(kept.track_ids)
 
 
 def test_a_track_stays_on_its_point_of_the_scene(filmed: Filmed) -> None:

@@ -1,11 +1,11 @@
 """Stereo tracks from one rectified pair of images to the next: follow, verify, begin anew where there is room.
 
 A corner is matched along its row at birth; from then on it is followed in time in the left image and from left to
-right. It ends, and its id with it, where one of the tests says that it is no longer the same point of the scene: KLT
+right, and measured in both where its first patch fits. It ends, and its id with it, where one of the tests says that it is no longer the same point of the scene: KLT
 there and back, the motion most tracks agree on (RANSAC), the first patch, the row and the sign of the disparity.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -38,15 +38,21 @@ class Sightings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """Tracks as the last pair has them: ids (N,), places left and right (N, 2) px, and their first patches."""
+    """Tracks as the last pair has them: ids (N,), places left and right (N, 2) px, and their first patches.
+
+    ``right_warps`` (N, 2, 2) are those that fit the first patches into the right image.
+    """
 
     ids: IntArray
     left_px: Array
     right_px: Array
     patches: Patches
+    right_warps: Array
 
     def select(self, rows: BoolArray | IntArray) -> "_Tracks":
-        return _Tracks(self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows))
+        return _Tracks(
+            self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows), self.right_warps[rows]
+        )
 
     def joined(self, others: "_Tracks") -> "_Tracks":
         return _Tracks(
@@ -54,10 +60,13 @@ class _Tracks:
             np.concatenate([self.left_px, others.left_px]),
             np.concatenate([self.right_px, others.right_px]),
             self.patches.joined(others.patches),
+            np.concatenate([self.right_warps, others.right_warps]),
         )
 
 
-_NO_TRACKS = _Tracks(np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2)), Patches.none())
+_NO_TRACKS = _Tracks(
+    np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2)), Patches.none(), np.empty((0, 2, 2))
+)
 
 
 @dataclass(eq=False)
@@ -85,15 +94,15 @@ class Tracker:
 
         Return None, and stay at the pair before, where the right image is not of the same instant as the left one.
         """
-        floats = as_floats(left)
+        floats, right_floats = as_floats(left), as_floats(right)
         found, motion = self._followed(left, floats)
-        paired = self._paired(left, right, found)
+        paired = self._fitted_right(right_floats, self._paired(left, right, found))
         agrees = motion.agrees(paired.left_px, paired.right_px, paired.ids)
         if len(found.ids) >= _FEWEST_TO_JUDGE and agrees.sum() < _LEAST_PAIRED * len(found.ids):
             return None
         self._motion = motion
         tracks = paired.select(agrees)
-        tracks = tracks.joined(self._begun(left, right, floats, tracks))
+        tracks = tracks.joined(self._fitted_right(right_floats, self._begun(left, right, floats, tracks)))
         self._motion = self._motion.at(tracks.left_px, tracks.right_px, tracks.ids)
         self._tracks, self._before = tracks, left
         return Sightings(tracks.ids, np.hstack([tracks.left_px, tracks.right_px]))
@@ -115,12 +124,27 @@ class Tracker:
         # Where the first patch fits is where the track is: KLT's small errors, added up, would walk away from it.
         rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
         shift_px = here_px - before.left_px[rows]
-        return _Tracks(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches), motion
+        right_warps = before.right_warps[rows] @ np.linalg.inv(before.patches.warps[rows]) @ patches.warps
+        return _Tracks(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches, right_warps), motion
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
         """Return the tracks found in the right image, near where they are in ``right_px``."""
         right_px, found = self._found_right(left, right, tracks.left_px, tracks.right_px)
-        return _Tracks(tracks.ids, tracks.left_px, right_px, tracks.patches).select(found)
+        return replace(tracks, right_px=right_px).select(found)
+
+    def _fitted_right(self, right: Array, tracks: _Tracks) -> _Tracks:
+        """Return the tracks measured in the right image where their first patches fit it, without those that do not.
+
+        What is seen from the left is seen from aside on the right: without the warp slanted surfaces bias the disparity.
+        """
+        patches, fitted_px, correlation = replace(tracks.patches, warps=tracks.right_warps).fitted(
+            right, tracks.right_px
+        )
+        off_px = np.linalg.norm(fitted_px - tracks.right_px, axis=1)
+        same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
+        same &= np.abs(tracks.left_px[:, 1] - fitted_px[:, 1]) < self.settings.epipolar_px
+        same &= (tracks.left_px[:, 0] - fitted_px[:, 0] > _LEAST_DISPARITY_PX) & self._inside(fitted_px, 1)
+        return replace(tracks, right_px=fitted_px, right_warps=patches.warps).select(same)
 
     def _found_right(self, left: Image, right: Image, left_px: Array, near_px: Array) -> tuple[Array, BoolArray]:
         """Return where points (N, 2) of the left image are in the right one, sought near (N, 2), and if found (N,)."""
@@ -151,7 +175,8 @@ class Tracker:
         begun_px, right_px = places_px[found][:wanted], right_px[paired][:wanted]
         new_ids = self._next_id + np.arange(len(begun_px))
         self._next_id += len(begun_px)
-        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px))
+        identities = np.tile(np.eye(2), (len(begun_px), 1, 1))
+        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px), identities)
 
     def _free(self, taken_px: Array) -> BoolArray:
         """Return for each pixel whether a track may begin there."""

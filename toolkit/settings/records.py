@@ -237,7 +237,7 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
     levels: Annotated[int, Meta(ge=0, le=8, description="halvings of the image in KLT's pyramid")] = 3
     nearest_m: Annotated[
         float, Meta(gt=0.0, le=100.0, description="depth of the nearest point looked for", extra={"unit": "m"})
-    ] = 0.5
+    ] = 0.25
     forward_backward_px: Annotated[
         float,
         Meta(
