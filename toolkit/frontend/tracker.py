@@ -1,8 +1,9 @@
 """Stereo tracks from one rectified pair of images to the next: follow, verify, begin anew where there is room.
 
 A corner is matched along its row at birth; from then on it is followed in time in the left image and from left to
-right, and measured in both where its first patch fits. It ends, and its id with it, where one of the tests says that it is no longer the same point of the scene: KLT
-there and back, the motion most tracks agree on (RANSAC), the first patch, the row and the sign of the disparity.
+right, and measured in both where its first patch fits. It ends, and its id with it, where one of the tests says that
+it is no longer the same point of the scene: KLT there and back, the motion most tracks agree on (RANSAC), the first
+patch, the row and the sign of the disparity.
 """
 
 from dataclasses import dataclass, field, replace
@@ -135,11 +136,10 @@ class Tracker:
     def _fitted_right(self, right: Array, tracks: _Tracks) -> _Tracks:
         """Return the tracks measured in the right image where their first patches fit it, without those that do not.
 
-        What is seen from the left is seen from aside on the right: without the warp slanted surfaces bias the disparity.
+        The right camera sees a slanted surface under another angle: a window that only shifts would bias its disparity.
         """
-        patches, fitted_px, correlation = replace(tracks.patches, warps=tracks.right_warps).fitted(
-            right, tracks.right_px
-        )
+        as_seen = replace(tracks.patches, warps=tracks.right_warps)
+        patches, fitted_px, correlation = as_seen.fitted(right, tracks.right_px)
         off_px = np.linalg.norm(fitted_px - tracks.right_px, axis=1)
         same = (off_px < self.settings.patch_px) & (correlation > self.settings.patch_correlation)
         same &= np.abs(tracks.left_px[:, 1] - fitted_px[:, 1]) < self.settings.epipolar_px

@@ -96,7 +96,7 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     Where one camera has dropped an image the other has, numbers no longer tell what belongs together. A stamp of the
     right camera that is missing leaves its image to the left one of the same number.
     """
-    partner = _partners(t_ns, {number: right_t_ns.get(number, stamp) for number, stamp in t_ns.items()} | right_t_ns)
+    partner = _partners(t_ns, {**t_ns, **right_t_ns})
     if all(number == other for number, other in partner.items()):
         return pairs_by_name(left, right, t_ns)
     lefts, rights = ({int(p.stem): p for p in images_in(side) if p.stem.isdecimal()} for side in (left, right))
