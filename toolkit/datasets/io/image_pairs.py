@@ -93,11 +93,13 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
 def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> Listed:
     """Pair images whose names are numbers and whose stamps, by number, are the nearest.
 
-    Where one camera has dropped an image the other has, numbers no longer tell what belongs together. A stamp of the
-    right camera that is missing leaves its image to the left one of the same number.
+    Where one camera has dropped an image the other has, numbers no longer tell what belongs together. Where stamps are
+    out of order they tell it less than the numbers do, as :func:`pairs_by_name`. A stamp of the right camera that is
+    missing leaves its image to the left one of the same number.
     """
     partner = _partners(t_ns, {**t_ns, **right_t_ns})
-    if all(number == other for number, other in partner.items()):
+    in_order = all((np.diff([stamps[n] for n in sorted(stamps)]) > 0).all() for stamps in (t_ns, right_t_ns))
+    if not in_order or all(number == other for number, other in partner.items()):
         return pairs_by_name(left, right, t_ns)
     lefts, rights = ({int(p.stem): p for p in images_in(side) if p.stem.isdecimal()} for side in (left, right))
     paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
