@@ -149,6 +149,11 @@ def test_the_folder_is_the_scenarios_recording(filmed: Path) -> None:
     assert read.provenance.facts[1].startswith("against the rendered scene")
 
 
+def test_simulated_tracks_of_a_rendered_folder_do_not_pass_for_a_real_recording(filmed: Path) -> None:
+    provenance = load_sequence(str(filmed), 0, Frontend(tracks="simulated")).provenance
+    assert "real IMU" not in " ".join([provenance.source, *provenance.facts])
+
+
 def test_errors_against_the_scene_are_those_planted(filmed: Path) -> None:
     read = load_sequence(str(filmed), 0, Frontend(tracks="images"))
     before, seen = errors_px(read), read.observations

@@ -45,6 +45,7 @@ CITES = ("burri2016euroc",)
 REAL = "real IMU, stereo tracks from the images"
 RENDERED = "simulated IMU, stereo tracks from rendered images"
 SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
+ALL_SIMULATED = "simulated IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
@@ -151,7 +152,9 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         observations=tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
         motion=imu,
         provenance=Provenance(
-            "euroc", f"{path}: {SIMULATED}, seed {seed}", (*_facts(choice.reason, calibration), *_few_images(layout))
+            "euroc",
+            f"{path}: {ALL_SIMULATED if is_simulated(layout.root) else SIMULATED}, seed {seed}",
+            (_how_simulated(layout), choice.reason, calibration.source, calibration.noise_source, *_few_images(layout)),
         ),
         truth=truth,
     )
@@ -222,11 +225,8 @@ def _layout(path: Path) -> _Layout | None:
     return _Layout(path, None) if lean else None
 
 
-def _facts(truth_reason: str, calibration: Calibration) -> tuple[str, ...]:
+def _how_simulated(layout: _Layout) -> str:
     tracks = f"{_MAX_TRACKS} a frame, {PIXEL_SIGMA_PX:g} px of noise, landmarks in a room around the trajectory"
-    return (
-        f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU",
-        truth_reason,
-        calibration.source,
-        calibration.noise_source,
-    )
+    if is_simulated(layout.root):
+        return f"{ALL_SIMULATED} ({tracks}): no image was read"
+    return f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU"
