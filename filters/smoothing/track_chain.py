@@ -64,8 +64,8 @@ class ChainedSightings:
     def places(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Return the poses (N, 4, 4) and points (N, 3) m of the sightings."""
         frames, row = np.unique(self.pose, return_inverse=True)
-        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
-        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()])
+        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()]).reshape(-1, 4, 4)
+        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()]).reshape(-1, 3)
         return poses[row], points[self.point]
 
 

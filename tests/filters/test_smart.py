@@ -94,11 +94,13 @@ def test_point_steps_complete_the_step_of_the_whole_system(scene):
     np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
 
 
-def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
+@pytest.mark.parametrize("left_only", [[], [2, 5, 9, 20, 27]], ids=["pairs", "some by the left image alone"])
+def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene, left_only):
     """The one noise GTSAM's factor takes; on exact measurements both linearise at the same point."""
     poses, points, seen = scene
     rig = replace(RIG, cov_uv_px2=np.eye(3) * 0.7**2)
     exact = stereo.predict(points[seen.point], poses[seen.pose], rig).uv_px
+    exact[left_only, 1] = np.nan
     calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
     graph = gtsam.NonlinearFactorGraph()
     for i in range(POINTS):
