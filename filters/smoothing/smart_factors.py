@@ -164,11 +164,12 @@ class ChainedVision(Vision):
         own = weights * chain.whitened(in_channels(channels, to_pose), np.zeros_like(to_pose))
         before = weights * chain.whitened(np.zeros_like(to_pose), chain.of_before(channels, to_pose))
         J_point = weights * chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point))
-        seen, follow = self.sightings, np.flatnonzero(chain.before >= 0)
-        of_poses = [
-            _OfPoses(np.arange(seen.pose.size), seen.pose, own),
-            _OfPoses(follow, seen.pose[chain.before[follow]], before[follow]),
-        ]
+        seen, left, of_poses = self.sightings, is_left_only(self.sightings.uv_px), []
+        of_poses.append(_OfPoses(np.arange(seen.pose.size), seen.pose, own))
+        # Of a pair and of a sighting by the left image alone the same one may be that before.
+        for kind in (~left, left) if left.any() else (~left,):
+            follow = np.flatnonzero((chain.before >= 0) & kind)
+            of_poses.append(_OfPoses(follow, seen.pose[chain.before[follow]], before[follow]))
         return _eliminated(weights[..., 0] * self._residual, of_poses, J_point, seen.point, self.counts)
 
     @cached_property
@@ -185,7 +186,10 @@ class ChainedVision(Vision):
 
 
 class _OfPoses(NamedTuple):
-    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on."""
+    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on.
+
+    No two of them are of the same pose and the same point.
+    """
 
     rows: IntArray
     pose: IntArray
