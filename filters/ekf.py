@@ -12,6 +12,7 @@ from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.models import left_only
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE
 from toolkit.sequence import Packet
@@ -44,7 +45,7 @@ class DecoupledEkf:
         if len(seen):
             huber = self._outliers.filter_huber
             self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate, huber)
-            nis_bound = np.where(accepted, gate.bound(3), 0.0)
+            nis_bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
             pose, pose_cov = self._belief.T_world_imu, self._belief.cov[POSE, POSE]
             seen = correct_landmarks_below(seen, uvs_px, pose, pose_cov, self._rig, nis_bound)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)

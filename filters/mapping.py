@@ -7,6 +7,7 @@ from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
+from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
@@ -31,7 +32,7 @@ class Mapping:
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
         self._map = TrackedMap(setup.rig)
-        self._nis_bound = chi2_bound(3, setup.settings.outliers.gate_probability)
+        self._gate_probability = setup.settings.outliers.gate_probability
 
     def step(self, packet: Packet) -> Estimate:
         """Integrate the motion, then map from where it leads."""
@@ -39,7 +40,8 @@ class Mapping:
         T_world_imu = self._belief.T_world_imu
         seen, uvs_px = self._map.seen_again(packet.frame)
         if len(seen):
-            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, self._nis_bound)
+            nis_bound = chi2_bound(left_only.degrees_of_freedom(uvs_px), self._gate_probability)
+            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
         self._map.keep(seen, packet.frame, T_world_imu)
         return self._belief.estimate(packet.frame.t_ns)
 

@@ -16,7 +16,7 @@ from filters.kalman.online_output import OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet
@@ -58,9 +58,10 @@ class SeedEkf:
 
     def _correct_pose(self, seen: LandmarkMap, uvs_px: Array) -> None:
         predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
-        information = np.broadcast_to(np.linalg.inv(self._rig.cov_uv_px2), (len(seen), 3, 3))
-        residual_px = uvs_px - predicted.uv_px
-        self._belief = updated_by_pose_sightings(self._belief, residual_px, predicted.d_uv_d_pose, information)
+        information = np.broadcast_to(np.linalg.inv(left_only.noise_px2(uvs_px, self._rig)), (len(seen), 3, 3))
+        residual_px = left_only.residuals_px(uvs_px, predicted.uv_px)
+        H_pose = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, information)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""

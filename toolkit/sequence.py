@@ -65,7 +65,7 @@ def _orthonormal(T_imu_cam: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """A rectified stereo pair fixed to the IMU; one measurement is (uL, uR, v) in pixels.
+    """A rectified stereo pair fixed to the IMU; one measurement is (uL, uR, v) in pixels, uR NaN if only left saw.
 
     ``T_imu_cam`` (4, 4) takes left-camera coordinates (x right, y down, z forward) to the IMU frame;
     ``cov_uv_px2`` (3, 3) is the measurement covariance. Where a file has vL and vR, v is their mean and its
@@ -98,9 +98,23 @@ class StereoRig:
         return root
 
 
+def is_left_only(uv_px: Array) -> BoolArray:
+    """Say which sightings (uL, uR, v) (..., 3) px lack the right image: their uR is NaN."""
+    return np.asarray(np.isnan(uv_px[..., 1]))
+
+
+def is_measured(uv_px: Array) -> BoolArray:
+    """Say which sightings (..., 3) px are finite, but for the uR of those by the left image alone."""
+    finite = np.isfinite(uv_px)
+    return np.asarray(finite[..., 0] & finite[..., 2] & (finite[..., 1] | is_left_only(uv_px)))
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Stereo sightings sorted by frame then track: frame index (N,), track id (N,), (uL, uR, v) (N, 3) px."""
+    """Stereo sightings sorted by frame then track: frame index (N,), track id (N,), (uL, uR, v) (N, 3) px.
+
+    uR is NaN in a sighting by the left image alone (:func:`is_left_only`).
+    """
 
     frame: IntArray
     track_id: IntArray
@@ -321,8 +335,9 @@ def check_runnable(sequence: Sequence) -> None:
                 f"{name}: the stamp of {what} {backwards[0] + 1} is not after the one before it; "
                 "sort or drop it in the recording"
             )
-    for what, array in (("motion sample", motion.values), ("observation", sequence.observations.uv_px)):
-        bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    samples, sightings = np.isfinite(motion.values).all(axis=1), is_measured(sequence.observations.uv_px)
+    for what, sound in (("motion sample", samples), ("observation", sightings)):
+        bad = np.flatnonzero(~sound)
         if bad.size:
             raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]

@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from filters.kalman import kernels, multiview, triangulation
+from filters.kalman import kernels, multiview, track_gate, triangulation
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TestedTracks, Window
 from toolkit.geometry import Array
@@ -29,7 +29,9 @@ _RULES = np.array(
 
 
 def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
-    """Test tracks against a window: ``track_gate.tested``, compiled."""
+    """Test tracks against a window: ``track_gate.tested``, compiled where no right image is missing."""
+    if sightings.left_only.any():
+        return track_gate.tested(sightings, window, rig, bounds)
     given = [np.ascontiguousarray(array) for array in (sightings.uvs_px, sightings.seen, sightings.ages)]
     points, reliable, nis, worst, ends, H, residuals = kernels.test_tracks(
         tuple(given), tuple(np.array(part, order="C") for part in window), _camera(rig), _RULES, bounds

@@ -13,8 +13,8 @@ from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray
-from toolkit.models import stereo
-from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
+from toolkit.models import left_only, stereo
+from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -39,14 +39,26 @@ def correct_pose(
     A sighting outside the gate is left out; the others are weighed by Huber's loss of the norm of their residual,
     whitened by the noise of sighting and landmark.
     """
-    predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
-    residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
-    own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2
+    residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, belief.T_world_imu, rig)
+    own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + left_only.noise_px2(uvs_px, rig)
     nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
-    accepted = gate.accepts(nis, 3, predicted.depth_m > 0.0)
-    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov), huber), 0.0)
+    dof = left_only.degrees_of_freedom(uvs_px)
+    accepted = gate.accepts(nis, dof, depth_m > 0.0)
+    threshold = huber if huber is None or isinstance(dof, int) else huber_threshold(dof, huber)
+    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov), threshold), 0.0)
     corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
     return PoseCorrection(corrected, accepted)
+
+
+def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> stereo.StereoPrediction:
+    """Return sightings (N, 3) px less what is predicted of them, with Jacobians, zero where uR is missing."""
+    predicted = stereo.predict(landmarks.points, T_world_imu, rig)
+    return stereo.StereoPrediction(
+        left_only.residuals_px(uvs_px, predicted.uv_px),
+        left_only.seen_rows(uvs_px, predicted.d_uv_d_pose),
+        left_only.seen_rows(uvs_px, predicted.d_uv_d_point),
+        predicted.depth_m,
+    )
 
 
 def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:
@@ -73,15 +85,14 @@ def correct_landmarks(
 
     ``pose_cov`` (6, 6), zero in the report, counts as measurement noise: a doubtful pose does not harden the map.
     """
-    predicted = stereo.predict(landmarks.points, T_world_imu, rig)
-    residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
-    noise_px2 = rig.cov_uv_px2 + H_pose @ pose_cov @ np.swapaxes(H_pose, 1, 2)
+    residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, T_world_imu, rig)
+    noise_px2 = left_only.noise_px2(uvs_px, rig) + H_pose @ pose_cov @ np.swapaxes(H_pose, 1, 2)
     innovation_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + noise_px2
     gain = np.swapaxes(np.linalg.solve(innovation_cov, H_point @ landmarks.covs), 1, 2)
     points = landmarks.points + (gain @ residual_px[..., None])[..., 0]
     covs = landmarks.covs - gain @ H_point @ landmarks.covs
     corrected = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
-    return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), predicted.depth_m)
+    return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), depth_m)
 
 
 def correct_landmarks_below(
@@ -96,14 +107,14 @@ class KnownPoseMapper:
     """Maps landmarks along given poses, each by its own EKF; a sighting outside the gate corrects nothing."""
 
     def __init__(self, rig: StereoRig, gate_probability: float | None) -> None:
-        self._rig, self._map = rig, TrackedMap(rig)
-        self._nis_bound = chi2_bound(3, gate_probability)
+        self._rig, self._map, self._probability = rig, TrackedMap(rig), gate_probability
 
     def add(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Correct the landmarks the frame shows again and start its new ones, seen from a pose (4, 4)."""
         seen, uvs_px = self._map.seen_again(frame)
         if len(seen):
-            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, self._nis_bound)
+            nis_bound = chi2_bound(left_only.degrees_of_freedom(uvs_px), self._probability)
+            seen = correct_landmarks_below(seen, uvs_px, T_world_imu, np.zeros((6, 6)), self._rig, nis_bound)
         self._map.keep(seen, frame, T_world_imu)
 
     def landmarks(self) -> Landmarks:

@@ -15,7 +15,7 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models import correlated_noise
+from toolkit.models import correlated_noise, left_only
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.state import Belief
 from toolkit.sequence import StereoFrame, StereoRig
@@ -86,16 +86,17 @@ def correct(joint: ErringBelief, frame: StereoFrame, at: Linearisation, rig: Ste
     if not count:
         return
     order = np.argsort(frame.track_ids)
-    joint.walk(frame.ages[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]])
+    rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
+    joint.walk(frame.ages[rows])
     white = correlated_noise.white_rig(joint.noise, rig)
     seen = joint_landmarks.linearise_sightings(joint, frame, at, white)
-    H_error = white.whitener @ np.linalg.inv(CHANNELS)
-    residuals = seen.residuals - joint.track_errors_px @ H_error.T
+    H_error = left_only.whitener(frame.uvs_px[rows], white) @ np.linalg.inv(CHANNELS)
+    residuals = seen.residuals - left_only.applied(H_error, joint.track_errors_px)
     H_each = np.concatenate([seen.H_pose, seen.H_point, np.broadcast_to(H_error, (count, 3, 3))], axis=2)
     columns = _columns_each(joint)
     spread = H_each @ joint.cov[columns[:, :, None], columns[:, None, :]] @ np.swapaxes(H_each, 1, 2)
     nis = mahalanobis_squared(residuals, spread + np.eye(3))
-    weights = gate.weights(nis, 3, gate.accepts(nis, 3, seen.depth_m > 0.0))
+    weights = gate.weights(nis, seen.dof, gate.accepts(nis, seen.dof, seen.depth_m > 0.0))
     used = np.flatnonzero(weights)
     if used.size:
         roots = np.sqrt(weights[used])
@@ -153,7 +154,7 @@ def started(joint: ErringBelief, sightings: TrackSightings, points: Array, linea
     mixing, d = linearised.decorrelation, joint.cov.shape[0]
     assert mixing is not None
     H = mixing @ linearised.H_point.reshape(count, 3 * window, 3)
-    last = correlated_noise.error_of_the_last(joint.noise, sightings.ages, sightings.seen)
+    last = correlated_noise.error_of_the_last(joint.noise, sightings.ages, sightings.seen, sightings.left_only)
     cov_point = np.linalg.inv(np.swapaxes(H, 1, 2) @ H)
     to_point = cov_point @ np.swapaxes(H, 1, 2)
     unexplained = np.eye(3 * window) - H @ to_point

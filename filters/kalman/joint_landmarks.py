@@ -16,17 +16,22 @@ from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models import left_only
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
 
 class LandmarkSightings(NamedTuple):
-    """Whitened residuals (L, 3) of the state's landmarks, Jacobians to pose (L, 3, 6) and landmark (L, 3, 3), depth."""
+    """Whitened residuals (L, 3) of the state's landmarks, Jacobians to pose (L, 3, 6) and landmark (L, 3, 3), depth.
+
+    ``dof`` are the degrees of freedom (L,) of the residuals, or of each.
+    """
 
     residuals: Array
     H_pose: Array
     H_point: Array
     depth_m: Array
+    dof: int | IntArray
 
 
 class StackedSightings(NamedTuple):
@@ -87,7 +92,8 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
     newest = joint.clones[-1:]
     now = multiview.linearise(sightings, joint.points, newest, newest, rig)
     there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)
-    return LandmarkSightings(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0])
+    dof = left_only.degrees_of_freedom(frame.uvs_px[rows])
+    return LandmarkSightings(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0], dof)
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:
@@ -113,7 +119,7 @@ def weighed(joint: JointBelief, seen: LandmarkSightings, gate: FrameGate) -> Arr
     H = np.concatenate([seen.H_pose, seen.H_point], axis=2)
     predicted = H @ _pose_and_landmark_cov(joint) @ np.swapaxes(H, 1, 2)
     nis = mahalanobis_squared(seen.residuals, predicted + np.eye(3))
-    return gate.weights(nis, 3, gate.accepts(nis, 3, seen.depth_m > 0.0))
+    return gate.weights(nis, seen.dof, gate.accepts(nis, seen.dof, seen.depth_m > 0.0))
 
 
 def _pose_and_landmark_cov(joint: JointBelief) -> Array:

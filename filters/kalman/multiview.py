@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.models import correlated_noise, stereo
-from toolkit.sequence import StereoRig
+from toolkit.models import correlated_noise, left_only, stereo
+from toolkit.sequence import StereoRig, is_left_only
 
 REFINEMENTS = 3
 
@@ -26,6 +26,16 @@ class TrackSightings(NamedTuple):
     uvs_px: Array
     seen: BoolArray
     ages: IntArray
+
+    @property
+    def left_only(self) -> BoolArray:
+        """Say which sightings (F, W) lack the right image."""
+        return self.seen & is_left_only(self.uvs_px)
+
+    @property
+    def degrees_of_freedom(self) -> IntArray:
+        """Return how many coordinates of each track (F,) are left when its landmark is eliminated."""
+        return np.asarray(3 * self.seen.sum(axis=1) - self.left_only.sum(axis=1) - 3)
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return some of the tracks."""
@@ -81,15 +91,15 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
-    What was not seen is zero throughout.
+    What was not seen is zero throughout, and so is uR where the right image is missing.
     """
-    whitener, seen = rig.whitener, sightings.seen[..., None]
+    whitener, seen = left_only.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
     there = stereo.linearise(_in_imu(poses_at, points), poses_at[:, :3, :3], rig)
     if poses_at is poses:
         uv_px, depth_m = there.uv_px, there.depth_m
     else:
         uv_px, depth_m = stereo.images(_in_imu(poses, points), rig)
-    residuals = np.where(seen, (sightings.uvs_px - uv_px) @ whitener.T, 0.0)
+    residuals = np.where(seen, left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))
@@ -99,7 +109,7 @@ def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoR
     """Return tracks together with what makes their rows independent, where the rig's noise is correlated."""
     if rig.track_noise is None:
         return linearised
-    mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen)
+    mixing = correlated_noise.decorrelation(rig.track_noise, rig, sightings.ages, sightings.seen, sightings.left_only)
     return linearised._replace(decorrelation=mixing)
 
 
@@ -149,10 +159,10 @@ class Constraints(NamedTuple):
         return Constraints(residuals, H, np.concatenate([self.dof, other.dof]))
 
 
-def without_landmark(linearised: Linearised, seen: BoolArray) -> Constraints:
+def without_landmark(linearised: Linearised, sightings: TrackSightings) -> Constraints:
     """Project the measurements onto the left null space of the landmark's Jacobian (MSCKF, eqs. 23-24)."""
-    tracks, window = seen.shape
-    dof = 3 * seen.sum(axis=1) - 3
+    tracks, window = sightings.seen.shape
+    dof = sightings.degrees_of_freedom
     stacked = linearised.residuals.reshape(tracks, 3 * window, 1)
     if linearised.decorrelation is not None:
         basis = null_space(linearised)

@@ -78,7 +78,7 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     if rig.track_noise is not None:
         points = multiview.refined(sightings, points, poses, rig)
     linearised = _linearised(sightings, points, window, rig)
-    constraints = multiview.without_landmark(linearised, sightings.seen)
+    constraints = multiview.without_landmark(linearised, sightings)
     covs = innovation_covs(constraints, P)
     nis = mahalanobis_squared(constraints.residuals, covs)
     bound = bounds[constraints.dof]
@@ -157,7 +157,7 @@ class TrackGate:
         """Return the tracks that pass as they are, and those that fail by far less their worst sighting."""
         bounds = gate.bound(np.arange(3 * sightings.seen.shape[1] + 1))
         tracks = self._test(sightings, self._window, self._rig, bounds)
-        dof = 3 * tracks.sightings.seen.sum(axis=1) - 3
+        dof = tracks.sightings.degrees_of_freedom
         accepted = gate.accepts(tracks.nis, dof)
         weights = gate.weights(tracks.nis, dof, accepted)
         roots = np.sqrt(weights)[tracks.track]

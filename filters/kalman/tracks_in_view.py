@@ -22,8 +22,9 @@ from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.triangulation import nearest_view
+from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
 from toolkit.models.state import Belief
 from toolkit.sequence import StereoRig
@@ -48,17 +49,18 @@ class TracksInView:
     def corrected(self, joint: JointBelief, sightings: TrackSightings) -> Belief:
         """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet."""
         tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
-        rows, in_front = self._rows(joint, tracks)
-        self._known = tracks = tracks.select(in_front)
-        if not in_front.any():
+        rows, usable = self._rows(joint, tracks)
+        self._known = tracks = tracks.select(usable)
+        if not usable.any():
             return joint.core
-        normals = _Normals.of(rows.select(in_front))
+        normals = _Normals.of(rows.select(usable))
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         nis = normals.newest_nis(joint.cov[joint.clone_columns, joint.clone_columns])
-        weights = gate.weights(nis, 3, gate.accepts(nis, 3))
+        dof = left_only.degrees_of_freedom(tracks.sightings.uvs_px[:, -1])
+        weights = gate.weights(nis, dof, gate.accepts(nis, dof))
         tracks.weights[:, -1] = weights
         normals = normals.newest_weighed(weights)
-        most_m = 0.2 * rows.depth_m[in_front].min(axis=1)
+        most_m = 0.2 * rows.depth_m[usable].min(axis=1)
         self._known = tracks._replace(points=tracks.points + _no_longer_than(most_m, normals.point_steps()))
         return _informed(joint, *normals.of_clones())
 
@@ -71,11 +73,15 @@ class TracksInView:
         points[before] = known.points[rows[before]]
         weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
         reliable, new = before.copy(), sightings.select(~before)
-        points[~before], reliable[~before] = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
+        points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
+        reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
         return _Followed(sightings, joint.clone_frames, points, weights).select(reliable)
 
     def _rows(self, joint: JointBelief, tracks: "_Followed") -> tuple["_Rows", BoolArray]:
-        """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front."""
+        """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front.
+
+        Where right images are missing, the sightings before the newest must tell where the landmark is.
+        """
         counted = tracks.sightings._replace(seen=tracks.sightings.seen & (tracks.weights > 0.0))
         seen = multiview.linearise(counted, tracks.points, joint.clones, self._at.clones(joint), self._rig)
         rows = _Rows(seen.residuals, seen.H_point, seen.H_pose, seen.depth_m)
@@ -83,7 +89,12 @@ class TracksInView:
         rows = rows if mixing is None else rows.mixed(mixing)
         if ((tracks.weights > 0.0) & (tracks.weights < 1.0)).any():
             rows = rows.scaled(np.sqrt(tracks.weights))
-        return rows, np.asarray(seen.depth_m.min(axis=1) > LEAST_DEPTH_M)
+        nearest_m = seen.depth_m.min(axis=1)
+        usable, some = nearest_m > LEAST_DEPTH_M, np.flatnonzero(counted.left_only.any(axis=1))
+        if some.size:
+            H_before = rows.H_point[some, :-1]
+            usable[some] &= is_determined((np.swapaxes(H_before, 2, 3) @ H_before).sum(axis=1), nearest_m[some])
+        return rows, np.asarray(usable)
 
 
 class _Followed(NamedTuple):

@@ -9,15 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
-from toolkit.sequence import StereoRig
+from toolkit.sequence import StereoRig, is_left_only
 
 ITERATIONS, FIRST_DAMPING = 6, 1e-3
 # A track's residuals are freed of its landmark to first order: a hundredth of a standard deviation more is of no use.
 RELATIVE_DECREASE = 1e-4
 # A step that changes the error by rounding alone is taken, lest rounding should choose between the points.
 ROUNDING = 1e-12
+# What rays that are parallel to a thousandth of a radian say of where they meet.
+_LEAST_RAY = 1e-6
 
 
 class _Views(NamedTuple):
@@ -48,7 +50,8 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
 
     ``seen`` (F, W) marks the sightings, of which every track must have one. The start is the stereo triangulation
     with the largest disparity. A point is reliable if it lies in front of every pose that saw it and had a
-    disparity that tells its depth.
+    disparity that tells its depth; where right images are missing, also if the sightings together tell it
+    (:func:`is_determined`).
     """
     if not len(seen):
         return np.empty((0, 3)), np.empty(0, dtype=bool)
@@ -64,17 +67,55 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if not unsettled.any():
             break
-    return fit.points, wide & (fit.depth_m > LEAST_DEPTH_M)
+    told, blind = wide, lacking(uvs_px, seen, wide)
+    if blind.any():
+        told = wide | (blind & is_determined(fit.hessian, fit.depth_m))
+    return fit.points, told & (fit.depth_m > LEAST_DEPTH_M)
 
 
 def nearest_view(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:
-    """Return where the sighting with the largest disparity puts each point (F, 3), and whether (F,) it is enough."""
-    disparity_px = np.where(seen, stereo.disparity_px(uvs_px), -np.inf)
+    """Return where the sighting with the largest disparity puts each point (F, 3), and whether (F,) it is enough.
+
+    Where it is not and right images are missing, the point is where the rays of all sightings meet best.
+    """
+    disparity_px = np.where(seen & ~is_left_only(uvs_px), stereo.disparity_px(uvs_px), -np.inf)
     nearest = np.argmax(disparity_px, axis=1)
     rows = np.arange(len(nearest))
     wide = disparity_px[rows, nearest] > LEAST_DISPARITY_PX
     best_px = np.where(wide[:, None], uvs_px[rows, nearest], [rig.cx_px + 1.0, rig.cx_px, rig.cy_px])
-    return stereo.triangulate_world(best_px, poses[nearest], rig), wide
+    points, blind = stereo.triangulate_world(best_px, poses[nearest], rig), lacking(uvs_px, seen, wide)
+    if blind.any():
+        points[blind] = _where_rays_meet(uvs_px[blind], seen[blind], poses, rig)
+    return points, wide
+
+
+def lacking(uvs_px: Array, seen: BoolArray, wide: BoolArray) -> BoolArray:
+    """Say which tracks (F,) have no disparity that tells their depth, for want of right images perhaps."""
+    return np.asarray(~wide & (seen & is_left_only(uvs_px)).any(axis=1))
+
+
+def is_determined(information: Array, depth_m: Array) -> BoolArray:
+    """Say which points (F,) sightings with an information (F, 3, 3) 1/m^2 put to within their depths (F,) m.
+
+    By the rule of :data:`toolkit.models.gating.LEAST_DISPARITY_PX`, the standard deviation of no direction may be as
+    large as the depth itself.
+    """
+    return np.asarray(np.linalg.eigvalsh(information)[:, 0] * np.square(depth_m) > 1.0)
+
+
+def _where_rays_meet(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> Array:
+    """Return the points (F, 3) nearest to the rays of the left image, parallel ones meeting far in front of it."""
+    T_world_cam = poses @ rig.T_imu_cam
+    rays = np.ones((*seen.shape, 3))
+    rays[..., 0] = (uvs_px[..., 0] - rig.cx_px) / rig.fx_px
+    rays[..., 1] = (uvs_px[..., 2] - rig.cy_px) / rig.fy_px
+    rays = (T_world_cam[:, :3, :3] @ rays[..., None])[..., 0]
+    directions, centres = rays / np.linalg.norm(rays, axis=2, keepdims=True), T_world_cam[:, :3, 3]
+    across = (np.eye(3) - directions[..., None] * directions[..., None, :]) * seen[..., None, None]
+    far = (centres + rig.fx_px * rig.baseline_m / LEAST_DISPARITY_PX * rays)[np.arange(len(seen)), seen.argmax(axis=1)]
+    system = across.sum(axis=1) + _LEAST_RAY * np.eye(3)
+    right = (across @ centres[..., None]).sum(axis=1)[..., 0] + _LEAST_RAY * far
+    return np.asarray(np.linalg.solve(system, right[..., None])[..., 0])
 
 
 def _views(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> _Views:
@@ -91,8 +132,8 @@ def _fit(points: Array, views: _Views, rig: StereoRig) -> _Fit:
     # Jacobian and residual side by side: one product yields the normal equations and the cost.
     system = np.empty((len(depth_m), 3, 4))
     system[..., :3] = stereo.projection_jacobian(points_cam, rig) @ views.R_cam_world
-    system[..., 3] = views.uvs_px - stereo.project(points_cam, rig)
-    system = rig.whitener @ system
+    system[..., 3] = left_only.residuals_px(views.uvs_px, stereo.project(points_cam, rig))
+    system = left_only.whitener(views.uvs_px, rig) @ system
     normal = np.add.reduceat(np.swapaxes(system, 1, 2) @ system, views.first)
     nearest_m = np.minimum.reduceat(depth_m, views.first)
     cost = np.where(nearest_m > 0.0, 0.5 * normal[:, 3, 3], np.inf)

@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.smoothing.robust_loss import Cauchy
 from toolkit.geometry import Array, se3_exp
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -31,12 +31,12 @@ def aligned(expected: Belief, frame: StereoFrame, points: Mapping[int, Array], r
         return expected
     landmarks = np.array([points[i] for i in seen.track_ids.tolist()])
     held = np.linalg.inv(expected.cov[POSE, POSE])
-    T_world_imu, off = expected.T_world_imu, np.zeros(6)
+    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), left_only.whitener(seen.uvs_px, rig)
     for _ in range(ITERATIONS):
         predicted = stereo.predict(landmarks, T_world_imu, rig)
-        residual = (seen.uvs_px - predicted.uv_px) @ rig.whitener.T
+        residual = left_only.whitened_residuals(seen.uvs_px, predicted.uv_px, rig)
         weights = np.where(predicted.depth_m > 0.0, _LOSS.weight(np.linalg.norm(residual, axis=1)), 0.0)
-        H = (rig.whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
+        H = (whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
         weighed = H * np.repeat(weights, 3)[:, None]
         step = np.linalg.solve(held + weighed.T @ H, weighed.T @ residual.ravel() - held @ off)
         off, T_world_imu = off + step, T_world_imu @ se3_exp(step)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.gating import MOST_MISMATCHED, chi2_bound, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
@@ -49,11 +49,12 @@ class OutlierCheck:
         if not known.any():
             return known
         landmarks = np.array([points[i] for i in frame.track_ids[known].tolist()])
-        predicted = stereo.predict(landmarks, expected.T_world_imu, self.rig)
-        H = predicted.d_uv_d_pose
-        covs_px2 = 2.0 * self.rig.cov_uv_px2 + H @ expected.cov[POSE, POSE] @ np.swapaxes(H, 1, 2)
-        bound = self.policy.smoother_gate_factor * chi2_bound(3, self.policy.gate_probability)
-        far = mahalanobis_squared(frame.uvs_px[known] - predicted.uv_px, covs_px2) > bound
+        predicted, uvs_px = stereo.predict(landmarks, expected.T_world_imu, self.rig), frame.uvs_px[known]
+        H = left_only.seen_rows(uvs_px, predicted.d_uv_d_pose)
+        covs_px2 = 2.0 * left_only.noise_px2(uvs_px, self.rig) + H @ expected.cov[POSE, POSE] @ np.swapaxes(H, 1, 2)
+        dof = left_only.degrees_of_freedom(uvs_px)
+        bound = self.policy.smoother_gate_factor * chi2_bound(dof, self.policy.gate_probability)
+        far = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted.uv_px), covs_px2) > bound
         if far.mean() > MOST_MISMATCHED:
             return np.zeros_like(known)
         result = known.copy()

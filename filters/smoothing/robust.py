@@ -17,11 +17,11 @@ from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.factors import SCALE, L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
 from toolkit.progress import Progress
-from toolkit.sequence import StereoFrame, StereoRig
+from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.settings import Outliers
 
 # Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go. The last solve
@@ -64,8 +64,11 @@ def solve_robustly(
         frames = _without_those_behind(frames, values, rig)
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
-    bound = _cut_bound(outliers)
-    frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
+    frames = [
+        frame.select(distance < _cut_bound(outliers, left_only.degrees_of_freedom(frame.uvs_px)))
+        for frame, distance, _ in _residuals(frames, values, rig)
+    ]
+    frames = _placed_by_stereo(frames)
     if values.exists(SCALE):
         sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
@@ -93,7 +96,8 @@ def _solve_chained(
     loss = Squares() if outliers.batch_cauchy is None else Cauchy(outliers.batch_cauchy)
     robust = ChainedFactors(sightings, rig, loss)
     values = solve(motion, values, _JUMPS_STOPPING, progress, "solving along the tracks", robust).values
-    jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers)
+    dof = left_only.degrees_of_freedom(sightings.uv_px)
+    jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers, dof)
     sightings, frames = without_jumps(sightings, frames, jumped)
     last = ChainedFactors(sightings, rig, Squares())
     return _solve_last(motion, last, frames, values, CHAIN_STOPPING, progress)
@@ -114,9 +118,9 @@ def _solve_last(
     return Smoothed(solution, graph, frames)
 
 
-def _cut_bound(outliers: Outliers) -> Array:
+def _cut_bound(outliers: Outliers, dof: int | IntArray) -> Array:
     cut = outliers.batch_cut_probability
-    return chi2_bound(3, None if cut is None else 1.0 - cut)
+    return chi2_bound(dof, None if cut is None else 1.0 - cut)
 
 
 def _stages(outliers: Outliers) -> Iterator[tuple[gtsam.noiseModel.mEstimator.Base, Stopping, str]]:
@@ -135,7 +139,7 @@ def worth_smoothing(frames: list[StereoFrame], known: Landmarks) -> IntArray:
     disparities_px = np.concatenate([stereo.disparity_px(f.uvs_px) for f in frames])
     unique_ids, row_of, counts = np.unique(ids, return_inverse=True, return_counts=True)
     largest_px = np.full(unique_ids.size, -np.inf)
-    np.maximum.at(largest_px, row_of, disparities_px)
+    np.fmax.at(largest_px, row_of, disparities_px)
     good = (counts >= FEWEST_SIGHTINGS) & (largest_px >= LEAST_DISPARITY_PX)
     return np.intersect1d(unique_ids[good], known.track_ids, assume_unique=True)
 
@@ -170,9 +174,17 @@ def _residuals(
     for k, frame in enumerate(frames):
         seen = points[np.searchsorted(ids, frame.track_ids)]
         predicted = stereo.predict(seen, values.atPose3(X(k)).matrix(), rig)
-        residuals_px = frame.uvs_px - predicted.uv_px
-        covs_px2 = np.broadcast_to(rig.cov_uv_px2, (len(seen), 3, 3))
+        residuals_px = left_only.residuals_px(frame.uvs_px, predicted.uv_px)
+        covs_px2 = np.broadcast_to(left_only.noise_px2(frame.uvs_px, rig), (len(seen), 3, 3))
         yield frame, mahalanobis_squared(residuals_px, covs_px2), predicted.depth_m
+
+
+def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
+    """Return the frames without the left image's sightings of landmarks that no sighting in both images is left of."""
+    if not any(is_left_only(frame.uvs_px).any() for frame in frames):
+        return frames
+    placed = np.unique(np.concatenate([frame.track_ids[~is_left_only(frame.uvs_px)] for frame in frames]))
+    return [frame.select(np.isin(frame.track_ids, placed)) for frame in frames]
 
 
 def _without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:

@@ -15,10 +15,9 @@ import numpy as np
 from scipy.sparse import csc_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.models import stereo
-from toolkit.models.correlated_noise import Chain
-from toolkit.sequence import StereoRig
-from toolkit.track_noise import CHANNELS
+from toolkit.models import left_only, stereo
+from toolkit.models.correlated_noise import Chain, channels_of, in_channels
+from toolkit.sequence import StereoRig, is_left_only
 
 # A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
 _BEHIND_NORM = 100.0
@@ -123,7 +122,7 @@ class Vision:
     def reduced(self) -> Reduced:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
         weights = self._root_weights
-        weighted = weights[:, None, None] * self.camera.rig.whitener
+        weighted = weights[:, None, None] * left_only.whitener(self.sightings.uv_px, self.camera.rig)
         J_pose, J_point = weighted @ self._predicted.d_uv_d_pose, weighted @ self._predicted.d_uv_d_point
         seen, all_rows = self.sightings, np.arange(weights.size)
         of_poses = [_OfPoses(all_rows, seen.pose, J_pose)]
@@ -145,7 +144,7 @@ class Vision:
     @cached_property
     def _residual(self) -> Array:
         """Measured less predicted, whitened (N, 3)."""
-        return (self.sightings.uv_px - self._predicted.uv_px) @ self.camera.rig.whitener.T
+        return left_only.whitened_residuals(self.sightings.uv_px, self._predicted.uv_px, self.camera.rig)
 
     @cached_property
     def _norm(self) -> Array:
@@ -160,32 +159,37 @@ class ChainedVision(Vision):
 
     def reduced(self) -> Reduced:
         """Linearise and eliminate the points, as for sightings that stand each for itself."""
-        chain, weights = self._chain, self._root_weights[:, None, None]
-        to_pose, to_point = CHANNELS @ self._predicted.d_uv_d_pose, CHANNELS @ self._predicted.d_uv_d_point
-        own = weights * chain.whitened(to_pose, np.zeros_like(to_pose))
-        before = weights * chain.whitened(np.zeros_like(to_pose), to_pose[chain.before])
-        J_point = weights * chain.whitened(to_point, to_point[chain.before])
-        seen, follow = self.sightings, np.flatnonzero(chain.before >= 0)
-        of_poses = [
-            _OfPoses(np.arange(seen.pose.size), seen.pose, own),
-            _OfPoses(follow, seen.pose[chain.before[follow]], before[follow]),
-        ]
+        chain, weights, channels = self._chain, self._root_weights[:, None, None], channels_of(self.sightings.uv_px)
+        to_pose, to_point = self._predicted.d_uv_d_pose, self._predicted.d_uv_d_point
+        own = weights * chain.whitened(in_channels(channels, to_pose), np.zeros_like(to_pose))
+        before = weights * chain.whitened(np.zeros_like(to_pose), chain.of_before(channels, to_pose))
+        J_point = weights * chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point))
+        seen, left, of_poses = self.sightings, is_left_only(self.sightings.uv_px), []
+        of_poses.append(_OfPoses(np.arange(seen.pose.size), seen.pose, own))
+        # Of a pair and of a sighting by the left image alone the same one may be that before.
+        for kind in (~left, left) if left.any() else (~left,):
+            follow = np.flatnonzero((chain.before >= 0) & kind)
+            of_poses.append(_OfPoses(follow, seen.pose[chain.before[follow]], before[follow]))
         return _eliminated(weights[..., 0] * self._residual, of_poses, J_point, seen.point, self.counts)
 
     @cached_property
     def _chain(self) -> Chain:
         noise, seen = self.camera.rig.track_noise, self.sightings
         assert noise is not None
-        return Chain.of(noise, seen.point, seen.ages)
+        return Chain.of(noise, seen.point, seen.ages, is_left_only(seen.uv_px))
 
     @cached_property
     def _residual(self) -> Array:
         """What is new in measured less predicted, whitened (N, 3)."""
-        return self._chain.innovations(self.sightings.uv_px - self._predicted.uv_px)
+        residuals_px = left_only.residuals_px(self.sightings.uv_px, self._predicted.uv_px)
+        return self._chain.innovations(residuals_px, channels_of(self.sightings.uv_px))
 
 
 class _OfPoses(NamedTuple):
-    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on."""
+    """Jacobians (n, 3, 6) of some residuals, by their rows (n,), to one of the poses (n,) that each depends on.
+
+    No two of them are of the same pose and the same point.
+    """
 
     rows: IntArray
     pose: IntArray

@@ -18,12 +18,12 @@ import numpy as np
 
 from filters.smoothing.robust_loss import Huber, Loss, Squares
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models import stereo
-from toolkit.models.correlated_noise import Chain
+from toolkit.models import left_only, stereo
+from toolkit.models.correlated_noise import Chain, channels_of, in_channels
 from toolkit.models.disparity_scale import d_uv_d_scale, scaled_rig
 from toolkit.models.factors import SCALE, L, X
-from toolkit.sequence import StereoFrame, StereoRig
-from toolkit.track_noise import CHANNELS, TrackNoise
+from toolkit.sequence import StereoFrame, StereoRig, is_left_only
+from toolkit.track_noise import TrackNoise
 
 # Of Student's t over tracks, as fitted to all real recordings (docs/tracks.md); Gaussian ones lose a few percent by it.
 FREEDOM_OF_TRACKS = 2.0
@@ -37,7 +37,8 @@ class ChainedSightings:
     """N sightings: frame and track (N,), both by number, (uL, uR, v) (N, 3) px, and how their errors hang together.
 
     ``counted`` (N,) says which of the innovations count: an outlying one leaves the track free to be anywhere else from
-    there on. ``track_ids`` (M,) ascending are the tracks; ``channels`` (3, 3) is what makes channels of (uL, uR, v).
+    there on. ``track_ids`` (M,) ascending are the tracks; ``channels`` (3, 3), or
+    one each (N, 3, 3), is what makes channels of (uL, uR, v).
     """
 
     pose: IntArray
@@ -53,19 +54,18 @@ class ChainedSightings:
         """Return the sightings of frames (K,), with the noise of tracks if the rig states it."""
         pose = np.repeat(np.arange(len(frames)), [frame.track_ids.size for frame in frames])
         ids, point = np.unique(np.concatenate([frame.track_ids for frame in frames]), return_inverse=True)
-        ages = np.concatenate([frame.ages for frame in frames])
+        ages, uv_px = np.concatenate([f.ages for f in frames]), np.concatenate([f.uvs_px for f in frames])
         if rig.track_noise is None:
-            chain, channels = Chain.without_memory(point.size), rig.whitener
+            chain, channels = Chain.without_memory(point.size), left_only.whitener(uv_px, rig)
         else:
-            chain, channels = Chain.of(rig.track_noise, point, ages), CHANNELS
-        uv_px = np.concatenate([frame.uvs_px for frame in frames])
+            chain, channels = Chain.of(rig.track_noise, point, ages, is_left_only(uv_px)), channels_of(uv_px)
         return cls(pose, point, uv_px, chain, np.ones(pose.size, dtype=bool), ids, channels)
 
     def places(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Return the poses (N, 4, 4) and points (N, 3) m of the sightings."""
         frames, row = np.unique(self.pose, return_inverse=True)
-        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
-        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()])
+        poses = np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()]).reshape(-1, 4, 4)
+        points = np.array([values.atPoint3(L(i)) for i in self.track_ids.tolist()]).reshape(-1, 3)
         return poses[row], points[self.point]
 
 
@@ -117,9 +117,10 @@ class SightingRows:
     def chained(self, noise: TrackNoise) -> ChainedSightings:
         """Return all of them as they hang together; what is new counts where it is known what came before."""
         ids, point = np.unique(self.track_id, return_inverse=True)
-        chain = Chain.of(noise, point.astype(np.int64), self.age)
+        chain = Chain.of(noise, point.astype(np.int64), self.age, is_left_only(self.uv_px))
         counted = self.begins | (chain.before >= 0)
-        return ChainedSightings(self.pose, point.astype(np.int64), self.uv_px, chain, counted, ids, CHANNELS)
+        channels = channels_of(self.uv_px)
+        return ChainedSightings(self.pose, point.astype(np.int64), self.uv_px, chain, counted, ids, channels)
 
 
 def without_jumps(
@@ -127,10 +128,13 @@ def without_jumps(
 ) -> tuple[ChainedSightings, list[StereoFrame]]:
     """Return the sightings of frames (K,) less the innovations (N,) that jumped, and the frames with those left.
 
-    A track that jumped at its beginning is left out: where its landmark is, the rest of it hardly says.
+    A track that jumped at its beginning is left out: where its landmark is, the rest of it hardly says. So is one of
+    which no sighting in both images is left.
     """
     began_with = jumped & (sightings.chain.before < 0)
     kept = ~np.isin(sightings.point, sightings.point[began_with])
+    placing = ~jumped & ~is_left_only(sightings.uv_px)
+    kept &= np.isin(sightings.point, sightings.point[placing])
     rows = np.split(kept, np.cumsum([frame.track_ids.size for frame in frames])[:-1])
     frames = [frame.select(row) for frame, row in zip(frames, rows, strict=True)]
     tracks, point = np.unique(sightings.point[kept], return_inverse=True)
@@ -141,7 +145,7 @@ def without_jumps(
         sightings.chain.of_tracks(kept),
         ~jumped[kept],
         sightings.track_ids[tracks],
-        sightings.channels,
+        sightings.channels if sightings.channels.ndim == 2 else sightings.channels[kept],
     )
     return left, frames
 
@@ -207,8 +211,9 @@ class ChainedFactors:
     def _dof(self) -> Array:
         """The degrees of freedom (M,) that the innovations of each track have: its first one places the landmark."""
         seen = self.sightings
-        follows = seen.counted & (seen.chain.before >= 0)
-        return np.asarray(3.0 * np.bincount(seen.point, follows, seen.track_ids.size), dtype=float)
+        dof = left_only.degrees_of_freedom(seen.uv_px)
+        follows = np.where(seen.counted & (seen.chain.before >= 0), dof, 0)
+        return np.asarray(np.bincount(seen.point, follows, seen.track_ids.size), dtype=float)
 
     def linearised(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> gtsam.NonlinearFactorGraph:
         """Return the innovations that count as linear factors about the values, weighed as the loss does there.
@@ -224,8 +229,7 @@ class ChainedFactors:
 
     def _innovations(self, predicted: stereo.StereoPrediction) -> Array:
         seen = self.sightings
-        residual = (seen.uv_px - predicted.uv_px) @ seen.channels.T
-        return seen.chain.whitened(residual, residual[seen.chain.before])
+        return seen.chain.innovations(left_only.residuals_px(seen.uv_px, predicted.uv_px), seen.channels)
 
     def linear(self, values: gtsam.Values, jacobians_at: gtsam.Values | None = None) -> "LinearInnovations":
         """Return what is new in each sighting, and how it changes with what it depends on, without a loss."""
@@ -234,14 +238,13 @@ class ChainedFactors:
         innovation = self._innovations(predicted)
         if jacobians_at is not None:
             predicted = self.predicted(jacobians_at)
-        channels = self.sightings.channels
-        to_pose, to_point = channels @ predicted.d_uv_d_pose, channels @ predicted.d_uv_d_point
-        nothing = np.zeros_like(to_pose)
+        channels, nothing = self.sightings.channels, np.zeros_like(predicted.d_uv_d_pose)
+        to_pose, to_point = predicted.d_uv_d_pose, predicted.d_uv_d_point
         return LinearInnovations(
             innovation,
-            chain.whitened(to_pose, nothing),
-            chain.whitened(nothing, to_pose[chain.before]),
-            chain.whitened(to_point, to_point[chain.before]),
+            chain.whitened(in_channels(channels, to_pose), nothing),
+            chain.whitened(nothing, chain.of_before(channels, to_pose)),
+            chain.whitened(in_channels(channels, to_point), chain.of_before(channels, to_point)),
         )
 
     def predicted(self, values: gtsam.Values) -> stereo.StereoPrediction:
@@ -255,8 +258,9 @@ class ChainedFactors:
         if not values.exists(SCALE):
             return None
         seen = self.sightings
-        to_scale = seen.channels @ d_uv_d_scale(self.predicted(values).uv_px, scale_in(values))[..., None]
-        return seen.chain.whitened(to_scale, to_scale[seen.chain.before])
+        to_scale = d_uv_d_scale(self.predicted(values).uv_px, scale_in(values))[..., None]
+        own, before = in_channels(seen.channels, to_scale), seen.chain.of_before(seen.channels, to_scale)
+        return seen.chain.whitened(own, before)
 
     def factors(
         self, linear: "LinearInnovations", values: gtsam.Values, rows: BoolArray, to_scale: Array | None = None

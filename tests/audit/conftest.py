@@ -60,7 +60,7 @@ def turned(sequence: Sequence, turn: Array) -> Sequence:
 
 def not_finite(sequence: Sequence) -> Plant:
     uv_px, values = sequence.observations.uv_px.copy(), sequence.motion.values.copy()
-    uv_px[100:2100:50, 1] = np.nan
+    uv_px[100:2100:50, 0] = np.nan
     values[40:100:20, 4] = np.inf
     m = sequence.motion
     names = [name for name in m.__dataclass_fields__ if name not in ("t_ns", "pairing")]

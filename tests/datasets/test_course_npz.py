@@ -13,6 +13,7 @@ import pytest
 from toolkit.datasets import course_npz, load_sequence
 from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse
+from toolkit.sequence import is_left_only, is_measured
 
 Course = dict[str, Any]
 Refused = Callable[..., None]
@@ -79,10 +80,18 @@ def test_sightings_are_those_not_missing_in_all_four_coordinates(course: Course,
     np.testing.assert_array_equal(observations.uv_px[:2], [[400.0, 380.0, 201.0]] * 2)
 
 
-def test_a_sighting_that_lacks_a_coordinate_keeps_nan_there(course: Course, tmp_path: Path) -> None:
-    np.testing.assert_array_equal(
-        np.isnan(course_npz.load(written(tmp_path, course)).observations.uv_px[-1]), [False, True, False]
-    )
+def test_a_sighting_that_lacks_a_coordinate_is_damaged(course: Course, tmp_path: Path) -> None:
+    uv_px = course_npz.load(written(tmp_path, course)).observations.uv_px
+    np.testing.assert_array_equal(np.isnan(uv_px[-1]), [False, True, True])
+    np.testing.assert_array_equal(is_measured(uv_px), [True] * 6 + [False])
+
+
+def test_a_sighting_that_lacks_the_right_image_has_the_row_of_the_left_one(course: Course, tmp_path: Path) -> None:
+    course["features"][2:, 0, 0] = -1.0
+    course["features"][1, 0, 0] = 207.0
+    uv_px = course_npz.load(written(tmp_path, course)).observations.uv_px
+    np.testing.assert_array_equal(uv_px[0], [400.0, np.nan, 207.0])
+    np.testing.assert_array_equal(is_left_only(uv_px[:-1]), [True] + [False] * 5)
 
 
 def test_nan_of_the_file_is_kept_for_the_audit(course: Course, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from toolkit.datasets import own_tables
 from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError, OutputError
 from toolkit.estimate import Trajectory
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, is_left_only
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 
 Refused = Callable[..., None]
@@ -223,3 +223,24 @@ def test_what_is_saved_says_it_is_of_own_tables(tmp_path: Path) -> None:
     sequence = recorded("twist")
     saved = toolkit.save(tmp_path / "own", **tables_of(sequence), rig=rig_of(sequence))
     assert json.loads((saved / "recording.json").read_text())["provenance"]["format"] == "own-tables"
+
+
+@pytest.mark.parametrize("rows", [("v",), ("vL", "vR")], ids=["one row", "two rows"])
+def test_an_empty_right_image_is_a_sighting_by_the_left_one(tmp_path: Path, rows: tuple[str, ...]) -> None:
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    folder = written(sequence, tmp_path / "mine")
+    header, *lines = (folder / "tracks.csv").read_text().splitlines()
+    assert header == "t_ns,track_id,uL,uR,vL,vR"
+    if rows == ("v",):
+        header, lines = header.removesuffix(",vL,vR") + ",v", [line.rpartition(",")[0] for line in lines]
+    cells = lines[3].split(",")
+    cells[3] = ""
+    if len(rows) == 2:
+        cells[5] = ""
+    lines[3] = ",".join(cells)
+    (folder / "tracks.csv").write_text("\n".join([header, *lines]) + "\n")
+    uv_px = own_tables.load(folder).observations.uv_px
+    np.testing.assert_array_equal(is_left_only(uv_px), np.arange(len(uv_px)) == 3)
+    np.testing.assert_array_equal(uv_px[3, [0, 2]], sequence.observations.uv_px[3, [0, 2]])
+    other = np.arange(len(uv_px)) != 3
+    np.testing.assert_array_equal(uv_px[other], sequence.observations.uv_px[other])

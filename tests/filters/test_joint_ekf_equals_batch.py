@@ -61,6 +61,32 @@ def test_its_last_covariance_is_that_of_the_batch(scenario, at, oracle):
     oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
 
 
+@pytest.mark.parametrize("scenario", SCENARIOS[::2], ids=lambda s: s.name)
+def test_with_later_sightings_by_the_left_image_alone_it_is_the_batch_still(scenario, oracle):
+    """A landmark begins with a pair; of every later sighting uL and v correct, in both with the same noise."""
+    exact = [oracle.recorded(scenario, scale) for scale in (1e-4, 1e-7)]
+    for_mean, for_cov = (replace(one, sequence=without_later_pairs(one.sequence)) for one in exact)
+    estimate, last, forgotten = last_answer(for_mean, AtFirstEstimates())
+    mean, _ = oracle.batch(for_mean, for_mean.track_ids).state(last)
+    assert forgotten > 10, "tracks must have come and gone"
+    assert np.abs(for_mean.error_of(estimate, last) - mean).max() < 1e-8
+    estimate, last, _ = last_answer(for_cov, AtFirstEstimates())
+    _, cov = oracle.batch(for_cov, for_cov.track_ids).state(last)
+    oracle.assert_covariances_agree(estimate.cov, cov, 1e-6)
+    _, cov_of_pairs = oracle.batch(exact[1], exact[1].track_ids).state(last)
+    assert np.trace(cov) > 1.02 * np.trace(cov_of_pairs), "the right images must have told something"
+
+
+def without_later_pairs(sequence):
+    """Return the sequence with the right images of the first sightings of its tracks alone."""
+    seen = sequence.observations
+    later = np.ones(len(seen), dtype=bool)
+    later[np.unique(seen.track_id, return_index=True)[1]] = False
+    uv_px = seen.uv_px.copy()
+    uv_px[later, 1] = np.nan
+    return replace(sequence, observations=replace(seen, uv_px=uv_px))
+
+
 @every_scenario
 def test_a_landmark_left_out_would_show(scenario, oracle):
     """The two tests above can fail: a batch without one track in twenty is another problem."""

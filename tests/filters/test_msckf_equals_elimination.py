@@ -111,7 +111,7 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
     before = joint.core, joint.clones
     first = linearised.select(np.arange(kept))
     joint_landmarks.add_tracks(joint, sightings.track_ids[:kept], points[:kept], first)
-    constraints = multiview.without_landmark(linearised, sightings.seen)
+    constraints = multiview.without_landmark(linearised, sightings)
     H, residuals = multiview.compressed(
         constraints.H.reshape(-1, constraints.H.shape[2]), constraints.residuals.ravel()
     )

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from filters.smart import Smart
+from filters.smoothing.robust_loss import Squares
 from filters.smoothing.smart_factors import RobustCamera, Sightings, Vision
+from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 from toolkit import runner
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
@@ -17,6 +19,7 @@ from toolkit.progress import SILENT
 from toolkit.sequence import StereoFrame
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.track_noise import TrackNoise
 
 RIG, HUBER = FLIGHT.rig, DEFAULTS.outliers.smoother_huber
 CAMERA = RobustCamera(RIG, HUBER)
@@ -94,11 +97,13 @@ def test_point_steps_complete_the_step_of_the_whole_system(scene):
     np.testing.assert_allclose(reduced.point_steps(step[: 6 * POSES]).ravel(), step[6 * POSES :], atol=1e-9)
 
 
-def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
+@pytest.mark.parametrize("left_only", [[], [2, 5, 9, 20, 27]], ids=["pairs", "some by the left image alone"])
+def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene, left_only):
     """The one noise GTSAM's factor takes; on exact measurements both linearise at the same point."""
     poses, points, seen = scene
     rig = replace(RIG, cov_uv_px2=np.eye(3) * 0.7**2)
     exact = stereo.predict(points[seen.point], poses[seen.pose], rig).uv_px
+    exact[left_only, 1] = np.nan
     calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
     graph = gtsam.NonlinearFactorGraph()
     for i in range(POINTS):
@@ -112,6 +117,29 @@ def test_with_equal_noise_it_is_gtsam_smart_stereo_factor(scene):
     reduced = Vision.at(poses, points, replace(seen, uv_px=exact), RobustCamera(rig, HUBER)).reduced()
     # GTSAM triangulates linearly: the point is exact to rounding times the condition of that problem.
     np.testing.assert_allclose(reduced.information, expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("left_only", [[], [2, 9, 16, 17, 20]], ids=["pairs", "some by the left image alone"])
+def test_along_the_tracks_it_says_what_the_other_smoothers_factors_say(scene, left_only):
+    """A sighting may be the one before of a pair and of one by the left image alone: both are counted."""
+    poses, points, seen = scene
+    noise = TrackNoise(np.full(3, 0.3), np.full(3, 0.2), np.array([0.0, 0.7, 0.0]))
+    rig = replace(RIG, track_noise=noise)
+    uv_px = seen.uv_px.copy()
+    uv_px[left_only, 1] = np.nan
+    seen = replace(seen, uv_px=uv_px, ages=seen.pose)
+    frames = [StereoFrame(0, *(a[seen.pose == k] for a in (seen.point, uv_px, seen.ages))) for k in range(POSES)]
+    chained = ChainedFactors(ChainedSightings.of(frames, rig), rig, Squares())
+    values = gtsam_values(poses, points)
+    linear = chained.linearised(values).linearize(values)
+    information, vector = linear.hessian(ordering((X, POSES), (L, POINTS)))
+    n = 6 * POSES
+    across = information[:n, n:] @ np.linalg.inv(information[n:, n:])
+    reduced = Vision.at(poses, points, seen, RobustCamera.of(rig, None)).reduced()
+    scale = np.abs(reduced.information).max()
+    expected = information[:n, :n] - across @ information[n:, :n]
+    np.testing.assert_allclose(reduced.information, expected, atol=1e-9 * scale)
+    np.testing.assert_allclose(reduced.vector, vector[:n].ravel() - across @ vector[n:].ravel(), atol=1e-9 * scale)
 
 
 def test_global_position_and_rotation_gain_no_information(scene):

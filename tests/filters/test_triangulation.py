@@ -51,6 +51,38 @@ def test_noisy_sightings_give_the_least_squares_points():
         assert (point - best.x) @ np.linalg.solve(spread, point - best.x) < 0.01**2
 
 
+def by_the_left_image(uvs_px, rows=slice(None)):
+    result = uvs_px.copy()
+    result[rows, :, 1] = np.nan
+    return result
+
+
+def test_without_right_images_exact_sightings_from_several_poses_give_the_points():
+    points, poses, uvs_px, seen = scene(0)
+    found, reliable = triangulate(by_the_left_image(uvs_px, slice(0, None, 2)), seen, poses, RIG)
+    assert reliable[1::2].all()
+    assert reliable[::2].mean() > 0.8, "most are seen from far enough apart"
+    np.testing.assert_allclose(found[reliable], points[reliable], atol=1e-6)
+
+
+def test_without_right_images_nothing_is_known_of_what_poses_see_from_one_place():
+    """Not the depth, by whatever rounding and half a pixel of noise leave of the rays' angle."""
+    _, poses, uvs_px, seen = scene(0)
+    one_place = np.broadcast_to(poses[0], poses.shape)
+    again = by_the_left_image(np.where(seen[..., None], uvs_px[:, :1], 0.0))
+    noise_px = 0.5 * np.random.default_rng(0).standard_normal(again.shape)
+    for seen_px in (again, again + noise_px):
+        assert not triangulate(seen_px, seen, one_place, RIG)[1].any()
+
+
+def test_one_pair_is_enough_for_a_track_whose_other_right_images_are_missing():
+    points, poses, uvs_px, seen = scene(1)
+    uvs_px[:, 1:, 1] = np.nan
+    found, reliable = triangulate(uvs_px, seen, poses, RIG)
+    assert reliable.all()
+    np.testing.assert_allclose(found, points, atol=1e-7)
+
+
 def test_a_track_is_solved_as_if_alone_whatever_the_others_are():
     """A step that helps one track and harms another is taken by the one only."""
     _, poses, uvs_px, seen = scene(6)

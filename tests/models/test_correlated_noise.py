@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from toolkit.models import correlated_noise
+from toolkit.models import correlated_noise, left_only
 from toolkit.models.correlated_noise import Chain
 from toolkit.simulation import DRIVE
 from toolkit.track_noise import CHANNELS, TrackNoise
@@ -49,6 +49,56 @@ def test_the_error_of_the_last_sighting_has_the_covariance_with_all_that_the_tra
     expected = with_all @ (mixing[np.ix_(used, used)] @ to_whitened).T
     np.testing.assert_allclose(last.gain[0][:, used], expected, atol=1e-9)
     np.testing.assert_allclose(last.cov[0], with_all[:, -3:], atol=1e-12)
+
+
+LEFT_ONLY = np.array([[False, False, True, False, True], [False, False, False, True, False]])
+
+
+@pytest.mark.parametrize("track", [0, 1])
+def test_without_right_images_decorrelated_residuals_have_the_identity_for_covariance(track):
+    seen, ages, left = SEEN[track], AGES[track], LEFT_ONLY[track]
+    mixing = correlated_noise.decorrelation(NOISE, RIG, AGES, SEEN, LEFT_ONLY)[track]
+    to_uv = np.kron(np.eye(seen.sum()), np.linalg.inv(CHANNELS))
+    cov_uv = to_uv @ cov_of_stacked_channels(NOISE, ages[seen]) @ to_uv.T
+    uv_px = np.where(np.arange(3) == 1, np.where(left, np.nan, 0.0)[seen][:, None], 0.0)
+    whitened = block_diag(*np.broadcast_to(left_only.whitener(uv_px, RIG), (seen.sum(), 3, 3)))
+    used = np.repeat(seen, 3)
+    there = mixing[np.ix_(used, used)] @ whitened
+    expected = np.diag(np.where(np.isnan(uv_px), 0.0, 1.0).ravel())
+    np.testing.assert_allclose(there @ cov_uv @ there.T, expected, atol=1e-9)
+
+
+def test_without_right_images_the_error_of_the_last_is_known_as_well_as_the_rest_tells():
+    """By regression on what was measured of (uL, uR, v), written out."""
+    last = correlated_noise.error_of_the_last(NOISE, AGES, SEEN, LEFT_ONLY)
+    for track in (0, 1):
+        seen, ages = SEEN[track], AGES[track]
+        to_uv = np.kron(np.eye(seen.sum()), np.linalg.inv(CHANNELS))
+        cov = cov_of_stacked_channels(NOISE, ages[seen])
+        with_all = cov[-3:].copy()
+        with_all[:, -3:] -= np.diag(np.square(NOISE.white_px))
+        measured = np.ones((seen.sum(), 3), dtype=bool)
+        measured[:, 1] = ~LEFT_ONLY[track][seen]
+        rows = np.flatnonzero(measured)
+        across = (with_all @ to_uv.T)[:, rows]
+        explained = across @ np.linalg.solve((to_uv @ cov @ to_uv.T)[np.ix_(rows, rows)], across.T)
+        np.testing.assert_allclose(last.gain[track] @ last.gain[track].T, explained, atol=1e-9)
+
+
+def test_in_a_chain_the_left_image_follows_what_was_seen_and_a_pair_the_pair_before():
+    left = np.array([False, True, True, False, False])
+    chain = Chain.of(NOISE, np.zeros(5, dtype=np.int64), AGES[0], left)
+    assert chain.before.tolist() == [-1, 0, 1, 0, 3]
+    of_left = np.array([[1.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
+    common = np.square(NOISE.offset_px) + np.square(NOISE.walk_px) * AGES[0][:, None]
+    variance = common + np.square(NOISE.white_px)
+    # Of uL = c + d / 2 and of v: the regression on those of the sighting before.
+    slope = (common[1] @ np.square(of_left).T) / (variance[1] @ np.square(of_left).T)
+    np.testing.assert_allclose(chain.carried[2, [0, 2]], slope)
+    left_over = variance[2] @ np.square(of_left).T - slope * (common[1] @ np.square(of_left).T)
+    np.testing.assert_allclose(np.square(chain.sigma_px[2, [0, 2]]), left_over)
+    pairs = Chain.of(NOISE, np.zeros(3, dtype=np.int64), AGES[0][~left])
+    np.testing.assert_allclose(chain.sigma_px[~left], pairs.sigma_px)
 
 
 def innovations_of(chain: Chain, n: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, own_one_step_px
 from toolkit.geometry import Array
 from toolkit.models.camera_motion import camera_motion
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Sequence, StereoRig, is_measured
 
 # Quantiles of the sightings that are their range: tracks may slide out of the image.
 RANGE = (0.005, 0.995)
@@ -30,7 +30,7 @@ def check(evidence: Evidence) -> Symptom | None:
     """Name the intrinsics that the sightings cannot have; without images there is no way to mend them."""
     sequence = evidence.sequence
     uv_px = sequence.observations.uv_px
-    if len(uv_px) < LEAST_INTERVALS or not np.isfinite(uv_px).all():
+    if len(uv_px) < LEAST_INTERVALS or not is_measured(uv_px).all():
         return None
     low, high = np.quantile(uv_px[:, [0, 2]], RANGE, axis=0)
     faults = _suspects(sequence.rig, low, high)

@@ -7,12 +7,13 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.subsets import keep_samples
 from toolkit.geometry import BoolArray
+from toolkit.sequence import is_measured
 
 
 def check(evidence: Evidence) -> Symptom | None:
-    """Count the rows with a value that is not finite; drop them."""
+    """Count the rows with a value that is not finite; drop them. That a sighting lacks the right image is no fault."""
     sequence = evidence.sequence
-    sightings: BoolArray = np.asarray(np.isfinite(sequence.observations.uv_px).all(axis=1))
+    sightings: BoolArray = is_measured(sequence.observations.uv_px)
     samples: BoolArray = np.asarray(np.isfinite(sequence.motion.values).all(axis=1))
     bad_sightings, bad_samples = int(np.sum(~sightings)), int(np.sum(~samples))
     if bad_sightings + bad_samples == 0:

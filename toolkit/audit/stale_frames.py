@@ -29,7 +29,8 @@ def check(evidence: Evidence) -> Symptom | None:
     """Count the stale frames; every repeated track ends there and a new one starts at the next frame."""
     sequence = evidence.sequence
     pairs = neighbours(sequence.observations)
-    step_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before]).max(axis=1)
+    moved_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before])
+    step_px = np.where(np.isnan(moved_px[:, 1]), moved_px[:, [0, 2]].max(axis=1), moved_px.max(axis=1))
     stale = _stale_intervals(max(sequence.frame_count - 1, 0), pairs, step_px)
     count = int(stale.sum())
     if count == 0:

@@ -15,7 +15,7 @@ from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.agreement import agreement
 from toolkit.geometry import Array, BoolArray
 from toolkit.models.stereo import disparity_px
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, is_left_only
 
 # Share of the disparities that is not positive from which their order is doubted: a repair by dropping would block.
 SUSPECT_SHARE = 0.2
@@ -56,6 +56,9 @@ def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
     """Return the recording with its coordinates in every other order, and with the tracks behind the camera turned."""
     uv_px = sequence.observations.uv_px
     orders = [order for order in itertools.permutations(range(3)) if order != (0, 1, 2)]
+    # What lacks the right image has nothing to be exchanged with.
+    sequence = replace(sequence, observations=sequence.observations.select(~is_left_only(uv_px)))
+    uv_px = sequence.observations.uv_px
     whole = [(_words(order), uv_px[:, list(order)]) for order in orders]
     behind = _behind(sequence)
     if behind.mean() < 1.0 - SUSPECT_SHARE:

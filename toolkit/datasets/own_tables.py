@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.datasets import vislam_recording
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows
+from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations
 from toolkit.datasets.io.named_columns import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file
 from toolkit.datasets.io.tables import find_table
 from toolkit.datasets.io.truth_file import load_truth, with_truth
@@ -117,15 +117,19 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
     table.require("|".join(_STAMPS), *TRACKS, *rows)
     frames_t_ns, frame = np.unique(table.stamps(), return_inverse=True)
     check_frame_count(table.what, frames_t_ns.size)
-    track_id, columns_px, rows_px = table.whole(TRACKS[0]), table.numbers(*TRACKS[1:]), table.numbers(*rows)
+    track_id, left_px = table.whole(TRACKS[0]), table.numbers(TRACKS[1], rows[0])
+    right_px = table.numbers_or_none(TRACKS[2], rows[-1])
+    # A single row v is that of both images, or of the left one.
+    right_px[:, 1] = np.where(np.isnan(right_px[:, 0]) & (rows == ONE_ROW), np.nan, right_px[:, 1])
+    corners_px = np.hstack([left_px, right_px])
     if rows == TWO_ROWS:
-        check_rows(table.what, np.stack([columns_px[:, 0], rows_px[:, 0], columns_px[:, 1], rows_px[:, 1]], axis=1))
+        check_rows(table.what, corners_px)
     order = np.lexsort((track_id, frame))
     twice = np.flatnonzero((np.diff(frame[order]) == 0) & (np.diff(track_id[order]) == 0))
     if twice.size:
         row = int(order[twice[0] + 1])
         raise DataError(f"{table.what}: {table.at(row)}: track {track_id[row]} is there twice in its frame; remove one")
-    return frames_t_ns, Observations.sorted(frame, track_id, np.column_stack([columns_px, rows_px.mean(axis=1)]))
+    return frames_t_ns, observations(frame, track_id, corners_px)
 
 
 def _motion(table: Columns, place: Path, noise: Mapping[str, Any]) -> tuple[MotionSamples, MotionNoise]:

@@ -11,11 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.sequence import StereoRig
+from toolkit.models.left_only import applied, left_whitener
+from toolkit.sequence import StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Part of every sighting's error whatever is stated, a fiftieth of what a tracker resolves: a covariance needs some.
 LEAST_WHITE_PX = 0.01
+_TO_UV = np.linalg.inv(CHANNELS)
 
 
 def white_rig(noise: TrackNoise, rig: StereoRig) -> StereoRig:
@@ -30,16 +32,27 @@ def walked_variance(noise: TrackNoise, ages: IntArray) -> Array:
     return np.asarray(np.square(noise.offset_px) + walked + LEAST_WHITE_PX**2)
 
 
-def decorrelation(noise: TrackNoise, rig: StereoRig, ages: IntArray, seen: BoolArray) -> Array:
+def decorrelation(
+    noise: TrackNoise, rig: StereoRig, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
+) -> Array:
     """Return what makes the residuals of F tracks independent, (F, 3 W, 3 W), of sightings (F, W) of given ages.
 
     It applies to residuals that are whitened as if each sighting stood for itself (``StereoRig.whitener``), stacked
-    by sighting, and to their Jacobians. Rows of what was not seen mix with no others.
+    by sighting, and to their Jacobians. Rows of what was not seen mix with no others, nor does uR of what is
+    ``left_only`` (F, W), in which no channel but v is measured: there C is that of uL, uR and v together.
     """
     tracks, window = seen.shape
     to_channels = CHANNELS @ np.linalg.inv(rig.whitener)
     mixed = np.einsum("fcwv,ck->fwcvk", _inverse_roots(noise, ages, seen), to_channels)
-    return np.asarray(mixed.reshape(tracks, 3 * window, 3 * window))
+    mixed = mixed.reshape(tracks, 3 * window, 3 * window)
+    some = _with_any(left_only)
+    if some.size:
+        assert left_only is not None
+        units = np.where(
+            left_only[some, :, None, None], np.linalg.pinv(left_whitener(rig)), np.linalg.inv(rig.whitener)
+        )
+        mixed[some] = _together(_inverse_root_of_all(noise, ages[some], seen[some], left_only[some]), units)
+    return np.asarray(mixed)
 
 
 class LastError(NamedTuple):
@@ -51,23 +64,90 @@ class LastError(NamedTuple):
     gain: Array
 
 
-def error_of_the_last(noise: TrackNoise, ages: IntArray, seen: BoolArray) -> LastError:
+def error_of_the_last(
+    noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
+) -> LastError:
     """Return what the walk and the offset have come to in F tracks at the last of W places, where all are seen."""
     tracks, window = seen.shape
     walk, offset = np.square(noise.walk_px), np.square(noise.offset_px)
     shared = np.where(seen[:, None, :], walk[:, None] * ages[:, None, :] + offset[:, None], 0.0)
     with_residuals = np.einsum("fcwv,fcv->fcw", _inverse_roots(noise, ages, seen), shared)
     gain = np.einsum("fcw,ck->fcwk", with_residuals, np.eye(3)).reshape(tracks, 3, 3 * window)
+    some = _with_any(left_only)
+    if some.size:
+        assert left_only is not None
+        with_uv = np.einsum("fcw,ic->fcwi", shared[some], _TO_UV)
+        with_uv[..., 1] = np.where(left_only[some, None, :], 0.0, with_uv[..., 1])
+        roots = _inverse_root_of_all(noise, ages[some], seen[some], left_only[some])
+        gain[some] = with_uv.reshape(some.size, 3, 3 * window) @ np.swapaxes(roots, 1, 2)
     return LastError(shared[:, :, -1, None] * np.eye(3), gain)
 
 
 def _inverse_roots(noise: TrackNoise, ages: IntArray, seen: BoolArray) -> Array:
     """Return the inverse Cholesky factors (F, 3, W, W) of the sightings' covariances, a channel each."""
-    window = seen.shape[1]
     both = seen[:, None, :, None] & seen[:, None, None, :]
-    white = np.maximum(LEAST_WHITE_PX**2 - noise.white_px**2, 0.0)[:, None, None] * np.eye(window)
-    cov = np.where(both, noise.cov(ages.astype(float)) + white, np.eye(window))
+    cov = np.where(both, _cov_of_channels(noise, ages), np.eye(seen.shape[1]))
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+
+
+def _cov_of_channels(noise: TrackNoise, ages: IntArray) -> Array:
+    """Return the covariances (F, 3, W, W) px^2 of sightings of given ages (F, W), a channel each."""
+    white = np.maximum(LEAST_WHITE_PX**2 - noise.white_px**2, 0.0)[:, None, None] * np.eye(ages.shape[1])
+    return np.asarray(noise.cov(ages.astype(float)) + white)
+
+
+def _with_any(left_only: BoolArray | None) -> IntArray:
+    """Return the tracks that lack a right image."""
+    return np.flatnonzero(np.zeros(0) if left_only is None else left_only.any(axis=1))
+
+
+def _inverse_root_of_all(noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray) -> Array:
+    """Return the inverse Cholesky factors (F, 3 W, 3 W) of what is measured of (uL, uR, v) in all sightings."""
+    tracks, window = seen.shape
+    cov = np.einsum("ic,fcwv,jc->fwivj", _TO_UV, _cov_of_channels(noise, ages), _TO_UV)
+    measured = np.repeat(seen[:, :, None], 3, axis=2)
+    measured[..., 1] &= ~left_only
+    measured = measured.reshape(tracks, 3 * window)
+    both = measured[:, :, None] & measured[:, None, :]
+    cov = np.where(both, cov.reshape(tracks, 3 * window, 3 * window), np.eye(3 * window))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+
+
+def _together(mixing: Array, units: Array) -> Array:
+    """Return (F, 3 W, 3 W) times what each sighting (F, W, 3, 3) is multiplied by before."""
+    tracks, window = units.shape[:2]
+    by_sighting = mixing.reshape(tracks, 3 * window, window, 3)
+    return np.asarray(np.einsum("frwi,fwij->frwj", by_sighting, units).reshape(mixing.shape))
+
+
+def channels_of(uv_px: Array) -> Array:
+    """Return the channels of sightings (N, 3): (3, 3), or (N, 3, 3) with uL, nothing and v where uR is missing."""
+    left = is_left_only(uv_px)
+    every: Array = np.where(left[:, None, None], np.diag([1.0, 0.0, 1.0]), CHANNELS)
+    return every if left.any() else CHANNELS
+
+
+def in_channels(channels: Array, values: Array) -> Array:
+    """Return values (N, 3) of (uL, uR, v), or their derivatives (N, 3, k), in channels (3, 3) or (N, 3, 3)."""
+    return applied(channels, values) if values.ndim == 2 else np.asarray(channels @ values)
+
+
+def _as_seen(variance: Array, left: BoolArray, of_none: float = 0.0) -> Array:
+    """Return variances (N, 3) of the channels c, d, v, where only left sees as those of uL = c + d / 2, none, and v."""
+    if not left.any():
+        return variance
+    of_left = np.stack([variance[:, 0] + 0.25 * variance[:, 1], np.full(len(left), of_none), variance[:, 2]], axis=1)
+    return np.where(left[:, None], of_left, variance)
+
+
+def _row_before(track: IntArray) -> IntArray:
+    """Return the row (N,) of the sighting before each of its track (N,), -1 where there is none."""
+    order = np.argsort(track, kind="stable")
+    follows = np.zeros(track.size, dtype=bool)
+    follows[1:] = track[order][1:] == track[order][:-1]
+    before = np.full(track.size, -1)
+    before[order[follows]] = order[np.flatnonzero(follows) - 1]
+    return before
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,23 +163,26 @@ class Chain:
     sigma_px: Array
 
     @classmethod
-    def of(cls, noise: TrackNoise, track: IntArray, ages: IntArray) -> "Chain":
+    def of(cls, noise: TrackNoise, track: IntArray, ages: IntArray, left_only: BoolArray | None = None) -> "Chain":
         """Return the chain of sightings of tracks (N,) with ages (N,), those of a track in the order of time.
 
         It is the Markov chain whose sightings have their variances, and whose successive ones their covariances:
         exact for noise that is all white, and for a walk and an offset without white noise. In between it forgets a
         part of the offset at every step: the share of the white variance in that of the sighting.
+
+        What is ``left_only`` (N,) follows the sighting before it in uL and v (:func:`channels_of`), what both images
+        show the last that both showed: in between there is no disparity to go on from. The walk of uL over such a gap
+        counts twice.
         """
-        order = np.argsort(track, kind="stable")
-        follows = np.zeros(track.size, dtype=bool)
-        follows[1:] = track[order][1:] == track[order][:-1]
-        before = np.full(track.size, -1)
-        before[order[follows]] = order[np.flatnonzero(follows) - 1]
+        left = np.zeros(track.size, dtype=bool) if left_only is None else left_only
+        before, both = _row_before(track), np.flatnonzero(~left)
+        if left.any():
+            before[both] = np.append(both, -1)[_row_before(track[both])]
         common = np.square(noise.offset_px) + np.square(noise.walk_px) * ages[:, None].astype(float)
         variance = common + np.square(np.maximum(noise.white_px, LEAST_WHITE_PX))
-        with_before = np.where(before[:, None] >= 0, common[before], 0.0)
-        carried = with_before / variance[before]
-        return cls(before, carried, np.sqrt(variance - carried * with_before))
+        with_before = np.where(before[:, None] >= 0, _as_seen(common[before], left), 0.0)
+        carried = with_before / _as_seen(variance[before], left, of_none=1.0)
+        return cls(before, carried, np.sqrt(_as_seen(variance, left, of_none=1.0) - carried * with_before))
 
     @classmethod
     def without_memory(cls, count: int) -> "Chain":
@@ -111,9 +194,15 @@ class Chain:
         rows = np.append(np.cumsum(kept) - 1, -1)
         return Chain(rows[self.before[kept]], self.carried[kept], self.sigma_px[kept])
 
-    def innovations(self, residual_px: Array) -> Array:
-        """Return residuals (N, 3) of (uL, uR, v), px, as independent ones of unit variance, in the channels."""
-        return self.whitened(residual_px @ CHANNELS.T, (residual_px @ CHANNELS.T)[self.before])
+    def innovations(self, residual_px: Array, channels: Array = CHANNELS) -> Array:
+        """Return residuals (N, 3) of (uL, uR, v), px, as independent ones of unit variance, in channels."""
+        return self.whitened(in_channels(channels, residual_px), self.of_before(channels, residual_px))
+
+    def of_before(self, channels: Array, values: Array) -> Array:
+        """Return values (N, 3, ...) of the sightings before, in the channels, (3, 3) or (N, 3, 3), of those after."""
+        if channels.ndim == 2:
+            return np.asarray(in_channels(channels, values)[self.before])
+        return np.asarray(in_channels(channels, values[self.before]))
 
     def whitened(self, own: Array, before: Array) -> Array:
         """Return what is left of values (N, 3, ...) in the channels, less what was carried on, in sigmas."""

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from itertools import chain
+from math import isnan
 from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
 from toolkit.geometry import Array
+from toolkit.models import left_only
 from toolkit.sequence import StereoFrame, StereoRig
 
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
@@ -26,22 +28,38 @@ def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:
 
 
 class StereoFactors:
-    """Makes one projection factor per sighting: the measurement, noise and extrinsic the filters use."""
+    """Makes one projection factor per sighting: the measurement, noise and extrinsic the filters use.
+
+    A sighting that lacks the right image has a factor of the left camera, with two rows instead of three and the loss
+    of the others.
+    """
 
     def __init__(self, rig: StereoRig, robust: gtsam.noiseModel.mEstimator.Base | None = None) -> None:
-        gaussian = gtsam.noiseModel.Gaussian.Covariance(rig.cov_uv_px2)
-        self._noise = gaussian if robust is None else gtsam.noiseModel.Robust.Create(robust, gaussian)
+        self._noise = _noise(rig.cov_uv_px2, robust)
+        self._left_noise = _noise(left_only.left_cov_px2(rig), robust)
         self._calibration = gtsam.Cal3_S2Stereo(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px, rig.baseline_m)
+        self._left_calibration = gtsam.Cal3_S2(rig.fx_px, rig.fy_px, 0.0, rig.cx_px, rig.cy_px)
         self._T_imu_cam = gtsam.Pose3(rig.T_imu_cam)
 
     def of(self, frame: StereoFrame, k: int) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the factors between the pose X(k) and the landmarks L(track id) the frame shows."""
         pose = X(k)
         for track_id, uv_px in zip(frame.track_ids.tolist(), frame.uvs_px.tolist(), strict=True):
+            if isnan(uv_px[1]):
+                left_px = np.array([uv_px[0], uv_px[2]])
+                yield gtsam.GenericProjectionFactorCal3_S2(
+                    left_px, self._left_noise, pose, L(track_id), self._left_calibration, self._T_imu_cam
+                )
+                continue
             measured = gtsam.StereoPoint2(*uv_px)
             yield gtsam.GenericStereoFactor3D(
                 measured, self._noise, pose, L(track_id), self._calibration, self._T_imu_cam
             )
+
+
+def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.noiseModel.Base:
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(cov_px2)
+    return gaussian if robust is None else gtsam.noiseModel.Robust.Create(robust, gaussian)
 
 
 def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam.NonlinearFactorGraph:

@@ -30,6 +30,13 @@ def dropped_sightings(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> S
     return replace(sequence, observations=sequence.observations.select(kept))
 
 
+def missing_right(sequence: Sequence, dose: float = 0.33, seed: int = 0) -> Sequence:
+    """Lose the right image of a share of the sightings, each by itself: a stereo matcher that fails now and then."""
+    uv_px = sequence.observations.uv_px.copy()
+    uv_px[np.random.default_rng(seed).uniform(size=len(uv_px)) < dose, 1] = np.nan
+    return _with_pixels(sequence, uv_px)
+
+
 def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """See nothing for so many seconds, and new tracks after that: a tunnel, glare, a covered lens."""
     seen, begin_s, end_s = sequence.observations, *span_s(sequence, dose, seed)

@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3
 from toolkit.models.gating import LEAST_DISPARITY_PX
-from toolkit.sequence import Sequence, StereoRig
+from toolkit.sequence import Sequence, StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS
 
 # A landmark has three unknowns, and so has a sighting: from the third on a walk can be told from white noise.
@@ -67,6 +67,8 @@ class Tracklets:
 def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
     """Return the tracks an estimator may see, a group for each number of sightings; none where none is long enough."""
     seen = sequence.visible
+    # Disparities are what the noise is told by: a track ends where it lacks the right image.
+    seen = seen.select(~is_left_only(seen.uv_px))
     order = np.lexsort((seen.frame, seen.track_id))
     frame, track_id, cdv_px = seen.frame[order], seen.track_id[order], seen.uv_px[order] @ CHANNELS.T
     first = np.flatnonzero(np.diff(track_id, prepend=track_id[:1] - 1) != 0)

@@ -182,7 +182,12 @@ def camera_matrix(path: Path, key: str, K: Array) -> Array:
 
 
 def observations(frame: IntArray, track_id: IntArray, corners_px: Array) -> Observations:
-    """Build sightings from rows in any order; corners (N, 4) are uL, vL, uR, vR and v is the mean of the two rows."""
+    """Build sightings from rows in any order; corners (N, 4) are uL, vL, uR, vR and v is the mean of the two rows.
+
+    Where uR and vR are NaN the right image is missing, and v is vL; where one of them is, the sighting is damaged.
+    """
     u_left_px, v_left_px, u_right_px, v_right_px = corners_px.T
-    uv_px = np.stack([u_left_px, u_right_px, 0.5 * (v_left_px + v_right_px)], axis=1)
+    no_u, no_v = np.isnan(u_right_px), np.isnan(v_right_px)
+    v_px = np.where(no_u & no_v, v_left_px, np.where(no_u, np.nan, 0.5 * (v_left_px + v_right_px)))
+    uv_px = np.stack([u_left_px, u_right_px, v_px], axis=1)
     return Observations.sorted(frame, track_id, uv_px)

@@ -1,7 +1,7 @@
 """Columns by name, of a CSV file or of a program's own values, with every complaint naming table, column and row."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,14 @@ class Columns:
     def numbers(self, *names: str) -> Array:
         """Return columns side by side (N, C) as float64, NaN included; raises DataError naming the row of a text."""
         return np.stack([self._numbers(name) for name in names], axis=1)
+
+    def numbers_or_none(self, *names: str) -> Array:
+        """Return columns as :meth:`numbers` does, with NaN where a CSV has nothing."""
+        filled = {name: [cell or "nan" for cell in self.values[name]] for name in names if self._is_text(name)}
+        return replace(self, values={**self.values, **filled}).numbers(*names)
+
+    def _is_text(self, name: str) -> bool:
+        return all(isinstance(cell, str) for cell in self.values[name])
 
     def whole(self, name: str) -> IntArray:
         """Return a column of whole numbers (N,); raises DataError naming the row of anything else."""

@@ -78,7 +78,7 @@ def _kept_entries(
 def corners_of(features: SparseArray) -> tuple[IntArray, IntArray, Array]:
     """Return frame (N,), track (N,) and uL, vL, uR, vR (N, 4) px of features (4, M, T).
 
-    A sighting that lacks a coordinate has NaN there, for the audit to find.
+    A sighting that lacks a coordinate has NaN there: both of the right image, or one, for the audit to find.
     """
     coordinate, track, frame = features.indices
     tracks = max(features.shape[1], 1)

@@ -15,7 +15,7 @@ That needs a truth with every state, exact: the motion measured between its stat
 stated noise says. Where a recording has none, the bound that the model claims is had at an estimate of the states.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import gtsam
@@ -27,13 +27,13 @@ from toolkit.initialization import start_from_measurements
 from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.consistency import starts_in_the_truths_world
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.models import stereo
+from toolkit.models import left_only, stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief, Layout
 from toolkit.models.state_covariances import state_covs
-from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig
+from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is_left_only
 
 # A sighting whose residual at the truth is this improbable is a mismatch and informs nobody.
 _MISMATCH_PROBABILITY = 1e-6
@@ -171,18 +171,31 @@ def _without_mismatches(
     packets: tuple[Packet, ...], poses: Array, rig: StereoRig
 ) -> tuple[tuple[Packet, ...], IntArray, Array]:
     """Return the packets without sightings that chance does not explain, and the landmarks (M,), (M, 3) of the rest."""
-    kept = packets
+    kept = _placed_by_stereo(packets)
     for _ in range(2):
         track_ids, points = _landmarks(kept, poses, rig)
         sound = [_explained(p.frame, track_ids, points, pose, rig) for p, pose in zip(kept, poses, strict=True)]
-        kept = tuple(Packet(p.index, p.motion, f) for p, f in zip(kept, sound, strict=True))
+        kept = _placed_by_stereo(tuple(Packet(p.index, p.motion, f) for p, f in zip(kept, sound, strict=True)))
     return kept, *_landmarks(kept, poses, rig)
+
+
+def _placed_by_stereo(packets: tuple[Packet, ...]) -> tuple[Packet, ...]:
+    """Return the packets without the sightings by the left image alone of tracks that no pair has shown before."""
+    if not any(is_left_only(packet.frame.uvs_px).any() for packet in packets):
+        return packets
+    placed, kept = np.empty(0, dtype=np.int64), []
+    for packet in packets:
+        frame, left = packet.frame, is_left_only(packet.frame.uvs_px)
+        placed = np.union1d(placed, frame.track_ids[~left])
+        kept.append(replace(packet, frame=frame.select(np.isin(frame.track_ids, placed))))
+    return tuple(kept)
 
 
 def _explained(frame: StereoFrame, track_ids: IntArray, points: Array, pose: Array, rig: StereoRig) -> StereoFrame:
     seen = stereo.predict(points[np.searchsorted(track_ids, frame.track_ids)], pose, rig)
-    whitened = (frame.uvs_px - seen.uv_px) @ rig.whitener.T
-    likely = np.square(whitened).sum(axis=1) < chi2_bound(3, 1.0 - _MISMATCH_PROBABILITY)
+    whitened = left_only.whitened_residuals(frame.uvs_px, seen.uv_px, rig)
+    bound = chi2_bound(left_only.degrees_of_freedom(frame.uvs_px), 1.0 - _MISMATCH_PROBABILITY)
+    likely = np.square(whitened).sum(axis=1) < bound
     return frame.select(likely & (seen.depth_m > 0.0))
 
 
@@ -196,10 +209,10 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
     uvs_px, seen_from = uvs_px[order], poses[pose[order]]
     track_ids, first, track = np.unique(ids[order], return_index=True, return_inverse=True)
     points = stereo.triangulate_world(uvs_px[first], seen_from[first], rig)
-    whitener = rig.whitener
+    whitener = left_only.whitener(uvs_px, rig)
     for _ in range(_POINT_ITERATIONS):
         seen = stereo.predict(points[track], seen_from, rig)
-        H, residuals = whitener @ seen.d_uv_d_point, (uvs_px - seen.uv_px) @ whitener.T
+        H, residuals = whitener @ seen.d_uv_d_point, left_only.whitened_residuals(uvs_px, seen.uv_px, rig)
         H_transposed = np.swapaxes(H, 1, 2)
         information = np.add.reduceat(H_transposed @ H, first)
         score = np.add.reduceat((H_transposed @ residuals[..., None])[..., 0], first)
@@ -271,9 +284,9 @@ class _Information:
         problem, rows = self._problem, self._problem.rows(frame)
         self._join(rows[~np.isin(rows, self._landmarks)])
         seen = stereo.predict(problem.points[rows], T_world_imu, problem.rig)
-        whitener = problem.rig.whitener
+        whitener = left_only.whitener(frame.uvs_px, problem.rig)
         H = np.concatenate([whitener @ seen.d_uv_d_pose, whitener @ seen.d_uv_d_point], axis=2)
-        residuals = (frame.uvs_px - seen.uv_px) @ whitener.T
+        residuals = left_only.whitened_residuals(frame.uvs_px, seen.uv_px, problem.rig)
         place = np.argsort(self._landmarks)[np.searchsorted(np.sort(self._landmarks), rows)]
         own = self._size + 3 * place[:, None] + np.arange(3)
         columns = np.concatenate([np.broadcast_to(np.arange(6), (len(rows), 6)), own], axis=1)

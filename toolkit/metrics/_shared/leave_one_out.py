@@ -19,6 +19,7 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.residuals import reprojection_errors_px
+from toolkit.models import left_only
 from toolkit.sequence import Observations, StereoRig
 
 # Leaving one out of three leaves two, the fewest in which an outlier contradicts the motion.
@@ -59,7 +60,8 @@ class Views:
 
     ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. A measurement is
     focal * (numerator @ q + numerator_0) / (denominator @ q + denominator_0) + centre, with numerators
-    (N, 3, 3), (N, 3) for uL, uR and v, and denominators (N, 3), (N,). ``sqrt_information`` (3, 3) whitens.
+    (N, 3, 3), (N, 3) for uL, uR and v, and denominators (N, 3), (N,). ``sqrt_information`` (3, 3), or
+    one each (N, 3, 3), whitens.
     """
 
     track: IntArray
@@ -84,7 +86,7 @@ class Views:
     def normal_equations(self, points: Array) -> NormalEquations:
         """Linearise every view at its track's point (M, 3), with Huber's weights."""
         uv_px, d_uv_d_point, in_front = self.predict(points[self.track])
-        residual = (self.uv_px - uv_px) @ self.sqrt_information.T
+        residual = left_only.applied(self.sqrt_information, left_only.residuals_px(self.uv_px, uv_px))
         length = np.linalg.norm(residual, axis=1)
         visible = in_front & np.isfinite(length)
         length = np.where(visible, length, _BEHIND_SIGMAS)
@@ -110,6 +112,8 @@ class Views:
         other = first_of_track + place
         other += other >= np.repeat(rows, count)
         chosen = {name: getattr(self, name)[other] for name in _PER_VIEW}
+        if self.sqrt_information.ndim == 3:
+            chosen["sqrt_information"] = self.sqrt_information[other]
         return replace(self, track=np.repeat(np.arange(rows.size), count), first=first, **chosen)
 
     def summed(self, shares: Array) -> Array:
@@ -183,7 +187,7 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
         denominator_0=constant[:, 2],
         focal_px=np.array([rig.fx_px, rig.fx_px, rig.fy_px]),
         centre_px=np.array([rig.cx_px, rig.cx_px, rig.cy_px]),
-        sqrt_information=rig.whitener,
+        sqrt_information=left_only.whitener(uv_px, rig),
     )
 
 
@@ -198,9 +202,9 @@ def _start(views: Views, T_last_view: Array, rig: StereoRig) -> Array:
 
 
 def _median_by_track(views: Views, values: Array) -> Array:
-    """Return the lower median (M,) of values (N,) over each track's views; NaN sorts last."""
-    order = np.lexsort((values, views.track))
-    median: Array = values[order][views.first + (views.count - 1) // 2]
+    """Return the lower median (M,) of values (N,) over each track's views, those apart that are NaN."""
+    order, known = np.lexsort((values, views.track)), np.add.reduceat((~np.isnan(values)).astype(np.int64), views.first)
+    median: Array = values[order][views.first + np.maximum(known - 1, 0) // 2]
     return np.where(np.isfinite(median), median, 0.0)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
 from toolkit.metrics._shared.association import Matched
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.sequence import is_left_only
 
 # An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or
 # one that is not finite, counts as this much, so that no run wins by losing its points.
@@ -39,9 +40,12 @@ def rmse(errors: Array) -> float:
 def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_front: BoolArray) -> Array:
     """Return the root mean square of the uL, uR and v residuals (N,), no more than CAP_PX.
 
-    Predictions and measurements are (N, 3); an observation that is not ``in_front`` (N,) counts as CAP_PX.
+    Predictions and measurements are (N, 3); an observation that is not ``in_front`` (N,) counts as CAP_PX. One that
+    lacks the right image has the root mean square of uL and v.
     """
-    errors_px = np.sqrt(np.mean((uv_measured_px - uv_predicted_px) ** 2, axis=1))
+    squares_px2 = (uv_measured_px - uv_predicted_px) ** 2
+    means_px2 = np.where(is_left_only(uv_measured_px), squares_px2[:, [0, 2]].mean(axis=1), squares_px2.mean(axis=1))
+    errors_px = np.sqrt(means_px2)
     return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
 
 

@@ -1,0 +1,91 @@
+"""Sightings by the left image alone: the one place that knows what of (uL, uR, v) is then measured, and how well.
+
+Where uR is missing (NaN) it is as if it had been measured with an infinite variance: its rows of residual and Jacobian
+are zero, the noise of uL and v does not depend on it, and the sighting has two degrees of freedom. So it keeps three
+rows, of which one says nothing, and what works on whole frames needs no second path. Every function returns the rig's
+one noise, and three degrees of freedom, where no right image is missing.
+"""
+
+import numpy as np
+
+from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.sequence import StereoRig, is_left_only
+
+_U_RIGHT = 1
+_SEEN = np.ix_([0, 2], [0, 2])
+
+
+def degrees_of_freedom(uvs_px: Array) -> int | IntArray:
+    """Return how many coordinates sightings (..., 3) px have: 3 of all, or 2 or 3 of each (...)."""
+    missing = is_left_only(uvs_px)
+    return 3 - missing.astype(np.int64) if missing.any() else 3
+
+
+def residuals_px(uvs_px: Array, predicted_px: Array) -> Array:
+    """Return measured less predicted (..., 3) px, zero where uR is missing."""
+    residuals: Array = uvs_px - predicted_px
+    missing = is_left_only(uvs_px)
+    if missing.any():
+        residuals[..., _U_RIGHT] = np.where(missing, 0.0, residuals[..., _U_RIGHT])
+    return residuals
+
+
+def seen_rows(uvs_px: Array, jacobian: Array) -> Array:
+    """Return Jacobians (..., 3, k) of predicted sightings with the row of uR zero where it is missing."""
+    missing = is_left_only(uvs_px)
+    if not missing.any():
+        return jacobian
+    result: Array = jacobian.copy()
+    result[missing, _U_RIGHT] = 0.0
+    return result
+
+
+def noise_px2(uvs_px: Array, rig: StereoRig) -> Array:
+    """Return the noise of sightings: the rig's (3, 3), or each one's (..., 3, 3), which keeps a missing uR apart.
+
+    The row of uR is to be taken with those of :func:`residuals_px` and :func:`seen_rows`, which are zero.
+    """
+    return _each(uvs_px, rig.cov_uv_px2, _left_noise_px2(rig))
+
+
+def whitener(uvs_px: Array, rig: StereoRig) -> Array:
+    """Return what whitens residuals and Jacobians of sightings, (3, 3) or (..., 3, 3), and makes a missing row zero.
+
+    It does not make a row zero that is NaN: residuals are those of :func:`residuals_px`.
+    """
+    return _each(uvs_px, rig.whitener, left_whitener(rig))
+
+
+def left_whitener(rig: StereoRig) -> Array:
+    """Return what whitens a sighting that lacks the right image (3, 3), the row and column of uR zero."""
+    result = np.zeros((3, 3))
+    result[_SEEN] = np.linalg.inv(np.linalg.cholesky(_left_noise_px2(rig)[_SEEN]))
+    return result
+
+
+def whitened_residuals(uvs_px: Array, predicted_px: Array, rig: StereoRig) -> Array:
+    """Return measured less predicted (..., 3) in standard deviations, zero where uR is missing."""
+    return applied(whitener(uvs_px, rig), residuals_px(uvs_px, predicted_px))
+
+
+def applied(matrix: Array, values: Array) -> Array:
+    """Return a matrix (3, 3), or one each (..., 3, 3), times values (..., 3)."""
+    return np.asarray(values @ matrix.T if matrix.ndim == 2 else (matrix @ values[..., None])[..., 0])
+
+
+def left_cov_px2(rig: StereoRig) -> Array:
+    """Return the covariance (2, 2) px^2 of (uL, v) in a sighting by the left image alone."""
+    return np.asarray(_left_noise_px2(rig)[_SEEN])
+
+
+def _left_noise_px2(rig: StereoRig) -> Array:
+    """Return the noise (3, 3) with uR apart. Where v is the mean of two rows, one row alone errs more: as uL does."""
+    cov_px2 = rig.cov_uv_px2.copy()
+    cov_px2[_U_RIGHT, [0, 2]] = cov_px2[[0, 2], _U_RIGHT] = 0.0
+    cov_px2[2, 2] = max(cov_px2[2, 2], cov_px2[0, 0])
+    return cov_px2
+
+
+def _each(uvs_px: Array, whole: Array, left: Array) -> Array:
+    missing: BoolArray = is_left_only(uvs_px)
+    return np.where(missing[..., None, None], left, whole) if missing.any() else whole
