@@ -58,9 +58,9 @@ class SeedEkf:
 
     def _correct_pose(self, seen: LandmarkMap, uvs_px: Array) -> None:
         predicted = stereo.predict(seen.points, self._belief.T_world_imu, self._rig)
-        information = np.broadcast_to(np.linalg.inv(self._rig.cov_uv_px2), (len(seen), 3, 3))
-        residual_px = uvs_px - predicted.uv_px
-        self._belief = updated_by_pose_sightings(self._belief, residual_px, predicted.d_uv_d_pose, information)
+        residual_px, H_pose = uvs_px - predicted.uv_px, predicted.d_uv_d_pose
+        weighted = np.asarray(np.linalg.solve(self._rig.cov_uv_px2, H_pose))
+        self._belief = updated_by_pose_sightings(self._belief, residual_px, H_pose, weighted)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""

@@ -12,7 +12,7 @@ import numpy as np
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound, huber_weights, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
@@ -41,21 +41,37 @@ def correct_pose(
     """
     predicted = stereo.predict(landmarks.points, belief.T_world_imu, rig)
     residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
-    own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + rig.cov_uv_px2
-    nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
+    own_cov = H_point @ landmarks.covs @ transposed(H_point) + rig.cov_uv_px2
+    nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
     accepted = gate.accepts(nis, 3, predicted.depth_m > 0.0)
-    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov), huber), 0.0)
-    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
+    weights = accepted.astype(float)
+    if huber is not None:
+        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), huber)
+    weighted = weights[:, None, None] * np.linalg.solve(own_cov, H_pose)
+    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weighted)
     return PoseCorrection(corrected, accepted)
 
 
-def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:
-    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6) and information matrices (N, 3, 3)."""
-    weighted = np.swapaxes(H_pose, 1, 2) @ information
-    posterior = np.linalg.inv(belief.cov)
-    posterior[POSE, POSE] += (weighted @ H_pose).sum(axis=0)
-    cov = np.linalg.inv(posterior)
-    return belief.moved(cov[:, POSE] @ np.einsum("nij,nj->i", weighted, residual_px), cov)
+def carried_pose_cov(H_pose: Array, pose_cov: Array) -> Array:
+    """Return ``H P H^T`` (N, 3, 3) of Jacobians (N, 3, 6), the first product being one for all N."""
+    carried = H_pose.reshape(-1, 6) @ pose_cov
+    return np.asarray(carried.reshape(H_pose.shape) @ transposed(H_pose))
+
+
+def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, weighted: Array) -> Belief:
+    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6).
+
+    ``weighted`` (N, 3, 6) are the Jacobians, each multiplied by the information matrix of its residual. They add up to
+    an information matrix M (6, 6) and vector n (6,) of the pose. Of the belief's covariance P and its columns p of the
+    pose the update takes ``P_p (1 + M P_pp)^-1 M P_p^T``, and it moves by ``P_p (1 + M P_pp)^-1 n``: the same as the
+    inverse of ``P^-1 + M``, without inverting P.
+    """
+    rows = weighted.reshape(-1, 6)
+    matrix, vector = rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)
+    cov_pose = belief.cov[:, POSE]
+    told = np.column_stack([matrix @ cov_pose.T, vector])
+    taken = cov_pose @ np.linalg.solve(np.eye(6) + matrix @ cov_pose[POSE], told)
+    return belief.moved(taken[:, -1], belief.cov - taken[:, :-1])
 
 
 class LandmarkCorrection(NamedTuple):
@@ -75,13 +91,14 @@ def correct_landmarks(
     """
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
     residual_px, H_pose, H_point = uvs_px - predicted.uv_px, predicted.d_uv_d_pose, predicted.d_uv_d_point
-    noise_px2 = rig.cov_uv_px2 + H_pose @ pose_cov @ np.swapaxes(H_pose, 1, 2)
-    innovation_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + noise_px2
-    gain = np.swapaxes(np.linalg.solve(innovation_cov, H_point @ landmarks.covs), 1, 2)
-    points = landmarks.points + (gain @ residual_px[..., None])[..., 0]
-    covs = landmarks.covs - gain @ H_point @ landmarks.covs
+    carried = H_point @ landmarks.covs
+    innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + rig.cov_uv_px2
+    weighted = np.linalg.solve(innovation_cov, np.concatenate([carried, residual_px[..., None]], axis=2))
+    nis = np.einsum("ni,ni->n", residual_px, weighted[..., 3])
+    update = transposed(carried) @ weighted
+    points, covs = landmarks.points + update[..., 3], landmarks.covs - update[..., :3]
     corrected = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
-    return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), predicted.depth_m)
+    return LandmarkCorrection(corrected, nis, predicted.depth_m)
 
 
 def correct_landmarks_below(
