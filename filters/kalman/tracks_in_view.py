@@ -16,15 +16,15 @@ from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief
+from filters.kalman.joint import JointBelief, divided_by_root
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import Window
 from filters.kalman.triangulation import nearest_view
+from toolkit.arrays import is_among
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
@@ -127,7 +127,8 @@ class TracksInView:
         known = self._known
         rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
         points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
-        still, here = np.isin(known.clone_frames, joint.clone_frames), np.isin(joint.clone_frames, known.clone_frames)
+        still = is_among(known.clone_frames, joint.clone_frames)
+        here = is_among(joint.clone_frames, known.clone_frames)
         points[before] = known.points[rows[before]]
         weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
         reliable, new = before.copy(), sightings.select(~before)
@@ -258,14 +259,14 @@ def _of_poses(rows: _Rows) -> tuple[Array, Array]:
 def _informed(joint: JointBelief, matrix: Array, vector: Array) -> Belief:
     """Return the state now given information (6 W, 6 W), (6 W,) on the clones."""
     core, clones = joint.core, joint.clone_columns
-    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size]
+    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size].copy()
     cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
-    root = np.linalg.cholesky(cov)
-    to_core = solve_triangular(root, cross, lower=True, check_finite=False)
+    root = np.asarray(np.linalg.cholesky(cov), dtype=float)
+    to_core = divided_by_root(root, cross)
     spread = root.T @ matrix @ root
     spread.flat[:: len(spread) + 1] += 1.0
-    right = np.column_stack([to_core, root.T @ vector])
-    halves = solve_triangular(np.linalg.cholesky(spread), right, lower=True, check_finite=False)
+    spread_root = np.asarray(np.linalg.cholesky(spread), dtype=float)
+    halves = divided_by_root(spread_root, np.column_stack([to_core, root.T @ vector]))
     half = halves[:, :-1]
     return core.moved(half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half)
 
