@@ -62,12 +62,13 @@ class Compilation:
             why = " ".join(str(error).split())[:200]
             if self._asked == "compiled":
                 raise EstimatorError(f"arithmetic = compiled: numba cannot be used here ({why})") from error
-            self.log = (f"numba cannot be used here, NumPy ran: {why}",)
+            self.log = tuple(dict.fromkeys([*self.log, f"numba cannot be used here, NumPy ran: {why}"]))
             return None
         self.ran = "compiled"
-        self.wall_s, self.cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+        took_s = time.process_time() - cpu
+        self.wall_s, self.cpu_s = self.wall_s + time.perf_counter() - wall, self.cpu_s + took_s
         if first and module.COMPILED:
-            self.log = (f"{module.COMPILED} ({self.cpu_s:.0f} s of CPU, in none of the times)",)
+            self.log += (f"{module.COMPILED} ({took_s:.0f} s of CPU, in none of the times)",)
         return module
 
 

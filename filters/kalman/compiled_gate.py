@@ -1,19 +1,22 @@
 """The test of tracks as ``track_gate`` wants it, by the compiled kernel; imported only where that is to run."""
 
+from collections.abc import Iterable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from filters.kalman import kernels, multiview, track_gate, triangulation
+from filters.kalman import multiview, track_gate, triangulation
+from filters.kalman.kernels import track_gate as kernel
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TestedTracks, Window
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import correlated_noise
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX, MISMATCHED_TRACK_FACTOR
 from toolkit.sequence import StereoRig
 from toolkit.track_noise import CHANNELS
 
-COMPILED = kernels.COMPILED
+COMPILED = kernel.COMPILED
 _RULES = np.array(
     [
         triangulation.ITERATIONS,
@@ -32,9 +35,8 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     """Test tracks against a window: ``track_gate.tested``, compiled where no right image is missing."""
     if sightings.left_only.any():
         return track_gate.tested(sightings, window, rig, bounds)
-    given = [np.ascontiguousarray(array) for array in (sightings.uvs_px, sightings.seen, sightings.ages)]
-    points, reliable, nis, worst, ends, H, residuals = kernels.test_tracks(
-        tuple(given), tuple(np.array(part, order="C") for part in window), _camera(rig), _RULES, bounds
+    points, reliable, nis, worst, ends, H, residuals = kernel.test_tracks(
+        given((sightings.uvs_px, sightings.seen, sightings.ages)), given(window), camera_of(rig), _RULES, bounds
     )
     rows = np.diff(ends[reliable], prepend=0)
     count = int(rows.sum())
@@ -49,8 +51,13 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     )
 
 
+def given(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
+    """Return arrays as kernels take them."""
+    return tuple(np.ascontiguousarray(array) for array in arrays)
+
+
 @lru_cache(maxsize=4)
-def _camera(rig: StereoRig) -> tuple[Array, ...]:
+def camera_of(rig: StereoRig) -> tuple[Array, ...]:
     """Return a rig as the kernel takes it."""
     intrinsics = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.baseline_m])
     none = np.empty((0, 3))

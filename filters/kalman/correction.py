@@ -12,7 +12,7 @@ import numpy as np
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, transposed
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, mahalanobis_squared
 from toolkit.models.state import POSE, Belief
@@ -40,13 +40,16 @@ def correct_pose(
     whitened by the noise of sighting and landmark.
     """
     residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, belief.T_world_imu, rig)
-    own_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + left_only.noise_px2(uvs_px, rig)
-    nis = mahalanobis_squared(residual_px, own_cov + H_pose @ belief.cov[POSE, POSE] @ np.swapaxes(H_pose, 1, 2))
+    own_cov = H_point @ landmarks.covs @ transposed(H_point) + left_only.noise_px2(uvs_px, rig)
+    nis = mahalanobis_squared(residual_px, own_cov + carried_pose_cov(H_pose, belief.cov[POSE, POSE]))
     dof = left_only.degrees_of_freedom(uvs_px)
     accepted = gate.accepts(nis, dof, depth_m > 0.0)
-    threshold = huber if huber is None or isinstance(dof, int) else huber_threshold(dof, huber)
-    weights = np.where(accepted, huber_weights(mahalanobis_squared(residual_px, own_cov), threshold), 0.0)
-    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weights[:, None, None] * np.linalg.inv(own_cov))
+    weights = accepted.astype(float)
+    if huber is not None:
+        threshold = huber if isinstance(dof, int) else huber_threshold(dof, huber)
+        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
+    weighted = weights[:, None, None] * np.linalg.solve(own_cov, H_pose)
+    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weighted)
     return PoseCorrection(corrected, accepted)
 
 
@@ -61,13 +64,26 @@ def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: St
     )
 
 
-def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, information: Array) -> Belief:
-    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6) and information matrices (N, 3, 3)."""
-    weighted = np.swapaxes(H_pose, 1, 2) @ information
-    posterior = np.linalg.inv(belief.cov)
-    posterior[POSE, POSE] += (weighted @ H_pose).sum(axis=0)
-    cov = np.linalg.inv(posterior)
-    return belief.moved(cov[:, POSE] @ np.einsum("nij,nj->i", weighted, residual_px), cov)
+def carried_pose_cov(H_pose: Array, pose_cov: Array) -> Array:
+    """Return ``H P H^T`` (N, 3, 3) of Jacobians (N, 3, 6), the first product being one for all N."""
+    carried = H_pose.reshape(-1, 6) @ pose_cov
+    return np.asarray(carried.reshape(H_pose.shape) @ transposed(H_pose))
+
+
+def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array, weighted: Array) -> Belief:
+    """Return the EKF update by residuals (N, 3) with Jacobians (N, 3, 6).
+
+    ``weighted`` (N, 3, 6) are the Jacobians, each multiplied by the information matrix of its residual. They add up to
+    an information matrix M (6, 6) and vector n (6,) of the pose. Of the belief's covariance P and its columns p of the
+    pose the update takes ``P_p (1 + M P_pp)^-1 M P_p^T``, and it moves by ``P_p (1 + M P_pp)^-1 n``: the same as the
+    inverse of ``P^-1 + M``, without inverting P.
+    """
+    rows = weighted.reshape(-1, 6)
+    matrix, vector = rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)
+    cov_pose = belief.cov[:, POSE]
+    told = np.column_stack([matrix @ cov_pose.T, vector])
+    taken = cov_pose @ np.linalg.solve(np.eye(6) + matrix @ cov_pose[POSE], told)
+    return belief.moved(taken[:, -1], belief.cov - taken[:, :-1])
 
 
 class LandmarkCorrection(NamedTuple):
@@ -86,13 +102,15 @@ def correct_landmarks(
     ``pose_cov`` (6, 6), zero in the report, counts as measurement noise: a doubtful pose does not harden the map.
     """
     residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, T_world_imu, rig)
-    noise_px2 = left_only.noise_px2(uvs_px, rig) + H_pose @ pose_cov @ np.swapaxes(H_pose, 1, 2)
-    innovation_cov = H_point @ landmarks.covs @ np.swapaxes(H_point, 1, 2) + noise_px2
-    gain = np.swapaxes(np.linalg.solve(innovation_cov, H_point @ landmarks.covs), 1, 2)
-    points = landmarks.points + (gain @ residual_px[..., None])[..., 0]
-    covs = landmarks.covs - gain @ H_point @ landmarks.covs
+    noise_px2 = left_only.noise_px2(uvs_px, rig)
+    carried = H_point @ landmarks.covs
+    innovation_cov = carried @ transposed(H_point) + carried_pose_cov(H_pose, pose_cov) + noise_px2
+    weighted = np.linalg.solve(innovation_cov, np.concatenate([carried, residual_px[..., None]], axis=2))
+    nis = np.einsum("ni,ni->n", residual_px, weighted[..., 3])
+    update = transposed(carried) @ weighted
+    points, covs = landmarks.points + update[..., 3], landmarks.covs - update[..., :3]
     corrected = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
-    return LandmarkCorrection(corrected, mahalanobis_squared(residual_px, innovation_cov), depth_m)
+    return LandmarkCorrection(corrected, nis, depth_m)
 
 
 def correct_landmarks_below(

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Self
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dtrsm
 from scipy.sparse import csr_array
 
@@ -108,8 +107,7 @@ class JointBelief:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
-        whitened = solve_triangular(root, residual, lower=True, check_finite=False)
-        self.move(half_gain.T @ whitened)
+        self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
     def reduce_covariance(self, H: Array | csr_array, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
@@ -126,9 +124,7 @@ class JointBelief:
         innovation_cov = np.asarray(H @ carried[:, columns].T)
         innovation_cov.flat[:: len(carried) + 1] += 1.0
         root = np.asarray(np.linalg.cholesky(innovation_cov), dtype=float)
-        # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
-        half_gain: Array = dtrsm(1.0, root.T, carried.T, side=1, overwrite_b=1).T
-        return root, half_gain
+        return root, divided_by_root(root, carried)
 
     def move(self, delta: Array) -> None:
         """Move every estimate by an error (n,); first estimates stay."""
@@ -153,6 +149,13 @@ class JointBelief:
         """
         newest = delta[self.clone_columns][-6:]
         return H_pose @ se3_right_jacobian(newest), H_point
+
+
+def divided_by_root(root: Array, right: Array) -> Array:
+    """Return ``C^-1 B`` of a lower triangular root C (n, n) and right sides B (n, m), which may be overwritten."""
+    # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
+    result: Array = dtrsm(1.0, root.T, right.T, side=1, overwrite_b=1).T
+    return result
 
 
 def _symmetric(cov: Array) -> Array:

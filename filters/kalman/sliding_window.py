@@ -22,7 +22,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.track_gate import TrackGate, track_test
-from filters.kalman.tracks_in_view import TracksInView
+from filters.kalman.tracks_in_view import TracksInView, tell
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
@@ -51,7 +51,7 @@ class SlidingWindowFilter:
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
         self._tracks = WindowTracks()
         self._track_test = track_test(setup.compilation)
-        self._in_view = TracksInView(linearisation, setup.rig, setup.settings.outliers)
+        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
         self._memory = LandmarkMemory()
 
     def step(self, packet: Packet) -> Estimate:

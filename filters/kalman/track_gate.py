@@ -30,6 +30,12 @@ class Window(NamedTuple):
     poses_at: Array
     cov: Array
 
+    @classmethod
+    def of(cls, joint: JointBelief, at: Linearisation) -> "Window":
+        """Return that of a joint belief, linearised as chosen."""
+        columns = joint.clone_columns
+        return cls(joint.clones, at.clones(joint), joint.cov[columns, columns])
+
 
 class TestedTracks(NamedTuple):
     """F tracks with a landmark (F, 3) each: the NIS (F,) of what they constrain the window by, and those constraints.
@@ -136,8 +142,7 @@ class TrackGate:
 
     def __init__(self, joint: JointBelief, at: Linearisation, rig: StereoRig, test: TrackTest = tested) -> None:
         self._rig, self._test = rig, test
-        columns = joint.clone_columns
-        self._window = Window(joint.clones, at.clones(joint), joint.cov[columns, columns])
+        self._window = Window.of(joint, at)
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
         """Return the tracks that pass, some of them without one of their sightings.

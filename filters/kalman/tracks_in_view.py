@@ -12,17 +12,20 @@ n the information matrix and vector that is left on the clones, the update in in
 as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its covariance.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, cast
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief
+from filters.kalman.joint import JointBelief, divided_by_root
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
+from filters.kalman.track_gate import Window
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
+from toolkit.arrays import is_among
+from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
@@ -35,6 +38,72 @@ from toolkit.settings import Outliers
 _LEAST_INDEPENDENT = 1e-12
 
 
+class FollowedTracks(NamedTuple):
+    """F tracks in view of W clones: points (F, 3), and what each sighting counts for (F, W), 0 if rejected.
+
+    The newest clone sees all of them.
+    """
+
+    sightings: TrackSightings
+    clone_frames: IntArray
+    points: Array
+    weights: Array
+
+    @property
+    def counted(self) -> TrackSightings:
+        """Return the sightings that were not rejected."""
+        return self.sightings._replace(seen=self.sightings.seen & (self.weights > 0.0))
+
+    @classmethod
+    def none(cls) -> "FollowedTracks":
+        """Return no tracks."""
+        ids, nothing = np.empty(0, dtype=np.int64), np.empty((0, 0))
+        sightings = TrackSightings(ids, np.empty((0, 0, 3)), nothing.astype(bool), nothing.astype(np.int64))
+        return cls(sightings, ids, np.empty((0, 3)), nothing)
+
+    def select(self, rows: BoolArray) -> "FollowedTracks":
+        """Return some of the tracks (F,)."""
+        return FollowedTracks(self.sightings.select(rows), self.clone_frames, self.points[rows], self.weights[rows])
+
+
+class Told(NamedTuple):
+    """What F tracks tell of W poses: information matrix (6 W, 6 W) and vector (6 W,), free of the landmarks.
+
+    ``weights`` (F,) is what the newest sightings count for, ``points`` (F, 3) the landmarks after a Gauss-Newton step.
+    Tracks that are not ``usable`` (F,), in front of all their cameras and of a known place, tell nothing.
+    """
+
+    points: Array
+    weights: Array
+    usable: BoolArray
+    matrix: Array
+    vector: Array
+
+
+# Gates the newest sightings of tracks and says what the tracks tell of a window.
+Tell = Callable[[FollowedTracks, Window, StereoRig, FrameGate], Told]
+
+
+def told(tracks: FollowedTracks, window: Window, rig: StereoRig, gate: FrameGate) -> Told:
+    """Gate the newest sightings and return what the tracks tell: the definition, in NumPy, all tracks at once."""
+    rows, usable = _rows(tracks, window, rig)
+    points, weights = tracks.points.copy(), np.zeros(len(usable))
+    normals = _Normals.of(rows.select(usable))
+    nis = normals.newest_nis(window.cov)
+    dof = left_only.degrees_of_freedom(tracks.sightings.uvs_px[usable, -1])
+    weights[usable] = gate.weights(nis, dof, gate.accepts(nis, dof))
+    normals = normals.newest_weighed(weights[usable])
+    most_m = 0.2 * rows.depth_m[usable].min(axis=1)
+    points[usable] += _no_longer_than(most_m, normals.point_steps())
+    return Told(points, weights, usable, *normals.of_clones())
+
+
+def tell(compilation: Compilation) -> Tell:
+    """Return what is to say what tracks tell: compiled where that is asked for and possible, else the definition."""
+    compiled = compilation.module("filters.kalman.compiled_in_view")
+    return told if compiled is None else cast(Tell, compiled.told)
+
+
 class TracksInView:
     """Corrects a belief by the tracks in view, and remembers of them from frame to frame what spares work.
 
@@ -42,79 +111,32 @@ class TracksInView:
     gated once, at its frame, against the window and the earlier sightings of its track; what it counts for then stays.
     """
 
-    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers) -> None:
-        self._at, self._rig, self._outliers = at, rig, outliers
-        self._known = _Followed.none()
+    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, tell: Tell = told) -> None:
+        self._at, self._rig, self._outliers, self._tell = at, rig, outliers, tell
+        self._known = FollowedTracks.none()
 
     def corrected(self, joint: JointBelief, sightings: TrackSightings) -> Belief:
         """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet."""
         tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
-        rows, usable = self._rows(joint, tracks)
-        self._known = tracks = tracks.select(usable)
-        if not usable.any():
-            return joint.core
-        normals = _Normals.of(rows.select(usable))
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
-        nis = normals.newest_nis(joint.cov[joint.clone_columns, joint.clone_columns])
-        dof = left_only.degrees_of_freedom(tracks.sightings.uvs_px[:, -1])
-        weights = gate.weights(nis, dof, gate.accepts(nis, dof))
-        tracks.weights[:, -1] = weights
-        normals = normals.newest_weighed(weights)
-        most_m = 0.2 * rows.depth_m[usable].min(axis=1)
-        self._known = tracks._replace(points=tracks.points + _no_longer_than(most_m, normals.point_steps()))
-        return _informed(joint, *normals.of_clones())
+        told = self._tell(tracks, Window.of(joint, self._at), self._rig, gate)
+        tracks.weights[:, -1] = told.weights
+        self._known = tracks._replace(points=told.points).select(told.usable)
+        return _informed(joint, told.matrix, told.vector) if told.usable.any() else joint.core
 
-    def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "_Followed":
+    def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "FollowedTracks":
         """Return the tracks with their landmarks: as last known, or as a first triangulation has them."""
         known = self._known
         rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
         points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
-        still, here = np.isin(known.clone_frames, joint.clone_frames), np.isin(joint.clone_frames, known.clone_frames)
+        still = is_among(known.clone_frames, joint.clone_frames)
+        here = is_among(joint.clone_frames, known.clone_frames)
         points[before] = known.points[rows[before]]
         weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
         reliable, new = before.copy(), sightings.select(~before)
         points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
         reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
-        return _Followed(sightings, joint.clone_frames, points, weights).select(reliable)
-
-    def _rows(self, joint: JointBelief, tracks: "_Followed") -> tuple["_Rows", BoolArray]:
-        """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front.
-
-        Where right images are missing, the sightings before the newest must tell where the landmark is.
-        """
-        counted = tracks.sightings._replace(seen=tracks.sightings.seen & (tracks.weights > 0.0))
-        seen = multiview.linearise(counted, tracks.points, joint.clones, self._at.clones(joint), self._rig)
-        rows = _Rows(seen.residuals, seen.H_point, seen.H_pose, seen.depth_m)
-        mixing = multiview.decorrelated(seen, counted, self._rig).decorrelation
-        rows = rows if mixing is None else rows.mixed(mixing)
-        if ((tracks.weights > 0.0) & (tracks.weights < 1.0)).any():
-            rows = rows.scaled(np.sqrt(tracks.weights))
-        nearest_m = seen.depth_m.min(axis=1)
-        usable, some = nearest_m > LEAST_DEPTH_M, np.flatnonzero(counted.left_only.any(axis=1))
-        if some.size:
-            H_before = rows.H_point[some, :-1]
-            usable[some] &= is_determined((np.swapaxes(H_before, 2, 3) @ H_before).sum(axis=1), nearest_m[some])
-        return rows, np.asarray(usable)
-
-
-class _Followed(NamedTuple):
-    """F tracks in view of W clones: points (F, 3), and what each sighting counts for (F, W), 0 if rejected."""
-
-    sightings: TrackSightings
-    clone_frames: IntArray
-    points: Array
-    weights: Array
-
-    @classmethod
-    def none(cls) -> "_Followed":
-        """Return no tracks."""
-        ids, nothing = np.empty(0, dtype=np.int64), np.empty((0, 0))
-        sightings = TrackSightings(ids, np.empty((0, 0, 3)), nothing.astype(bool), nothing.astype(np.int64))
-        return cls(sightings, ids, np.empty((0, 3)), nothing)
-
-    def select(self, rows: BoolArray) -> "_Followed":
-        """Return some of the tracks (F,)."""
-        return _Followed(self.sightings.select(rows), self.clone_frames, self.points[rows], self.weights[rows])
+        return FollowedTracks(sightings, joint.clone_frames, points, weights).select(reliable)
 
 
 class _Rows(NamedTuple):
@@ -144,6 +166,26 @@ class _Rows(NamedTuple):
         H_point = (mixing @ self.H_point.reshape(tracks, 3 * window, 3)).reshape(tracks, window, 3, 3)
         H_pose = np.swapaxes(multiview.by_pose(mixing) @ self.H_pose, 1, 2)
         return _Rows(residuals, H_point, H_pose.reshape(tracks, window, 3, 6 * window), self.depth_m)
+
+
+def _rows(tracks: FollowedTracks, window: Window, rig: StereoRig) -> tuple[_Rows, BoolArray]:
+    """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front.
+
+    Where right images are missing, the sightings before the newest must tell where the landmark is.
+    """
+    counted = tracks.counted
+    seen = multiview.linearise(counted, tracks.points, window.poses, window.poses_at, rig)
+    rows = _Rows(seen.residuals, seen.H_point, seen.H_pose, seen.depth_m)
+    mixing = multiview.decorrelated(seen, counted, rig).decorrelation
+    rows = rows if mixing is None else rows.mixed(mixing)
+    if ((tracks.weights > 0.0) & (tracks.weights < 1.0)).any():
+        rows = rows.scaled(np.sqrt(tracks.weights))
+    nearest_m = seen.depth_m.min(axis=1)
+    usable, some = nearest_m > LEAST_DEPTH_M, np.flatnonzero(counted.left_only.any(axis=1))
+    if some.size:
+        H_before = rows.H_point[some, :-1]
+        usable[some] &= is_determined((np.swapaxes(H_before, 2, 3) @ H_before).sum(axis=1), nearest_m[some])
+    return rows, np.asarray(usable)
 
 
 class _Normals(NamedTuple):
@@ -228,14 +270,16 @@ def _of_poses(rows: _Rows) -> tuple[Array, Array]:
 def _informed(joint: JointBelief, matrix: Array, vector: Array) -> Belief:
     """Return the state now given information (6 W, 6 W), (6 W,) on the clones."""
     core, clones = joint.core, joint.clone_columns
-    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size]
+    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size].copy()
     cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
-    root = np.linalg.cholesky(cov)
-    to_core = solve_triangular(root, cross, lower=True, check_finite=False)
-    told = root.T @ matrix @ root
-    spread = np.eye(len(told)) + told
-    moved = to_core.T @ np.linalg.solve(spread, np.column_stack([told @ to_core, root.T @ vector]))
-    return core.moved(moved[:, -1], core.cov - moved[:, :-1])
+    root = np.asarray(np.linalg.cholesky(cov), dtype=float)
+    to_core = divided_by_root(root, cross)
+    spread = root.T @ matrix @ root
+    spread.flat[:: len(spread) + 1] += 1.0
+    spread_root = np.asarray(np.linalg.cholesky(spread), dtype=float)
+    halves = divided_by_root(spread_root, np.column_stack([to_core, root.T @ vector]))
+    half = halves[:, :-1]
+    return core.moved(half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half)
 
 
 def _no_longer_than(most_m: Array, steps: Array) -> Array:

@@ -1,5 +1,6 @@
-"""The compiled test of tracks computes what NumPy's does: NumPy is the definition."""
+"""What is compiled of the windowed filters computes what their NumPy does: NumPy is the definition."""
 
+import importlib
 import subprocess
 import sys
 from dataclasses import replace
@@ -7,11 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman import track_gate
+from filters.kalman import track_gate, tracks_in_view
+from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import Window
+from filters.kalman.tracks_in_view import FollowedTracks
+from filters.kalman.triangulation import nearest_view
 from toolkit.compilation import Compilation
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound
@@ -26,11 +30,16 @@ CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0
 
 
 @pytest.fixture(scope="module")
-def compiled():
+def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    from filters.kalman import compiled_gate
+    from filters.kalman import compiled_gate, compiled_in_view
 
-    return compiled_gate.tested
+    return compiled_gate, compiled_in_view
+
+
+@pytest.fixture(scope="module")
+def compiled(kernels):
+    return kernels[0].tested
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +94,49 @@ def test_compiled_and_numpy_test_tracks_alike(compiled, flight, noise):
         assert a.T @ r == pytest.approx(b.T @ s, abs=TOLERANCE * np.abs(a.T @ a).max())
 
 
+@pytest.mark.parametrize(("probability", "huber"), [(0.95, None), (0.999, 1.0), (None, None)])
+@pytest.mark.parametrize("noise", [None, CORRELATED], ids=["white", "correlated"])
+def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noise, probability, huber):
+    """Of tracks with rejected and weighed sightings, newest ones that do not fit and one that is behind a camera."""
+    rig, window = replace(flight[0], track_noise=noise), flight[1]
+    tracks = followed_in(rig, window)
+    ours, theirs = (
+        tell(tracks, window, rig, FrameGate(probability, huber)) for tell in (tracks_in_view.told, kernels[1].told)
+    )
+    assert ours.in_front.tolist() == theirs.in_front.tolist()
+    assert 0 < ours.in_front.sum() < TRACKS
+    some = ours.in_front
+    assert ours.points[some] == pytest.approx(theirs.points[some], rel=TOLERANCE)
+    assert ours.weights[some] == pytest.approx(theirs.weights[some], rel=TOLERANCE)
+    assert (ours.weights[some] == 0.0).any() == (probability is not None)
+    assert ((ours.weights[some] > 0.0) & (ours.weights[some] < 1.0)).any() == (huber is not None)
+    assert ours.matrix == pytest.approx(theirs.matrix, abs=TOLERANCE * np.abs(ours.matrix).max())
+    assert ours.vector == pytest.approx(theirs.vector, abs=TOLERANCE * np.abs(ours.matrix).max())
+
+
+def followed_in(rig, window: Window) -> FollowedTracks:
+    """Return the tracks that the newest pose sees, with landmarks a little off and some sightings that count less."""
+    sightings = sightings_in(rig, window)
+    sightings.seen[:, -1] = True
+    sightings.uvs_px[10:14, -1] += [30.0, 28.0, 15.0]
+    points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
+    points[7] = window.poses[-1, :3, 3] - 5.0 * window.poses[-1, :3, :3] @ rig.T_imu_cam[:3, 2]
+    rng = np.random.default_rng(6)
+    weights = rng.choice([0.0, 0.4, 1.0], sightings.seen.shape, p=[0.1, 0.2, 0.7])
+    weights[:, 4:] = 1.0
+    weights[20:25, 4] = 0.6
+    return FollowedTracks(sightings, np.arange(WINDOW), points + 0.1 * rng.normal(size=points.shape), weights)
+
+
+def test_nothing_is_told_by_no_track(kernels, flight):
+    rig, window = flight
+    none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
+    for tell in (tracks_in_view.told, kernels[1].told):
+        nothing = tell(none, window, rig, FrameGate(0.95))
+        assert len(nothing.weights) == len(nothing.in_front) == 0
+        assert not nothing.matrix.any() and not nothing.vector.any()
+
+
 def test_no_track_is_no_row(compiled, flight):
     rig, window = flight
     none = sightings_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
@@ -95,6 +147,7 @@ def test_no_track_is_no_row(compiled, flight):
 def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
     for compilation in (Compilation(), Compilation("numpy")):
         assert track_gate.track_test(compilation) is track_gate.tested
+        assert tracks_in_view.tell(compilation) is tracks_in_view.told
         assert compilation.ran == "numpy"
 
 
@@ -107,3 +160,25 @@ def test_importing_the_toolkit_and_its_estimators_imports_no_numba():
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "False"
+
+
+def test_what_was_kept_is_compiled_anew_when_any_source_of_its_folder_changes(kernels, tmp_path, monkeypatch):
+    """numba itself looks at the function's own file alone."""
+    from numba import types
+
+    from filters.kalman.kernels.compiling import kept, what_was_compiled
+
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "kept_one.py").write_text("def add(x):\n    return x + 1.0\n")
+    other = tmp_path / "other.py"
+    other.write_text("ONE = 1\n")
+
+    def told() -> str:
+        sys.modules.pop("kept_one", None)
+        return what_was_compiled(kept((types.float64,), tmp_path)(importlib.import_module("kept_one").add), "add was")
+
+    assert told() == "add was compiled, once for this version"
+    assert told() == ""
+    other.write_text("ONE = 1.0\n")
+    assert told() != ""
+    assert told() == ""

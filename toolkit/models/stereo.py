@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, se3_inverse, skew, transform
+from toolkit.geometry import Array, se3_inverse, skew, transform, transposed
 from toolkit.sequence import StereoRig
 
 # What a depth is divided by at least.
@@ -64,7 +64,7 @@ def linearise(points_imu: Array, R_world_imu: Array, rig: StereoRig) -> StereoPr
     # Moving the IMU by exp([phi, rho]) on the right moves a fixed point by [p]x phi - rho in the IMU frame.
     d_uv_d_pose = np.empty((*points_imu.shape, 6))
     d_uv_d_pose[..., :3], d_uv_d_pose[..., 3:] = d_uv_d_point_imu @ skew(points_imu), -d_uv_d_point_imu
-    d_uv_d_point = d_uv_d_point_imu @ np.swapaxes(R_world_imu, -1, -2)
+    d_uv_d_point = d_uv_d_point_imu @ transposed(R_world_imu)
     return StereoPrediction(project(points_cam, rig), d_uv_d_pose, d_uv_d_point, depth_m)
 
 

@@ -37,19 +37,20 @@ class TwistStep(NamedTuple):
 
 def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
     """Integrate the twists of one interval with a gyro bias (3,) rad/s taken off."""
-    T_start_end, d_step_d_bias, cov = np.eye(4), np.zeros((6, 3)), np.zeros((6, 6))
     density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
-    density_squared = np.tile(density_squared, (len(motion.dt_s), 1))
     if motion.noise_scale is not None:
-        density_squared *= np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
-    pieces = zip(motion.dt_s, motion.v_mps, motion.w_radps, density_squared, strict=True)
-    for dt_s, v_mps, w_radps, piece_density_squared in pieces:
-        xi = dt_s * np.concatenate([w_radps - gyro_bias, v_mps])
-        T_start_next, d_step_d_xi = se3_exp(xi), se3_right_jacobian(xi)
-        carry = se3_adjoint(se3_inverse(T_start_next))
-        T_start_end = T_start_end @ T_start_next
-        d_step_d_bias = carry @ d_step_d_bias - dt_s * d_step_d_xi[:, :3]
-        cov = carry @ cov @ carry.T + (d_step_d_xi * (dt_s * piece_density_squared)) @ d_step_d_xi.T
+        density_squared = density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
+    dt_s = motion.dt_s[:, None]
+    xi = dt_s * np.concatenate([motion.w_radps - gyro_bias, motion.v_mps], axis=1)
+    pieces, d_end_d_xi = se3_exp(xi), se3_right_jacobian(xi)
+    covs = (d_end_d_xi * (dt_s * density_squared)[:, None]) @ np.swapaxes(d_end_d_xi, 1, 2)
+    biases = -dt_s[..., None] * d_end_d_xi[:, :, :3]
+    T_start_end, d_step_d_bias, cov = pieces[0], biases[0], covs[0]
+    for piece, own_bias, own_cov in zip(pieces[1:], biases[1:], covs[1:], strict=True):
+        carry = se3_adjoint(se3_inverse(piece))
+        T_start_end = T_start_end @ piece
+        d_step_d_bias = carry @ d_step_d_bias + own_bias
+        cov = carry @ cov @ carry.T + own_cov
     return TwistStep(T_start_end, d_step_d_bias, cov, float(motion.dt_s.sum()))
 
 

@@ -1,0 +1,73 @@
+"""How numba compiles the kernels, and how what comes out is kept on disk for later processes.
+
+numba looks at a function's own file alone to tell whether what it kept of it is that of today, and a kernel calls
+others of this package: so what is kept belongs to the text of all files here, and a change in any compiles all anew.
+"""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from numba import njit, types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+Arrays = tuple[Any, ...]
+ROW, MATRIX, STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
+MASK, COUNTS = types.boolean[:, ::1], types.int64[:, ::1]
+# Poses (W, 4, 4), poses to linearise at (W, 4, 4), covariance of their errors (6 W, 6 W).
+WINDOW = types.Tuple((STACK, STACK, MATRIX))
+# fx, fy, cx, cy px and baseline m (5,); T_imu_cam (1, 4, 4); whitener (3, 3); variances (3, 3) px^2 of white noise,
+# walk and offset, a channel a column, and the channels (3, 3), both (0, 3) where the noise of tracks is white.
+CAMERA = types.Tuple((ROW, STACK, MATRIX, MATRIX, MATRIX))
+
+# Sums may be taken in any order; what is not called from Python needs no wrapper for it, half of the compilation.
+_OPTIONS = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy", "no_cfunc_wrapper": True}
+compiled = njit(no_cpython_wrapper=True, **_OPTIONS)
+
+
+class _KeptFor(FunctionCache):
+    """What is kept of a function for as long as some sources stay what they are, wherever its own file is."""
+
+    def __init__(self, function: Callable[..., Any], sources: str) -> None:
+        super().__init__(function)
+        self._cache_file = IndexDataCacheFile(
+            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=sources
+        )
+
+
+def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Callable[[Callable[..., Any]], Any]:
+    """Return what compiles a function and keeps what comes out for every process that finds the folder's files so.
+
+    Where nothing can be written (beside the file, in NUMBA_CACHE_DIR, in the user's cache) it is for this process.
+    """
+
+    def compile_or_load(function: Callable[..., Any]) -> Any:
+        kernel = njit(**_OPTIONS)(function)
+        try:
+            kernel._cache = _KeptFor(function, sources_of(folder))
+            kernel.compile(signature)
+        except (OSError, RuntimeError):
+            kernel = njit(**_OPTIONS)(function)
+            kernel.compile(signature)
+        kernel.disable_compile()
+        return kernel
+
+    return compile_or_load
+
+
+def sources_of(folder: Path) -> str:
+    """Return a digest of all modules of a folder."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def what_was_compiled(kernel: Any, name: str) -> str:
+    """Return what is told of the compilation of a kernel, empty where its result was found on disk."""
+    if kernel.stats.cache_hits:
+        return ""
+    if kernel.stats.cache_path:
+        return f"{name} compiled, once for this version"
+    return f"{name} compiled and there is no place to keep that: NUMBA_CACHE_DIR names one"

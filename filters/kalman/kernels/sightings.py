@@ -1,0 +1,167 @@
+"""A track's sightings compiled: their images and Jacobians, and what makes the rows of correlated noise independent."""
+
+import math
+
+import numpy as np
+
+from filters.kalman.kernels.algebra import cholesky, moved, solved_3
+from filters.kalman.kernels.compiling import Arrays, compiled
+from toolkit.geometry import Array, BoolArray, IntArray
+
+
+@compiled
+def sighted(seen: BoolArray, f: int) -> IntArray:
+    """Return the poses that saw a track."""
+    count = 0
+    for j in range(seen.shape[1]):
+        count += seen[f, j]
+    where = np.empty(count, dtype=np.int64)
+    count = 0
+    for j in range(seen.shape[1]):
+        if seen[f, j]:
+            where[count] = j
+            count += 1
+    return where
+
+
+@compiled
+def project(intrinsics: Array, x: float, y: float, z: float, J: Array) -> None:
+    """Put the Jacobian of (uL, uR, v) to a point in camera coordinates in J (4, 4), the image in its last column.
+
+    Within a millimetre of the camera's plane the point counts as a millimetre in front, as in ``stereo.linearise``.
+    """
+    z = z if abs(z) >= 1e-3 else 1e-3
+    across, down, right = intrinsics[0] / z, intrinsics[1] / z, x - intrinsics[4]
+    J[0, 0], J[0, 1], J[0, 2], J[0, 3] = across, 0.0, -across * x / z, across * x + intrinsics[2]
+    J[1, 0], J[1, 1], J[1, 2], J[1, 3] = across, 0.0, -across * right / z, across * right + intrinsics[2]
+    J[2, 0], J[2, 1], J[2, 2], J[2, 3] = 0.0, down, -down * y / z, down * y + intrinsics[3]
+
+
+@compiled
+def linearise(points: Array, f: int, uvs_px: Array, where: IntArray, window: Arrays, eye: Arrays, out: Arrays) -> float:
+    """Linearise the sightings of a track from the poses ``where`` (m,); return its least depth.
+
+    ``window`` has the inverses of the poses, the poses to linearise at and their inverses; ``eye`` the intrinsics,
+    T_cam_imu and what rows are multiplied by. ``out`` gets the Jacobians to each pose (3 m, 6), and the landmark's
+    Jacobian beside the residual (3 m, 4): from ``T exp([phi, rho])`` a fixed point p, in the frame of the IMU, is seen
+    to move by ``p x phi - rho``.
+    """
+    inverses_now, poses_at, inverses_at = window
+    intrinsics, T_cam_imu, rows = eye
+    H_pose, H_point = out
+    J, uv, nearest = np.empty((3, 4)), np.empty(3), np.inf
+    for k in range(where.size):
+        j = where[k]
+        x, y, z = moved(inverses_now, j, points[f, 0], points[f, 1], points[f, 2])
+        x, y, z = moved(T_cam_imu, T_cam_imu.shape[0] - 1, x, y, z)
+        nearest = min(nearest, z)
+        project(intrinsics, x, y, z, J)
+        for i in range(3):
+            uv[i] = J[i, 3]
+        px, py, pz = moved(inverses_at, j, points[f, 0], points[f, 1], points[f, 2])
+        x, y, z = moved(T_cam_imu, T_cam_imu.shape[0] - 1, px, py, pz)
+        project(intrinsics, x, y, z, J)
+        for i in range(3):
+            u = rows[i, 0] * J[0, 0] + rows[i, 1] * J[1, 0]
+            v = rows[i, 2] * J[2, 1]
+            w = rows[i, 0] * J[0, 2] + rows[i, 1] * J[1, 2] + rows[i, 2] * J[2, 2]
+            a = u * T_cam_imu[0, 0, 0] + v * T_cam_imu[0, 1, 0] + w * T_cam_imu[0, 2, 0]
+            b = u * T_cam_imu[0, 0, 1] + v * T_cam_imu[0, 1, 1] + w * T_cam_imu[0, 2, 1]
+            c = u * T_cam_imu[0, 0, 2] + v * T_cam_imu[0, 1, 2] + w * T_cam_imu[0, 2, 2]
+            at = 3 * k + i
+            H_pose[at, 0], H_pose[at, 1], H_pose[at, 2] = b * pz - c * py, c * px - a * pz, a * py - b * px
+            H_pose[at, 3], H_pose[at, 4], H_pose[at, 5] = -a, -b, -c
+            H_point[at, 3] = 0.0
+            for d in range(3):
+                H_point[at, d] = a * poses_at[j, d, 0] + b * poses_at[j, d, 1] + c * poses_at[j, d, 2]
+                H_point[at, 3] += rows[i, d] * (uvs_px[f, j, d] - uv[d])
+    return nearest
+
+
+@compiled
+def noise_roots(ages: IntArray, f: int, where: IntArray, variances: Array, roots: Array) -> None:
+    """Put the Cholesky factors of the covariances of a track's errors, a channel under the other, in roots (3 m, m).
+
+    ``white [j = k] + walk min(a_j, a_k) + offset`` (``toolkit.track_noise``).
+    """
+    m = where.size
+    one = np.empty((m, m))
+    for channel in range(3):
+        white, walk, offset = variances[0, channel], variances[1, channel], variances[2, channel]
+        for i in range(m):
+            for j in range(i + 1):
+                one[i, j] = walk * min(ages[f, where[i]], ages[f, where[j]]) + offset
+            one[i, i] += white
+        cholesky(one, m)
+        for i in range(m):
+            for j in range(i + 1):
+                roots[channel * m + i, j] = one[i, j]
+
+
+@compiled
+def decorrelate(roots: Array, m: int, A: Array, columns: int) -> None:
+    """Multiply the first columns of A (3 m, n), rows by sighting and channel, by the inverse of each channel's root."""
+    for row in range(3 * m):
+        i, channel = row // 3, row % 3
+        for j in range(i):
+            factor = roots[channel * m + i, j]
+            for c in range(columns):
+                A[row, c] -= factor * A[3 * j + channel, c]
+        for c in range(columns):
+            A[row, c] /= roots[channel * m + i, i]
+
+
+@compiled
+def decorrelate_transposed(roots: Array, m: int, A: Array, columns: int) -> None:
+    """Multiply the first columns of A (3 m, n) by the transposed inverse of each channel's root."""
+    for row in range(3 * m - 1, -1, -1):
+        i, channel = row // 3, row % 3
+        for j in range(i + 1, m):
+            factor = roots[channel * m + j, i]
+            for c in range(columns):
+                A[row, c] -= factor * A[3 * j + channel, c]
+        for c in range(columns):
+            A[row, c] /= roots[channel * m + i, i]
+
+
+@compiled
+def own_jacobians(H_pose: Array, m: int, roots: Array, correlated: bool, J: Array) -> None:
+    """Put the Jacobians (3 m, 6) of each sighting to its own pose in J (3 m, 6 m), to all; make them independent."""
+    for i in range(3 * m):
+        for c in range(6 * m):
+            J[i, c] = 0.0
+    for k in range(m):
+        for i in range(3 * k, 3 * k + 3):
+            for c in range(6):
+                J[i, 6 * k + c] = H_pose[i, c]
+    if correlated:
+        decorrelate(roots, m, J, 6 * m)
+
+
+@compiled
+def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
+    """Add ``[H r]^T [H r]`` of some rows (., 4) to row ``at`` of N, which has what ``solved_3`` takes."""
+    for row in range(first, end):
+        c = 0
+        for a in range(4):
+            for b in range(a + 1):
+                N[at, c] += rows[row, a] * rows[row, b]
+                c += 1
+
+
+@compiled
+def step(points: Array, f: int, nearest_m: float, N: Array) -> None:
+    """Move a track's point by the solution of the first row of N, no longer than a fifth of the least depth."""
+    x, y, z = solved_3(N, 0, 0.0, 0.0)
+    share = min(1.0, 0.2 * nearest_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
+    points[f, 0] += share * x
+    points[f, 1] += share * y
+    points[f, 2] += share * z
+
+
+@compiled
+def refine(points: Array, f: int, nearest_m: float, H_point: Array, n: int) -> None:
+    """Move a track's point by one step of ``multiview.refined``: Gauss-Newton on n independent rows ``[H r]``."""
+    N = np.zeros((1, 10))
+    add_products(H_point, 0, n, N, 0)
+    step(points, f, nearest_m, N)

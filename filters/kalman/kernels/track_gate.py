@@ -1,0 +1,356 @@
+"""The track gate compiled: the mathematics of ``track_gate``'s NumPy, one track after another.
+
+NumPy pads all tracks to the whole window and forms at once what it needs of them; compiled, a track costs what its own
+m sightings cost. Its covariance is not formed in the null space of its landmark: ``S = H_x P H_x^T`` is made of 3x3
+blocks, one for every two poses, and the reflections that take the landmark away are applied to it from both sides. The
+rows that come out span the same space as NumPy's in another basis: NIS, ``H^T H`` and ``H^T r`` are the same.
+
+Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter for vision-aided inertial navigation",
+eqs. 17-26 and appendix; Golub & Van Loan, "Matrix Computations" (4th ed.), 5.1 (reflections and their products).
+"""
+
+import numpy as np
+from numba import types
+
+from filters.kalman.kernels.algebra import (
+    cholesky,
+    inverses,
+    invert,
+    moved,
+    products,
+    reflect_both_sides,
+    reflections,
+    solved_3,
+    transpose,
+)
+from filters.kalman.kernels.compiling import (
+    CAMERA,
+    COUNTS,
+    MASK,
+    ROW,
+    STACK,
+    WINDOW,
+    Arrays,
+    compiled,
+    kept,
+    what_was_compiled,
+)
+from filters.kalman.kernels.sightings import (
+    add_products,
+    decorrelate,
+    decorrelate_transposed,
+    linearise,
+    noise_roots,
+    own_jacobians,
+    project,
+    refine,
+    sighted,
+)
+from toolkit.geometry import Array, BoolArray, IntArray
+
+# Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W), their ages (F, W). Then window and camera, rules as
+# numbered below, and bounds (3 W - 2,) of the NIS by degrees of freedom.
+SIGNATURE = (types.Tuple((STACK, MASK, COUNTS)), WINDOW, CAMERA, ROW, ROW)
+ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_DEPTH, REFINEMENTS, MISMATCHED = range(8)
+
+
+@compiled
+def first_guess(uvs_px: Array, seen: BoolArray, f: int, T_world_cam: Array, intrinsics: Array, points: Array) -> float:
+    """Put in ``points[f]`` where the sighting of a track with the largest disparity says it is; return that disparity.
+
+    One of no more than ``points[f, 0]`` px is taken for a pixel in the centre of the image.
+    """
+    least_px, nearest, largest = points[f, 0], seen.shape[1] - 1, -np.inf
+    for j in range(seen.shape[1]):
+        disparity = uvs_px[f, j, 0] - uvs_px[f, j, 1]
+        if seen[f, j] and disparity > largest:
+            nearest, largest = j, disparity
+    fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
+    if largest > least_px:
+        z = fx * baseline_m / largest
+        x, y = (uvs_px[f, nearest, 0] - cx) * z / fx, (uvs_px[f, nearest, 2] - cy) * z / fy
+    else:
+        x, y, z = baseline_m, 0.0, fx * baseline_m
+    points[f, 0], points[f, 1], points[f, 2] = moved(T_world_cam, nearest, x, y, z)
+    return largest
+
+
+@compiled
+def normal_equations(
+    points: Array, f: int, sightings: Arrays, T_cam_world: Array, eye: Arrays, N: Array, at: int
+) -> tuple[float, float]:
+    """Put ``[J r]^T [J r]`` of a track's whitened residuals r at its point in row ``at`` of N; see ``solved_3``.
+
+    Return half the squared error, infinite where the point is behind a camera, and the least depth.
+    """
+    uvs_px, seen = sightings
+    intrinsics, whitener = eye
+    for c in range(10):
+        N[at, c] = 0.0
+    J, rows = np.empty((3, 4)), np.empty((3, 4))
+    nearest = np.inf
+    for j in range(seen.shape[1]):
+        if seen[f, j]:
+            x, y, z = moved(T_cam_world, j, points[at, 0], points[at, 1], points[at, 2])
+            nearest = min(nearest, z)
+            project(intrinsics, x, y, z, J)
+            for i in range(3):
+                a = whitener[i, 0] * J[0, 0] + whitener[i, 1] * J[1, 0]
+                b = whitener[i, 2] * J[2, 1]
+                c = whitener[i, 0] * J[0, 2] + whitener[i, 1] * J[1, 2] + whitener[i, 2] * J[2, 2]
+                for d in range(3):
+                    rows[i, d] = a * T_cam_world[j, 0, d] + b * T_cam_world[j, 1, d] + c * T_cam_world[j, 2, d]
+                rows[i, 3] = 0.0
+                for d in range(3):
+                    rows[i, 3] += whitener[i, d] * (uvs_px[f, j, d] - J[d, 3])
+            add_products(rows, 0, 3, N, at)
+    return (0.5 * N[at, 9] if nearest > 0.0 else np.inf), nearest
+
+
+@compiled
+def triangulate(
+    sightings: Arrays, poses: Array, T_imu_cam: Array, eye: Arrays, rules: Array, points: Array
+) -> BoolArray:
+    """Put the points that fit F tracks best in ``points`` (F + 1, 3); return which to rely on (F,).
+
+    As ``triangulation.triangulate``: steps of ``(A + lambda diag(A) + 1e-12) step = J^T r``, ``A = J^T J``, and all
+    tracks stop together, as soon as no step of any has lessened its error by the relative decrease.
+    """
+    uvs_px, seen = sightings
+    count, window = seen.shape
+    T_world_cam, T_cam_world = np.zeros((window, 4, 4)), np.zeros((window, 4, 4))
+    products(poses, T_imu_cam, T_world_cam)
+    inverses(T_world_cam, T_cam_world)
+    reliable = np.zeros(count, dtype=np.bool_)
+    N, costs, depths, dampings = np.empty((count + 1, 10)), np.empty(count), np.empty(count), np.empty(count)
+    for f in range(count):
+        points[f, 0] = rules[LEAST_DISPARITY]
+        reliable[f] = first_guess(uvs_px, seen, f, T_world_cam, eye[0], points) > rules[LEAST_DISPARITY]
+        costs[f], depths[f] = normal_equations(points, f, sightings, T_cam_world, eye, N, f)
+        dampings[f] = rules[FIRST_DAMPING]
+    unsettled, iteration = True, 0
+    while unsettled and iteration < rules[ITERATIONS]:
+        unsettled, iteration = False, iteration + 1
+        for f in range(count):
+            x, y, z = solved_3(N, f, dampings[f], 1e-12)
+            points[count, 0], points[count, 1], points[count, 2] = points[f, 0] + x, points[f, 1] + y, points[f, 2] + z
+            cost, depth = normal_equations(points, f, sightings, T_cam_world, eye, N, count)
+            unsettled = unsettled or cost < (1.0 - rules[RELATIVE_DECREASE]) * costs[f]
+            if cost < (1.0 + rules[ROUNDING]) * costs[f]:
+                for i in range(3):
+                    points[f, i] = points[count, i]
+                for i in range(10):
+                    N[f, i] = N[count, i]
+                costs[f], depths[f] = cost, depth
+                dampings[f] *= 0.1
+            else:
+                dampings[f] *= 10.0
+    for f in range(count):
+        reliable[f] = reliable[f] and depths[f] > rules[LEAST_DEPTH]
+    return reliable
+
+
+@compiled
+def carry_cov(where: IntArray, H_pose: Array, P: Array, S: Array) -> None:
+    """Put ``H_x P H_x^T`` (3 m, 3 m) in S: of sightings i and j the block ``H_i P_ij H_j^T``."""
+    T = np.empty((3, 6))
+    for i in range(where.size):
+        for j in range(i + 1):
+            for a in range(3):
+                for b in range(6):
+                    total = 0.0
+                    for c in range(6):
+                        total += H_pose[3 * i + a, c] * P[6 * where[i] + c, 6 * where[j] + b]
+                    T[a, b] = total
+            for a in range(3):
+                for b in range(3):
+                    total = 0.0
+                    for c in range(6):
+                        total += T[a, c] * H_pose[3 * j + b, c]
+                    S[3 * i + a, 3 * j + b] = total
+                    S[3 * j + b, 3 * i + a] = total
+
+
+@compiled
+def innovations(
+    points: Array, f: int, sightings: Arrays, window: Arrays, eye: Arrays, refinements: float, work: Arrays
+) -> None:
+    """Linearise track f, its point refined first where its noise is correlated, and make its rows independent.
+
+    ``work`` gets Jacobians to each pose (3 m, 6), as they are; landmark's Jacobian and residual (3 m, 4), independent;
+    the covariance (3 m, 3 m) of the latter but for their noise, ``M H_x P H_x^T M^T``; and the roots of the noise,
+    whose inverse M is.
+    """
+    uvs_px, ages, where = sightings
+    poses, inverses_now, poses_at, inverses_at, P = window
+    intrinsics, T_cam_imu, rows, variances = eye
+    H_pose, H_point, S, roots = work
+    m, n, here = where.size, 3 * where.size, (intrinsics, T_cam_imu, rows)
+    correlated = variances.shape[0] > 0
+    if correlated:
+        noise_roots(ages, f, where, variances, roots)
+        for _ in range(int(refinements)):
+            latest = (inverses_now, poses, inverses_now)
+            nearest_m = linearise(points, f, uvs_px, where, latest, here, (H_pose, H_point))
+            decorrelate(roots, m, H_point, H_point.shape[1])
+            refine(points, f, nearest_m, H_point, n)
+    linearise(points, f, uvs_px, where, (inverses_now, poses_at, inverses_at), here, (H_pose, H_point))
+    carry_cov(where, H_pose, P, S)
+    if correlated:
+        decorrelate(roots, m, H_point, H_point.shape[1])
+        decorrelate(roots, m, S, n)
+        transpose(S, n)
+        decorrelate(roots, m, S, n)
+
+
+@compiled
+def nis_of(S: Array, n: int, residual: Array) -> float:
+    """Return ``r^T (S + 1)^-1 r`` of all rows but the first three.
+
+    The Cholesky factor L of those rows is left in S, ``L^-1 r`` in ``residual``.
+    """
+    for i in range(n):
+        S[i, i] += 1.0
+        for j in range(min(i, 3)):
+            S[i, j] = 0.0  # the first three rows are a factor by themselves
+    cholesky(S, n)
+    total = 0.0
+    for i in range(3, n):
+        value = residual[i]
+        for j in range(3, i):
+            value -= S[i, j] * residual[j]
+        residual[i] = value / S[i, i]
+        total += residual[i] * residual[i]
+    return total
+
+
+@compiled
+def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array, H: Array, first: int) -> None:
+    """Put the rows of ``Q^T J`` but three in H (., 6 W) from row ``first`` on, at the columns of ``where`` (m,).
+
+    J (3 m, 6 m) are Jacobians to those poses: unless dense, a row depends on its own pose alone. The product of three
+    reflections is ``Q^T = 1 - V T^T V^T`` with an upper triangular T, in whose diagonal their factors are and above it
+    ``T_ik = -tau_k sum_j T_ij v_j^T v_k`` (Schreiber & Van Loan 1989); Q itself is not formed.
+    """
+    n, T, reached = 3 * where.size, np.zeros((3, 3)), np.zeros((3, 6 * where.size))
+    for k in range(3):
+        T[k, k] = tau[k]
+        for j in range(k):
+            overlap = 0.0
+            for i in range(k, n):
+                overlap += V[j, i] * V[k, i]
+            for i in range(j + 1):
+                T[i, k] -= tau[k] * T[i, j] * overlap
+    for i in range(n):
+        begin, end = 0 if dense else 6 * (i // 3), 6 * (i // 3) + 6
+        for a in range(3):
+            weight = T[0, a] * V[0, i] + T[1, a] * V[1, i] + T[2, a] * V[2, i]
+            for c in range(begin, end):
+                reached[a, c] += weight * J[i, c]
+    for i in range(3, n):
+        row = first + i - 3
+        for c in range(H.shape[1]):
+            H[row, c] = 0.0
+        for k in range(where.size):
+            for c in range(6):
+                own = J[i, 6 * k + c] if 3 * k <= i and (dense or i < 3 * k + 3) else 0.0
+                at = 6 * k + c
+                H[row, 6 * where[k] + c] = (
+                    own - V[0, i] * reached[0, at] - V[1, i] * reached[1, at] - V[2, i] * reached[2, at]
+                )
+
+
+@compiled
+def worst_sighting(S: Array, n: int, rest: Array, V: Array, tau: Array, roots: Array, correlated: bool) -> int:
+    """Return which of a track's m sightings, left out, lessens its NIS most: ``track_gate._worst_sighting``.
+
+    S has a Cholesky factor and ``rest`` residuals as ``nis_of`` leaves them. With ``W = Q [0, 0; 0, S^-1] Q^T``, freed
+    of what made the rows independent, and w = W r the NIS falls by ``w_j^T W_jj^-1 w_j``.
+    """
+    W, w = np.empty((n, n)), np.zeros((n, 1))
+    invert(S, n, W)
+    for i in range(n - 1, 2, -1):
+        w[i, 0] = rest[i]
+        for k in range(i + 1, n):
+            w[i, 0] -= S[k, i] * w[k, 0]
+        w[i, 0] /= S[i, i]
+    for k in range(2, -1, -1):
+        reflect_both_sides(W, V, k, tau[k], n)
+        dot = 0.0
+        for i in range(n):
+            dot += V[k, i] * w[i, 0]
+        for i in range(n):
+            w[i, 0] -= tau[k] * dot * V[k, i]
+    if correlated:
+        decorrelate_transposed(roots, n // 3, W, n)
+        transpose(W, n)
+        decorrelate_transposed(roots, n // 3, W, n)
+        decorrelate_transposed(roots, n // 3, w, w.shape[1])
+    worst, largest, N = 0, -1.0, np.empty((1, 10))
+    for j in range(n // 3):
+        at = 0
+        for a in range(4):
+            for b in range(a + 1):
+                N[0, at] = W[3 * j + a, 3 * j + b] if a < 3 else w[3 * j + b, 0] if b < 3 else 0.0
+                at += 1
+        x, y, z = solved_3(N, N.shape[0] - 1, 0.0, 1e-12)
+        fall = x * N[0, 6] + y * N[0, 7] + z * N[0, 8]
+        if fall > largest:
+            worst, largest = j, fall
+    return worst
+
+
+@kept(SIGNATURE)
+def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array, bounds: Array) -> Arrays:
+    """Triangulate F tracks, linearise them, free them of their landmarks and test them; see :data:`SIGNATURE`.
+
+    Returns points (F + 1, 3), the last without meaning; which are reliable (F,): what else is told of others means
+    nothing; the NIS (F,); the worst sighting (F,), -1 where the NIS is not far above its bound; where each track's
+    rows end (F,); and those rows, of tracks below their bounds: H (n, 6 W), residuals (n,), n being the last end.
+    """
+    uvs_px, seen, ages = sightings
+    poses, poses_at, P = window
+    intrinsics, T_imu_cam, whitener, variances, channels = camera
+    (count, longest), correlated = seen.shape, variances.shape[0] > 0
+    points, nis = np.empty((count + 1, 3)), np.empty(count)
+    worst, ends = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    reliable = triangulate((uvs_px, seen), poses, T_imu_cam, (intrinsics, whitener), rules, points)
+    inverses_now, inverses_at, T_cam_imu = np.empty_like(poses), np.empty_like(poses), np.empty_like(T_imu_cam)
+    inverses(poses, inverses_now)
+    inverses(poses_at, inverses_at)
+    inverses(T_imu_cam, T_cam_imu)
+    window_of_all = (poses, inverses_now, poses_at, inverses_at, P)
+    eye = (intrinsics, T_cam_imu, channels if correlated else whitener, variances)
+    most, rows = 3 * longest, 0
+    for f in range(count):
+        ends[f] = 0
+        rows += 3 * sighted(seen, f).size
+    H, residuals = np.empty((rows, 2 * most)), np.empty(rows)
+    H_pose, H_point = np.empty((most, 6)), np.empty((most, 4))
+    S, roots = np.empty((most, most)), np.empty((most, longest))
+    V, tau, rest, J = np.empty((3, most)), np.empty(3), np.empty(most), np.empty((most, 2 * most))
+    for f in range(count):
+        nis[f], worst[f], where = np.inf, -1, sighted(seen, f)
+        ends[f] = ends[max(f - 1, 0)]
+        n = 3 * where.size
+        if reliable[f] and n > 3:
+            work = (H_pose, H_point, S, roots)
+            innovations(points, f, (uvs_px, ages, where), window_of_all, eye, rules[REFINEMENTS], work)
+            reflections(H_point, n, V, tau)
+            for k in range(3):
+                reflect_both_sides(S, V, k, tau[k], n)
+            for i in range(n):
+                rest[i] = H_point[i, 3]
+            nis[f] = nis_of(S, n, rest)
+            if nis[f] < bounds[n - 3]:
+                own_jacobians(H_pose, where.size, roots, correlated, J)
+                constraint_rows(where, J, correlated, V, tau, H, ends[f])
+                for i in range(3, n):
+                    residuals[ends[f] + i - 3] = H_point[i, 3]
+                ends[f] += n - 3
+            elif nis[f] > rules[MISMATCHED] * bounds[n - 3]:
+                worst[f] = where[worst_sighting(S, n, rest, V, tau, roots, correlated)]
+    return points, reliable, nis, worst, ends, H, residuals
+
+
+COMPILED = what_was_compiled(test_tracks, "the track gate was")
