@@ -7,14 +7,14 @@ measurements by their agreement, a sixth of the squared error gone, and made a s
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings, without_jumps
+from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
@@ -62,10 +62,10 @@ def solve_robustly(
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
         values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
         frames = _without_those_behind(frames, values, rig)
-    if rig.track_noise is not None:
-        return _solve_chained(motion, frames, rig, values, outliers, progress)
     bound = _cut_bound(outliers)
     frames = [frame.select(distance < bound) for frame, distance, _ in _residuals(frames, values, rig)]
+    if rig.track_noise is not None:
+        return _solve_chained(motion, frames, rig, values, outliers, progress)
     if values.exists(SCALE):
         sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
@@ -85,17 +85,20 @@ def _solve_chained(
 ) -> Smoothed:
     """Solve with sightings whose errors hang together along their tracks, from the answer of those that do not.
 
-    First under Cauchy's loss of what is new in each sighting; then without those innovations that chance does not
-    explain there, at full weight: after such a jump a track may be anywhere, and its next steps still count.
+    First under Cauchy's loss of what is new in each sighting, a track being Student-t distributed as a whole; then
+    without those innovations that chance does not explain there: after such a jump a track may be anywhere, and its
+    next steps still count. In the last solve each track weighs what it does at its start, so that what is solved, and
+    what the covariance is of, are least squares.
     """
     values = _only_seen(start, frames)
     sightings = ChainedSightings.of(frames, rig)
-    loss = Squares() if outliers.batch_cauchy is None else Cauchy(outliers.batch_cauchy)
-    robust = ChainedFactors(sightings, rig, loss)
+    robust = ChainedFactors(sightings, rig, Squares())
+    if outliers.batch_cauchy is not None:
+        robust = replace(robust, loss=Cauchy(outliers.batch_cauchy), freedom=FREEDOM_OF_TRACKS)
     values = solve(motion, values, _JUMPS_STOPPING, progress, "solving along the tracks", robust).values
     jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers)
     sightings, frames = without_jumps(sightings, frames, jumped)
-    last = ChainedFactors(sightings, rig, Squares())
+    last = replace(robust, sightings=sightings, loss=Squares()).held(_only_seen(values, frames))
     return _solve_last(motion, last, frames, values, CHAIN_STOPPING, progress)
 
 
