@@ -8,9 +8,9 @@ Bayes tree anew for each state, which takes a hundred times as long.
 The order is that of nested dissection: the graph is cut in halves again and again, and what cuts it comes last (George
 1973, "Nested dissection of a regular finite element mesh"). From the root to any state it is some tens of variables. In
 the order of time it is all states, and rounding grows on the way where steps between states are known far better than
-the states, as where the errors of sightings are correlated: on a drive of 125 frames a standard deviation came out wrong
-by 5 % of itself, in this order by 1e-9. The covariance of the first state is had by itself all the same: where the two
-differ, all are refused.
+the states, as where the errors of sightings are correlated: on a drive of 125 frames a standard deviation came out
+wrong by 5 % of itself, in this order by 1e-9. The covariance of the first state is had by itself all the same: where
+the two differ, all are refused.
 """
 
 from collections import Counter
