@@ -28,7 +28,7 @@ from toolkit.settings import Outliers
 # starts where these end.
 # Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
 # and to the last solve what is gained counts in itself, not by the whole.
-_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
+_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 120, decrease=0.01)
 # A scale that white noise has hangs on such differences too, but is soon found; far landmarks creep on for long.
 _SCALE_STOPPING = Stopping(1e-5, 60)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)

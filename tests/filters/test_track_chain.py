@@ -160,7 +160,7 @@ def test_batch_is_the_gauss_newton_step_with_the_whole_covariance_of_every_track
         oracle.assert_covariances_agree(estimate.cov, cov, 0.01)
 
 
-def test_batch_lets_mismatched_sightings_go_and_their_tracks_hang_together_over_them(run_estimator):
+def test_batch_lets_mismatched_sightings_go_and_chains_their_tracks_over_them(run_estimator):
     noise = TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
     sequence = simulate(replace(DRIVE, duration_s=1.0, camera=replace(DRIVE.camera, max_tracks=20)), 5)
     sequence = replace(sequence, rig=replace(sequence.rig, track_noise=noise))
