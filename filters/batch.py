@@ -78,12 +78,12 @@ class Batch:
         return Finished(trajectory, landmarks, smoothed.solution.converged, log)
 
     def _with_covariances(self, smoothed: Smoothed) -> tuple[Trajectory, tuple[str, ...]]:
-        values, landmark_keys = smoothed.solution.values, [L(i) for i in seen_ids(smoothed.frames)]
+        values = smoothed.solution.values
         states = [self._motion.read(values, p.index, p.frame.t_ns) for p in self._packets]
         trajectory, linear = Trajectory.of(states), smoothed.graph.linearize(values)
         if self._scale is None:
-            return with_covariances(trajectory, linear, landmark_keys, self._motion)
-        return self._scale.with_covariances(trajectory, linear, landmark_keys, self._motion, scale_in(values))
+            return with_covariances(trajectory, linear, self._motion)
+        return self._scale.with_covariances(trajectory, linear, self._motion, scale_in(values))
 
     def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""

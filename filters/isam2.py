@@ -75,9 +75,7 @@ class Isam2:
             graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
-        trajectory, log = with_covariances(
-            Trajectory.of(states), graph.linearize(values), self._tree.landmarks(), motion
-        )
+        trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), motion)
         return Finished(trajectory, Landmarks.of(points), converged, (*self._log, *log))
 
     def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:

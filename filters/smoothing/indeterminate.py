@@ -13,7 +13,7 @@ nothing.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -80,11 +80,11 @@ def without_gaps(factors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGr
 
 
 def with_covariances(
-    trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel
+    trajectory: Trajectory, linear: gtsam.GaussianFactorGraph, motion: MotionModel
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Return the trajectory with the covariance of every state, or as it is and the reason."""
     try:
-        covs = state_covs(linear, landmark_keys, motion, trajectory.T_world_imu)
+        covs = state_covs(linear, motion, trajectory.T_world_imu)
     except RuntimeError as refusal:
         return trajectory, (no_covariances(refusal),)
     return replace(trajectory, cov=covs), ()

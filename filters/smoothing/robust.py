@@ -7,14 +7,14 @@ measurements by their agreement, a sixth of the squared error gone, and made a s
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
-from filters.smoothing.track_chain import ChainedFactors, ChainedSightings, without_jumps
+from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, IntArray
 from toolkit.models import left_only, stereo
@@ -28,7 +28,7 @@ from toolkit.settings import Outliers
 # starts where these end.
 # Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
 # and to the last solve what is gained counts in itself, not by the whole.
-_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 60, decrease=0.01)
+_JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 120, decrease=0.01)
 # A scale that white noise has hangs on such differences too, but is soon found; far landmarks creep on for long.
 _SCALE_STOPPING = Stopping(1e-5, 60)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
@@ -62,13 +62,13 @@ def solve_robustly(
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
         values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
         frames = _without_those_behind(frames, values, rig)
-    if rig.track_noise is not None:
-        return _solve_chained(motion, frames, rig, values, outliers, progress)
     frames = [
         frame.select(distance < _cut_bound(outliers, left_only.degrees_of_freedom(frame.uvs_px)))
         for frame, distance, _ in _residuals(frames, values, rig)
     ]
     frames = _placed_by_stereo(frames)
+    if rig.track_noise is not None:
+        return _solve_chained(motion, frames, rig, values, outliers, progress)
     if values.exists(SCALE):
         sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
@@ -88,18 +88,21 @@ def _solve_chained(
 ) -> Smoothed:
     """Solve with sightings whose errors hang together along their tracks, from the answer of those that do not.
 
-    First under Cauchy's loss of what is new in each sighting; then without those innovations that chance does not
-    explain there, at full weight: after such a jump a track may be anywhere, and its next steps still count.
+    First under Cauchy's loss of what is new in each sighting, a track being Student-t distributed as a whole; then
+    without those innovations that chance does not explain there: after such a jump a track may be anywhere, and its
+    next steps still count. In the last solve each track weighs what it does at its start, so that what is solved, and
+    what the covariance is of, are least squares.
     """
     values = _only_seen(start, frames)
     sightings = ChainedSightings.of(frames, rig)
-    loss = Squares() if outliers.batch_cauchy is None else Cauchy(outliers.batch_cauchy)
-    robust = ChainedFactors(sightings, rig, loss)
+    robust = ChainedFactors(sightings, rig, Squares())
+    if outliers.batch_cauchy is not None:
+        robust = replace(robust, loss=Cauchy(outliers.batch_cauchy), freedom=FREEDOM_OF_TRACKS)
     values = solve(motion, values, _JUMPS_STOPPING, progress, "solving along the tracks", robust).values
     dof = left_only.degrees_of_freedom(sightings.uv_px)
     jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers, dof)
     sightings, frames = without_jumps(sightings, frames, jumped)
-    last = ChainedFactors(sightings, rig, Squares())
+    last = replace(robust, sightings=sightings, loss=Squares()).held(_only_seen(values, frames))
     return _solve_last(motion, last, frames, values, CHAIN_STOPPING, progress)
 
 

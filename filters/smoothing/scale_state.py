@@ -5,7 +5,6 @@ motion does, so the scale takes up what vision and motion samples differ by on t
 is right, but by its prior.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -37,7 +36,6 @@ class ScaleState:
         self,
         trajectory: Trajectory,
         linear: gtsam.GaussianFactorGraph,
-        landmark_keys: Sequence[int],
         motion: MotionModel,
         scale: float,
     ) -> tuple[Trajectory, tuple[str, ...]]:
@@ -46,7 +44,7 @@ class ScaleState:
         The states are as uncertain as the scale makes them.
         """
         try:
-            covs, of_scale = covs_beside(linear, landmark_keys, motion, trajectory.T_world_imu, (SCALE,))
+            covs, of_scale = covs_beside(linear, motion, trajectory.T_world_imu, (SCALE,))
         except RuntimeError as refusal:
             return trajectory, (f"disparities are {100.0 * scale:+.2f} % longer", no_covariances(refusal))
         return replace(trajectory, cov=covs), (self.in_words(scale, float(np.sqrt(of_scale[0, 0]))),)

@@ -182,6 +182,12 @@ class ChainedFactors:
         in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
         return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
+    def held(self, values: gtsam.Values) -> "ChainedFactors":
+        """Return them as least squares: every innovation for good with the weight it has at the values."""
+        seen = self.sightings
+        sigma_px = seen.chain.sigma_px / np.sqrt(self.weights(self.innovations(values)))[:, None]
+        return ChainedFactors(replace(seen, chain=replace(seen.chain, sigma_px=sigma_px)), self.rig, Squares())
+
     def error(self, values: gtsam.Values) -> float:
         """Return the sum of the losses, half a square each where there is none."""
         costs = self.loss.cost(np.linalg.norm(self.innovations(values), axis=1))

@@ -103,7 +103,7 @@ def test_states_and_scale_have_the_covariance_of_gtsams_marginals():
         before = [(pose_before, rng.standard_normal((20, 6))) for pose_before, _ in keys[k - 1 : k]]
         terms = before + at
         graph.add(gtsam.JacobianFactor(gtsam.GaussianConditional(terms, len(terms), np.zeros(20), unit)))
-    covs, of_scale = covs_beside(graph, [], motion, poses, (SCALE,))
+    covs, of_scale = covs_beside(graph, motion, poses, (SCALE,))
     tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
     assert of_scale[0, 0] == pytest.approx(joint_cov(tree, [SCALE])[0, 0], rel=1e-9)
     for k in (0, 5, 11):

@@ -15,7 +15,7 @@ from toolkit.models import stereo
 from toolkit.models.factors import L, X, kind_of
 from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES, Settings
-from toolkit.simulation import DRIVE
+from toolkit.simulation import DRIVE, simulate
 from toolkit.track_noise import TrackNoise
 
 NOISE = TrackNoise(np.array([0.1, 0.2, 0.1]), np.array([0.3, 0.2, 0.3]), np.array([0.0, 1.4, 0.0]))
@@ -87,6 +87,22 @@ def test_a_track_that_errs_throughout_counts_less_throughout_and_the_others_as_t
     assert weights[1][of_it][0] < 0.15 * weights[0][of_it][0]
 
 
+def test_innovations_held_at_their_weights_are_least_squares_with_the_gradient_of_the_cost(scene):
+    frames, poses, points = scene
+    robust, values = ChainedFactors(ChainedSightings.of(frames, RIG), RIG, Cauchy(2.0), 2.0), values_of(poses, points)
+    held = robust.held(values)
+    one, other = (
+        vision.linearised(values).linearize(values).augmentedHessian(gtsam.Ordering(values.keys()))
+        for vision in (robust, held)
+    )
+    # Rounding, relative to the largest entry.
+    np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(one).max())
+    moved = values_of(poses @ se3_exp(np.full(6, 0.05)), points)
+    np.testing.assert_array_equal(held.weights(held.innovations(moved)), 1.0)
+    squares = np.square(held.innovations(moved)).sum()
+    assert held.error(moved) == pytest.approx(0.5 * squares, rel=1e-12)
+
+
 def test_smart_says_of_the_poses_what_the_chain_says_once_its_landmarks_are_eliminated(scene):
     frames, poses, points = scene
     chained, values = ChainedSightings.of(frames, RIG), values_of(poses, points)
@@ -142,3 +158,21 @@ def test_batch_is_the_gauss_newton_step_with_the_whole_covariance_of_every_track
         mean, cov = truth.state(k)
         assert np.abs(recording.error_of(estimate, k) - mean).max() < 0.01 * np.abs(mean).max()
         oracle.assert_covariances_agree(estimate.cov, cov, 0.01)
+
+
+def test_batch_lets_mismatched_sightings_go_and_chains_their_tracks_over_them(run_estimator):
+    noise = TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
+    sequence = simulate(replace(DRIVE, duration_s=1.0, camera=replace(DRIVE.camera, max_tracks=20)), 5)
+    sequence = replace(sequence, rig=replace(sequence.rig, track_noise=noise))
+    seen = sequence.observations
+    # One of every track, in the middle of its life.
+    rows = [np.flatnonzero(seen.track_id == i) for i in np.unique(seen.track_id)]
+    struck = np.isin(np.arange(len(seen)), [of_track[of_track.size // 2] for of_track in rows if of_track.size > 4])
+    uv_px = seen.uv_px + 30.0 * struck[:, None] * np.array([1.0, 1.0, 1.0])
+    without = run_estimator("batch", replace(sequence, observations=seen.select(~struck)))
+    with_them = run_estimator("batch", replace(sequence, observations=replace(seen, uv_px=uv_px)))
+    apart = with_them.final.T_world_imu[:, :3, 3] - without.final.T_world_imu[:, :3, 3]
+    variances = (np.diagonal(run.final.cov, axis1=1, axis2=2)[:, :6] for run in (with_them, without))
+    np.testing.assert_allclose(*variances, rtol=0.02)
+    # The last solve stops where a hundredth of the cost is left to be gained.
+    assert np.abs(apart).max() < 0.05 * np.sqrt(without.final.cov[:, 3:6, 3:6].max())

@@ -1,27 +1,29 @@
-"""The covariance of every state of a solved graph: eliminate once forward in time, recover once backward.
+"""The covariance of every state of a solved graph: eliminate once, recover from the root of the elimination down.
 
-With the landmarks eliminated first and the states in the order of time, each state is a linear function of a few
-later ones plus noise: ``x = -R^-1 S x_S + n``. So the joint covariance of a short stretch of states, carried from
-the end to the beginning, yields every state's (Golub & Plemmons 1980; Kaess & Dellaert 2009, "Covariance recovery
-from a square root information matrix for data association"). GTSAM's Marginals traverses its Bayes tree anew for
-each state, which takes a hundred times as long.
+Eliminated, each variable is a linear function of some that are eliminated later plus noise, ``x = -R^-1 S x_S + n``,
+and those are together in what was recovered for the first of them (Golub & Plemmons 1980; Kaess & Dellaert 2009,
+"Covariance recovery from a square root information matrix for data association"). GTSAM's Marginals traverses its
+Bayes tree anew for each state, which takes a hundred times as long.
 
-Rounding may grow on the way back, where steps between states are known far better than the states, as where the errors
-of sightings are correlated and the camera stands. So the covariance of the first state, where the way ends, is also had
-by itself: where the two differ, all are refused.
+The order is that of nested dissection: the graph is cut in halves again and again, and what cuts it comes last (George
+1973, "Nested dissection of a regular finite element mesh"). From the root to any state it is some tens of variables. In
+the order of time it is all states, and rounding grows on the way where steps between states are known far better than
+the states, as where the errors of sightings are correlated: on a drive of 125 frames a standard deviation came out
+wrong by 5 % of itself, in this order by 1e-9. The covariance of the first state is had by itself all the same: where
+the two differ, all are refused.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.models.factors import joint_cov
 from toolkit.models.motion import MotionModel
 
-_STATES_AT_A_TIME = 10
 # A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
 _MOST_ROUNDED = 0.01
 
@@ -30,35 +32,28 @@ class RoundingError(RuntimeError):
     """The covariances of the states came out wrong, and are not known."""
 
 
-def state_covs(
-    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], motion: MotionModel, poses: Array
-) -> Array:
+def state_covs(linear: gtsam.GaussianFactorGraph, motion: MotionModel, poses: Array) -> Array:
     """Return the covariance (K, d, d) of the states 0 to K - 1, in the order and on the side of an Estimate.
 
     ``poses`` (K, 4, 4) are theirs. Raises RuntimeError, as GTSAM does, where the graph does not determine them, and
     RoundingError.
     """
-    return covs_beside(linear, landmark_keys, motion, poses, ())[0]
+    return covs_beside(linear, motion, poses, ())[0]
 
 
 def covs_beside(
-    linear: gtsam.GaussianFactorGraph,
-    landmark_keys: Sequence[int],
-    motion: MotionModel,
-    poses: Array,
-    beside: Sequence[int],
+    linear: gtsam.GaussianFactorGraph, motion: MotionModel, poses: Array, beside: Sequence[int]
 ) -> tuple[Array, Array]:
     """Return the covariances of the states as :func:`state_covs`, and (m, m) of the variables beside them.
 
     Those are of no frame, as the scale of disparities is: they are eliminated after all states.
     """
     states = [motion.keys(k) for k in range(len(poses))]
-    together = [*states[:-1], [*states[-1], *beside]]
-    covs = list(_recovered(_eliminated(linear, landmark_keys, together), together))[::-1]
-    size = motion.layout.size
-    covs, of_beside = [cov[:size, :size] for cov in covs], covs[-1][size:, size:]
+    together = [*states, beside] if beside else states
+    covs = _recovered(_eliminated(linear, together, beside), together)
     _check_first(covs[0], linear, states[0])
-    return np.stack([motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=True)]), of_beside
+    of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
+    return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
 
 
 def _check_first(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int]) -> None:
@@ -66,118 +61,83 @@ def _check_first(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int])
     last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
     expected = np.diag(joint_cov(linear.eliminateMultifrontal(last), keys))
     if not np.allclose(np.diag(cov), expected, rtol=2.0 * _MOST_ROUNDED, atol=0.0):
-        raise RoundingError("they were lost to rounding on the way from the last state to the first")
+        raise RoundingError("they were lost to rounding")
 
 
 def _eliminated(
-    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]]
+    linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]], last: Collection[int]
 ) -> list[gtsam.GaussianConditional]:
-    """Return each state's variables given later ones, in the order of time.
-
-    Some states are eliminated at a time, after the landmarks first seen from them. A landmark without its sightings is
-    a dense factor on all states that saw it: of all landmarks at once they would take gigabytes.
-    """
-    parts, rest = _parts(linear, landmark_keys, states), gtsam.GaussianFactorGraph()
-    conditionals: list[gtsam.GaussianConditional] = []
-    for factors, landmarks, keys in parts:
-        factors.push_back(rest)
-        net, rest = factors.eliminatePartialSequential(_ordering([*landmarks, *keys]))
-        found = {one.firstFrontalKey(): one for one in (net.at(i) for i in range(net.size()))}
-        conditionals += [found[key] for key in keys]
-    return conditionals
-
-
-class _Part(NamedTuple):
-    """The factors of which some landmarks and states are the first to be eliminated, and the keys of both."""
-
-    factors: gtsam.GaussianFactorGraph
-    landmarks: list[int]
-    states: list[int]
-
-
-def _parts(
-    linear: gtsam.GaussianFactorGraph, landmark_keys: Sequence[int], states: Sequence[Sequence[int]]
-) -> list[_Part]:
-    """Divide a graph among stretches of states: a landmark belongs to the first that saw it, with its sightings."""
-    part_of = {key: k // _STATES_AT_A_TIME for k, keys in enumerate(states) for key in keys}
-    landmarks, count = set(landmark_keys), len(states)
-    factors = [linear.at(i) for i in range(linear.size())]
-    keys_of = [factor.keys() for factor in factors]
-    for keys in keys_of:
-        seen_from = [part_of[key] for key in keys if key not in landmarks]
-        for key in landmarks.intersection(keys):
-            part_of[key] = min([part_of.get(key, count), *seen_from])
-    parts = [_Part(gtsam.GaussianFactorGraph(), [], []) for _ in range(0, count, _STATES_AT_A_TIME)]
-    for factor, keys in zip(factors, keys_of, strict=True):
-        parts[min(part_of[key] for key in keys)].factors.push_back(factor)
-    for key in landmark_keys:
-        parts[part_of[key]].landmarks.append(key)
-    for k, of_state in enumerate(states):
-        parts[k // _STATES_AT_A_TIME].states.extend(of_state)
-    return parts
-
-
-def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
+    """Return each variable given later ones; some of them last, and some so that they depend on one another."""
+    graph, sizes = gtsam.GaussianFactorGraph(), linear.gradientAtZero()
+    graph.push_back(linear)
+    unit = gtsam.noiseModel.Unit.Create(1)
+    for first, *others in together:
+        for other in others:
+            # A factor that says nothing.
+            nothing = [np.zeros((1, sizes.at(key).size)) for key in (first, other)]
+            graph.add(gtsam.JacobianFactor(first, nothing[0], other, nothing[1], np.zeros(1), unit))
+    dissected = gtsam.Ordering.MetisGaussianFactorGraph(graph)
+    keys = [key for key in (dissected.at(i) for i in range(dissected.size())) if key not in last]
     ordering = gtsam.Ordering()
-    for key in keys:
+    for key in [*keys, *last]:
         ordering.push_back(key)
-    return ordering
+    net = graph.eliminateSequential(ordering)
+    return [net.at(i) for i in range(net.size())]
 
 
-class _Stretch:
-    """The joint covariance of the states that earlier ones still depend on."""
+class _Joint(NamedTuple):
+    """The joint covariance of some variables, and the rows of each."""
 
-    def __init__(self) -> None:
-        self._keys: list[int] = []
-        self._sizes: list[int] = []
-        self._cov = np.empty((0, 0))
+    rows: dict[int, range]
+    cov: Array
 
-    def add(self, conditional: gtsam.GaussianConditional) -> None:
-        """Add the variable a conditional gives from variables that are here."""
-        key, *parents = conditional.keys()
+    def of(self, keys: Sequence[int]) -> "_Joint":
+        """Return the joint covariance of some of the variables, in the order of the keys."""
+        rows = [row for key in keys for row in self.rows[key]]
+        return _Joint(_rows({key: len(self.rows[key]) for key in keys}), self.cov[np.ix_(rows, rows)])
+
+    def with_first(self, conditional: gtsam.GaussianConditional) -> "_Joint":
+        """Return it with the variable that a conditional gives from all that are here, before them."""
         root = np.linalg.inv(conditional.R())
         gain = -root @ conditional.S()
-        cross = gain @ self._cov[self._rows(parents)]
-        own = root @ root.T + cross[:, self._rows(parents)] @ gain.T
-        self._cov = np.block([[self._cov, cross.T], [cross, own]])
-        self._keys.append(key)
-        self._sizes.append(len(root))
-
-    def joint(self, keys: Sequence[int]) -> Array:
-        """Return the joint covariance of some of the variables."""
-        rows = self._rows(keys)
-        return np.asarray(self._cov[np.ix_(rows, rows)])
-
-    def keep(self, needed: set[int]) -> None:
-        """Forget all other variables."""
-        kept = [i for i, key in enumerate(self._keys) if key in needed]
-        rows = self._rows([self._keys[i] for i in kept])
-        self._cov = self._cov[np.ix_(rows, rows)]
-        self._keys, self._sizes = [self._keys[i] for i in kept], [self._sizes[i] for i in kept]
-
-    def _rows(self, keys: Sequence[int]) -> IntArray:
-        ends = np.cumsum(self._sizes)
-        row_of = {key: range(end - size, end) for key, size, end in zip(self._keys, self._sizes, ends, strict=True)}
-        return np.array([row for key in keys for row in row_of[key]], dtype=np.int64)
+        cross = gain @ self.cov
+        cov = np.block([[root @ root.T + cross @ gain.T, cross], [cross.T, self.cov]])
+        sizes = {key: len(rows) for key, rows in self.rows.items()}
+        return _Joint(_rows({conditional.firstFrontalKey(): len(root), **sizes}), cov)
 
 
-def _recovered(conditionals: list[gtsam.GaussianConditional], states: Sequence[Sequence[int]]) -> Iterator[Array]:
-    """Yield the covariance of each state from the last to the first."""
-    stretch, end = _Stretch(), len(conditionals)
-    needed_until = _first_dependents(conditionals)
-    for keys in reversed(states):
-        begin = end - len(keys)
-        for conditional in reversed(conditionals[begin:end]):
-            stretch.add(conditional)
-        yield stretch.joint(keys)
-        stretch.keep({key for key, first in needed_until.items() if first < begin})
-        end = begin
+def _rows(sizes: dict[int, int]) -> dict[int, range]:
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {key: range(end - size, end) for (key, size), end in zip(sizes.items(), ends, strict=True)}
 
 
-def _first_dependents(conditionals: list[gtsam.GaussianConditional]) -> dict[int, int]:
-    """Return for each variable the first conditional that depends on it."""
-    first: dict[int, int] = {}
-    for place, conditional in enumerate(conditionals):
-        for parent in list(conditional.keys())[1:]:
-            first.setdefault(parent, place)
-    return first
+def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence[Sequence[int]]) -> list[Array]:
+    """Return the joint covariance of each group of variables, from the conditionals in the order of elimination."""
+    later_of = {key: later for key, *later in (one.keys() for one in conditionals)}
+    place = {key: i for i, key in enumerate(later_of)}
+    needed = {key for group in together for key in group}
+    for key, later in later_of.items():
+        needed.update(later if key in needed else ())
+    # The first of those that a variable depends on depends on all the others.
+    next_of = {key: min(later, key=place.__getitem__) for key, later in later_of.items() if key in needed and later}
+    of_group = {min(group, key=place.__getitem__): group for group in together}
+    joints, waiting, covs = dict[int, _Joint](), Counter(next_of.values()), dict[int, Array]()
+    for conditional, key in zip(reversed(conditionals), reversed(later_of), strict=True):
+        if key not in needed:
+            continue
+        given = joints[next_of[key]].of(later_of[key]) if key in next_of else _Joint({}, np.empty((0, 0)))
+        joint = given.with_first(conditional)
+        if key in of_group:
+            covs[of_group[key][0]] = joint.of(of_group[key]).cov
+        if waiting[key]:
+            joints[key] = joint
+        if key in next_of:
+            _count_down(next_of[key], waiting, joints)
+    return [covs[group[0]] for group in together]
+
+
+def _count_down(key: int, waiting: Counter[int], joints: dict[int, _Joint]) -> None:
+    """Forget a joint covariance with the last variable that is recovered from it."""
+    waiting[key] -= 1
+    if not waiting[key]:
+        del joints[key]

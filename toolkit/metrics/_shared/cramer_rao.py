@@ -337,7 +337,7 @@ def _final(problem: _Problem) -> Efficient:
         values.insert(L(track_id), point)
     linear = graph.linearize(values)
     poses = np.stack([state.T_world_imu for state in problem.states])
-    covs = state_covs(linear, [L(i) for i in problem.track_ids.tolist()], model, poses)
+    covs = state_covs(linear, model, poses)
     moved = values.retract(linear.optimize())
     errors = [offset(state.at(model.read(moved, k, 0)), state) for k, state in enumerate(problem.states)]
     return Efficient(problem.prior.layout, covs, np.array(errors))
