@@ -20,7 +20,7 @@ def test_every_setting_is_described_with_its_default() -> None:
     assert described.keys() == keys | (values.keys() - sections.keys() - {"estimators"})
     assert all(one.meaning for one in described.values())
     meaning = described["window.lag_s"].meaning
-    assert described["window.lag_s"] == ("window.lag_s", "s", "1.2 with an IMU, else 0.6", "> 0, <= 3600", meaning)
+    assert described["window.lag_s"] == ("window.lag_s", "s", "2 with an IMU, else 0.6", "> 0, <= 3600", meaning)
 
 
 def test_what_is_written_reads_back_as_the_same_settings() -> None:

@@ -81,6 +81,15 @@ def test_where_the_cap_does_not_bind_an_estimator_is_given_every_packet_as_it_is
             np.testing.assert_array_equal(given.motion.dt_s, packet.motion.dt_s)
 
 
+@pytest.mark.parametrize("motion_kind", ["imu", "twist", "none"])
+def test_by_default_every_frame_of_a_camera_at_20_hz_has_a_state(motion_kind):
+    """With stamps that err by a millisecond: the cap's intervals leave room for it."""
+    jitter_ns = np.random.default_rng(0).integers(-1_000_000, 1_000_000, 400)
+    t_ns = 50_000_000 * np.arange(400) + jitter_ns
+    intervals = [Window().interval(int(since_ns), motion_kind) for since_ns in t_ns - t_ns[0]]
+    assert len(set(intervals)) == len(intervals)
+
+
 def test_frames_without_a_state_are_carried_on_from_the_state_before_them(flight):
     """With nothing left out of the motion, which is exact to 1 kHz's midpoint rule."""
     listener, online, final = thinned(flight, Window(lag_s=1.0, most_states=5))

@@ -83,9 +83,10 @@ POLICIES: Mapping[PolicyName, Outliers] = {
 }
 
 
-# A track that outlives the window starts anew, so that a longer one is better where sightings err by themselves. Real
-# tracks do not, and the filters that take them for white lose by it on drives with measured twists (docs/settings.md).
-_LAG_WITH_IMU_S, _LAG_S = 1.2, 0.6
+# A track that outlives the window starts anew, so that a longer one is better where sightings err by themselves; what
+# it brings beside an IMU was measured (docs/settings.md). Real tracks do not, and the filters that take them for white
+# lose by it on drives with measured twists.
+_LAG_WITH_IMU_S, _LAG_S = 2.0, 0.6
 
 
 class Window(Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,7 +106,7 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
     ) = None
     most_states: Annotated[
         int, Meta(ge=2, le=10_000, description="states in the window at most; of more frames they are thinned evenly")
-    ] = 30
+    ] = 50
     landmarks: Annotated[
         int, Meta(ge=0, le=500, description="landmarks msckf-slam keeps in its state for as long as they are seen")
     ] = 50
