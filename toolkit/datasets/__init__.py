@@ -230,9 +230,12 @@ def load_references(source: str) -> dict[str, Trajectory]:
 
 def _reader_of(path: Path, source: str) -> RecordingFormat:
     _check_readable(path, source)
-    for reader in _readers().values():
-        if reader.recognises(path):
-            return reader
+    try:
+        for reader in _readers().values():
+            if reader.recognises(path):
+                return reader
+    except OSError as error:  # a file that can be opened and not read, as on a failing disk
+        raise DataError(unreadable(path, error)) from error
     what = why_unrecognised(path, lambda inside: any(reader.recognises(inside) for reader in _readers().values()))
     lacking = "".join(f"; {name} is unavailable: {why}" for name, why in unavailable().items())
     raise DataError(f"{source}: {what}; there are {', '.join(formats())}{lacking}")

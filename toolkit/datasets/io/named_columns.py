@@ -94,6 +94,8 @@ class Columns:
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
         try:
+            if values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any():
+                raise ValueError  # Python takes 1_0 for ten
             return values.astype(np.float64)
         except (TypeError, ValueError):
             bad = next(i for i, value in enumerate(values.tolist()) if not _is_number(value))
@@ -102,7 +104,7 @@ class Columns:
 
     def _whole(self, name: str, row: int, value: Any) -> int:
         try:
-            exact = Decimal(value) if isinstance(value, str) else value
+            exact = Decimal(value.replace("_", "?")) if isinstance(value, str) else value
             number = int(exact) if abs(exact) <= _LARGEST else None
         except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
             exact, number = value, None
@@ -113,7 +115,7 @@ class Columns:
 
     def _decimal(self, row: int, text: str) -> Decimal:
         try:
-            seconds = Decimal(text)
+            seconds = Decimal(text.replace("_", "?"))
         except InvalidOperation:
             seconds = Decimal("nan")
         if not seconds.is_finite():
@@ -134,7 +136,7 @@ def _is_number(value: Any) -> bool:
         float(value)
     except (TypeError, ValueError):
         return False
-    return True
+    return "_" not in str(value)
 
 
 def columns_of_file(path: Path) -> Columns:

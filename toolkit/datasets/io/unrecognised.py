@@ -32,7 +32,7 @@ def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
             return "the file is empty and so of no known format"
         archive = _archive(path)
         if archive is not None:
-            return f"is packed ({archive}) and so of no known format; unpack it and name what was in it"
+            return f"is packed ({archive}), unpack it and name what was in it: as it stands it is of no known format"
         if _is_trajectory(path):
             return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
     return "its content is of no known format"
