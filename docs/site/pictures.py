@@ -18,7 +18,7 @@ from toolkit.cli import main
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 UCSD = Path(os.environ.get("VISLAM_DATA", "../shared/data")).resolve() / "ucsd"
-# The page has many shades of grey, which fewer colours would tint.
+# The page has many shades of grey; the two rounds of k-means below keep greys from a tint.
 COLOURS, COLOURS_OF_PAGE = 48, 256
 
 RUNS = {
