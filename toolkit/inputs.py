@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
-from toolkit.errors import DataError
+from toolkit.errors import DataError, printable
 
 _KINDS = (
     (stat.S_ISDIR, "it is a directory; name a file"),
@@ -33,6 +33,8 @@ def open_input(path: Path) -> BinaryIO:
         return path.open("rb")
     except OSError as error:
         raise DataError(unreadable(path, error)) from error
+    except ValueError as error:  # of a path with a null character
+        raise DataError(f"{printable(str(path))}: is no path ({error}); name a file") from error
 
 
 def read_input(path: Path) -> bytes:

@@ -18,7 +18,8 @@ from toolkit.cli import main
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 UCSD = Path(os.environ.get("VISLAM_DATA", "../shared/data")).resolve() / "ucsd"
-COLOURS = 48
+# The page has many shades of grey; the two rounds of k-means below keep greys from a tint.
+COLOURS, COLOURS_OF_PAGE = 48, 256
 
 RUNS = {
     "kitti00": "compare kitti00 --estimators dead-reckoning,ekf,batch",
@@ -63,9 +64,9 @@ def photograph(directory: Path) -> None:
     subprocess.run(["chromium", *options, "--window-size=1400,1500", *page], check=True, timeout=60)
 
 
-def small(picture: Path) -> bytes:
+def small(picture: Path, colours: int) -> bytes:
     """Return a picture with few colours, chosen so that a thin line in a colour of its own keeps it."""
-    few = Image.open(picture).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few = Image.open(picture).convert("RGB").quantize(colours, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
     few.save(written := io.BytesIO(), "PNG", optimize=True)
     return written.getvalue()
 
@@ -75,9 +76,10 @@ def make(names: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in names or FIGURES:
             directory = run(FIGURES[name][0], Path(folder))
-            if FIGURES[name][1] == "page.png":
+            is_page = FIGURES[name][1] == "page.png"
+            if is_page:
                 photograph(directory)
-            data = small(directory / FIGURES[name][1])
+            data = small(directory / FIGURES[name][1], COLOURS_OF_PAGE if is_page else COLOURS)
             (IMAGES / name).write_bytes(data)
             print(f"{name}: {len(data) / 1000:.0f} kB")
 

@@ -85,6 +85,24 @@ def test_each_convention_of_the_extrinsic_is_found_with_noise_and_mismatches(tmp
     assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
 
 
+@pytest.mark.parametrize("convention", [name for name in CONVENTIONS if name.endswith("regular")])
+def test_where_the_camera_is_decides_between_readings_that_look_the_same_way(tmp_path: Path, convention: str) -> None:
+    """A camera that looks straight ahead: only its lever arm tells an extrinsic in regular axes from its inverse."""
+    ahead = replace(DRIVE.rig, T_imu_cam=se3(T_REGULAR_OPTICAL[:3, :3], DRIVE.rig.T_imu_cam[:3, 3]))
+    camera = replace(DRIVE.camera, rate_hz=30.0, max_tracks=40)
+    sequence = simulate(replace(DRIVE, duration_s=16.0, camera=camera, rig=ahead), 0)
+    # As much noise as was added to the course's earlier files: the residuals follow it and not the reading.
+    rng = np.random.default_rng(0)
+    noise = rng.normal(0.0, np.repeat([0.5, 0.05], 3), sequence.motion.values.shape)
+    given = course_dict(sequence, convention)
+    given["v_t"], given["w_t"] = np.split(sequence.motion.values + noise, 2, axis=1)
+    given["v_t"], given["w_t"] = given["v_t"][: sequence.frame_count], given["w_t"][: sequence.frame_count]
+    audited = audit(load_sequence(str(saved(tmp_path, given))))
+    assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
+    (told,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
+    assert "in turns the camera's velocity is" in told
+
+
 def test_kept_the_convention_is_told_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:
     path = saved(tmp_path, course_dict(drive(), "inverted, camera axes regular"))
     audited = audit(load_sequence(str(path)), keep=frozenset({"extrinsic-convention", "mixed-axes"}))

@@ -113,6 +113,37 @@ def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Pat
     assert [name.rpartition(" ")[2] for name in tables.unused] == ["comment", "comment"]
 
 
+@pytest.mark.parametrize(
+    ("write", "pattern"),
+    [
+        (lambda text: text.replace(",", ";"), None),
+        (lambda text: text.replace(",", "\t"), None),
+        (lambda text: text.replace("\n", "\r\n"), None),
+        (lambda text: "\ufeff" + text, None),
+        (lambda text: "".join('"' + line.replace(",", '","') + '"\n' for line in text.splitlines()), None),
+        (lambda text: "# a drive\n\n# of today\n" + text.replace("\n", "\n# next\n\n"), None),
+        (lambda text: "# a drive\n#" + text, None),
+        (lambda text: "".join(line + ",\n" for line in text.splitlines()), None),
+        (lambda text: text.replace(",", " "), "its columns stand between blanks; separate them by commas"),
+        (lambda text: text.replace(",", ";").replace(".", ","), r"line 2: .* is \d+,\d+, .* with a decimal point"),
+        (lambda text: text.partition("\n")[2], "holds numbers and no names; its first line names the columns"),
+        (lambda text: text.replace("000000,", ","), "t_ns must be in nanoseconds, but the stamps look like"),
+        (lambda text: text.replace(".", "_"), r"line 2: .* is .*_.*, expected a number"),
+        (lambda text: "# a drive\n\n" + text.replace(".", "x"), r"line 4: .* is .*x.*, expected a number"),
+    ],
+)
+def test_tables_as_spreadsheets_write_them_are_read_or_told(
+    tmp_path: Path, assert_refused: Refused, write: Callable[[str], str], pattern: str | None
+) -> None:
+    folder = written(recorded("twist"), tmp_path / "own")
+    path, expected = folder / "tracks.csv", toolkit.load_sequence(str(folder)).content_hash()
+    path.write_text(write(path.read_text()), encoding="utf-8")
+    if pattern is None:
+        assert toolkit.load_sequence(str(folder)).content_hash() == expected
+    else:
+        assert_refused(lambda: toolkit.load_sequence(str(folder)), path, pattern)
+
+
 def test_without_a_stated_noise_a_twist_has_that_of_its_scatter(tmp_path: Path) -> None:
     rig = rig_of(recorded("twist"))
     del rig["noise"]
@@ -122,7 +153,7 @@ def test_without_a_stated_noise_a_twist_has_that_of_its_scatter(tmp_path: Path) 
 
 TRACKS = [
     ("track_id", "trackid", r"missing column track_id \(rename trackid\?\); it has t_ns, trackid"),
-    ("\n", "\n#,", r"line 2 has 6 columns, expected 5|line 2 has 7 columns, expected 6"),
+    ("\n", "\n7,", r"line 2 has 6 columns, expected 5|line 2 has 7 columns, expected 6"),
     ("uL", "uR", "a column name is there twice"),
     ("t_ns,", "t,", "must be in seconds, but the stamps look like nanoseconds"),
 ]

@@ -1,5 +1,8 @@
 """Finding the reader of a recording by its content, and saying what there is where none is found."""
 
+import errno
+import gzip
+import io
 import shutil
 import subprocess
 import sys
@@ -44,6 +47,46 @@ def test_exactly_one_format_recognises_a_recording(course: dict[str, Any], openv
     np.savez(tmp_path / "course.npz", **course)
     for path, name in ((tmp_path / "course.npz", "course-npz"), (openvins, "openvins-sim")):
         assert [n for n, reader in datasets._readers().items() if reader.recognises(path)] == [name]
+
+
+@pytest.mark.parametrize(
+    ("content", "pattern"),
+    [
+        (gzip.compress(b"a bag"), r"is packed \(gzip\).*unpack it"),
+        (b"\x28\xb5\x2f\xfd" + bytes(9), r"is packed \(zstd\)"),
+        (bytes(257) + b"ustar" + bytes(9), r"is packed \(tar\)"),
+        (b"1.5 0 0 0 0 0 0 1\n2.5 1 0 0 0 0 0 1\n", "is a trajectory and no recording; .* --trajectory NAME=FILE"),
+    ],
+)
+def test_what_a_file_is_instead_is_told(tmp_path: Path, content: bytes, pattern: str) -> None:
+    (tmp_path / "drive").write_bytes(content)
+    with pytest.raises(DataError, match=pattern):
+        load_sequence(str(tmp_path / "drive"))
+
+
+def test_of_a_folder_of_recordings_some_are_named(course: dict[str, Any], tmp_path: Path) -> None:
+    np.savez(tmp_path / "02.npz", **course)
+    (tmp_path / "README").write_text("drives")
+    with pytest.raises(DataError, match=r"is no recording, and holds some: name 02\.npz in it"):
+        load_sequence(str(tmp_path))
+
+
+def test_a_path_with_a_null_character_is_no_path() -> None:
+    with pytest.raises(DataError, match=r"a\\x00b: is no path"):
+        load_sequence("a\0b")
+
+
+def test_a_file_that_opens_and_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a failing disk; an OSError that goes on would be taken for one of the output."""
+
+    class Failing(io.BytesIO):
+        def read(self, *_: Any) -> bytes:
+            raise OSError(errno.EIO, "Input/output error")
+
+    (tmp_path / "drive").write_bytes(b"x")
+    monkeypatch.setattr(Path, "open", lambda *_args, **_options: Failing())
+    with pytest.raises(DataError, match=r"drive: cannot be read \(Input/output error\); copy it again"):
+        load_sequence(str(tmp_path / "drive"))
 
 
 def test_an_unknown_source_names_the_built_ins() -> None:

@@ -1,5 +1,7 @@
 """Trajectory files: what is written is read back, evo reads it alike, and every wrong file gets one line."""
 
+import re
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from evo.tools import file_interface as evo
 
 from toolkit.datasets.trajectories import FORMATS, read_poses
-from toolkit.datasets.trajectories.rows import stamp_text
+from toolkit.datasets.trajectories.rows import read_rows, stamp_text
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.geometry import se3, so3_exp
@@ -248,3 +250,39 @@ def test_a_file_of_no_format_is_refused(tmp_path: Path, content: bytes, says: st
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "absent", tmp_path):
         assert "cannot be read" in complaint(path)
+
+
+@pytest.mark.parametrize("digits", [(1, 1), (9, 9), (10, 3), (10, 9)])
+def test_stamps_printed_alike_are_exact_to_the_nanosecond(tmp_path: Path, digits: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(digits))
+    before, after = digits
+    texts = sorted(
+        "".join(map(str, [rng.integers(1, 9), *rng.integers(0, 10, before - 1)]))
+        + "."
+        + "".join(map(str, rng.integers(0, 10, after)))
+        for _ in range(7)
+    )
+    path = tmp_path / "poses.txt"
+    for stamps in (texts, [*texts[:-1], f"{texts[-1]}0"[: before + 10]]):
+        path.write_text("".join(f"{text} 0 0 0 0 0 0 1\n" for text in stamps))
+        exact = [int(Decimal(text) * 10**9) for text in stamps]
+        assert read_rows(path, "a file").stamps(10**9).tolist() == exact
+
+
+@pytest.mark.parametrize(
+    ("cell", "pattern"),
+    [
+        ("1_0", "could not convert string to float: '1_0'"),
+        ("1e10", "has a position beyond 1e\\+09 m; check its unit"),
+        ("9" * 400, "not finite|beyond"),
+    ],
+)
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_position_that_no_body_has_is_refused(
+    tmp_path: Path, trajectory: Trajectory, name: str, cell: str, pattern: str
+) -> None:
+    rows = lines_of(name, trajectory)
+    rows[3][{"tum": 1, "kitti": 3, "euroc": 1, "openvins": 5}[name]] = cell
+    told = complaint(spoiled(tmp_path, name, rows))
+    assert "line 4" in told
+    assert re.search(pattern, told)

@@ -102,6 +102,14 @@ def test_runs_that_ought_to_be_there_are_missed(tree) -> None:
     assert standing(document(), "good")["ok"] == 21
 
 
+def test_fewer_runs_of_one_sequence_than_of_another_are_told(tree) -> None:
+    """A run that crashed may have left no file, and nothing else shows it."""
+    Path("results/good/S2/1.tum").unlink()
+    assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
+    told = "good has 2 of S2 and 3 runs elsewhere; --runs 3 counts those missing as failed"
+    assert told in document()["notes"]
+
+
 def test_repeated_runs_of_one_sequence_have_median_and_quartiles(tree, capsys) -> None:
     words = ("evaluate", "truths/S0.tum", "a=results/good/S0", "b=results/poor/S0/0.tum", "b=results/poor/S0/1.tum")
     assert tree(*words, "--out", "out") == 0

@@ -27,7 +27,8 @@ from toolkit.datasets import load_images, load_sequence
 from toolkit.datasets.io import bag_reader
 from toolkit.datasets.io.bag_topics import ROLES
 from toolkit.errors import DataError
-from toolkit.measured_motion import ImuNoise, TwistSamples
+from toolkit.geometry import so3_exp
+from toolkit.measured_motion import ImuNoise, ImuSamples, TwistSamples
 from toolkit.models.noise import mems_imu
 from toolkit.settings import Frontend
 
@@ -300,7 +301,8 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
     ("left_out", "pattern"),
     [
         ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry"),
-        ("/cam1/image_raw", "no two topics of images are a stereo pair"),
+        ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
+        ("image_raw", "holds no images that can be read"),
         ("/cam0/camera_info", "there is no sensor_msgs/CameraInfo beside /cam0/image_raw"),
         (
             "/tf_static",
@@ -311,10 +313,184 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
 def test_what_is_missing_is_told_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:
     ros = Ros.of("sqlite")
     film = film_of(asl, ros)
-    film = [item for item in [*film, *calibration_of(asl, ros, film[0].t_ns)] if item.topic != left_out]
+    film = [item for item in [*film, *calibration_of(asl, ros, film[0].t_ns)] if not item.topic.endswith(left_out)]
     with pytest.raises(DataError, match=pattern) as told:
         load_sequence(str(ros.write(tmp_path / "bare", film)))
     assert "\n" not in str(told.value)
+
+
+Edited = Callable[[Ros, list[Item]], list[Item]]
+
+
+def bare(ros: Ros, asl: Path, infos: tuple[float, float] | None = None) -> list[Item]:
+    """Return the messages of a bag that brings its calibration; ``infos`` are the Tx of P, of rectified images."""
+    film = film_of(asl, ros)
+    film += calibration_of(asl, ros, film[0].t_ns)
+    if infos is None:
+        return film
+    moved = {"/cam0/camera_info": infos[0], "/cam1/camera_info": infos[1]}
+    for item in film:
+        if item.topic in moved:
+            projection = item.value.P if hasattr(item.value, "P") else item.value.p
+            projection[[0, 2, 5, 6, 10]] = [230.0, 160.0, 230.0, 120.0, 1.0]
+            projection[3] = -230.0 * moved[item.topic]
+    return [item._replace(topic=item.topic.replace("image_raw", "image_rect")) for item in film]
+
+
+def test_a_gyro_and_an_accelerometer_apart_are_joined(asl: Path, tmp_path: Path) -> None:
+    """As a RealSense camera publishes them: each leaves the other's values zero."""
+    ros = Ros.of("ros1")
+    apart = []
+    for item in bare(ros, asl):
+        if item.topic != "/imu0":
+            apart.append(item)
+            continue
+        t_ns, gyro, accel = item.t_ns, vars(item.value.angular_velocity), vars(item.value.linear_acceleration)
+        gyro, accel = ([value[axis] for axis in "xyz"] for value in (gyro, accel))
+        apart.append(ros.imu(t_ns, gyro, [0.0] * 3)._replace(topic="/camera/gyro/sample"))
+        # At the same rate between the gyro's stamps, rising in time.
+        rising = [accel[0], accel[1], (t_ns - item.t_ns) + 1e-9 * (t_ns % 10**9)]
+        apart.append(ros.imu(t_ns + 2_000_000, [0.0] * 3, rising)._replace(topic="/camera/accel/sample"))
+    path = ros.write(tmp_path / "apart.bag", apart)
+    motion = load_sequence(str(path)).motion
+    assert isinstance(motion, ImuSamples)
+    whole = load_sequence(str(asl)).motion
+    np.testing.assert_array_equal(motion.gyro_radps, whole.gyro_radps[1:])
+    np.testing.assert_allclose(motion.accel_mps2[:, 2], 1e-9 * (motion.t_ns % 10**9) - 0.002, atol=1e-9)
+    with pytest.raises(DataError, match=r"/camera/accel/sample measures no angular velocity .*--topics imu=TOPIC"):
+        load_sequence(str(path), 0, Frontend(topics="imu=/camera/accel/sample"))
+    alone = ros.write(tmp_path / "alone.bag", [item for item in apart if item.topic != "/camera/accel/sample"])
+    with pytest.raises(DataError, match=r"/camera/gyro/sample measures no acceleration .*--topics accel=TOPIC"):
+        load_sequence(str(alone))
+
+
+def test_the_baseline_is_between_both_projections_or_that_of_the_transforms(asl: Path, tmp_path: Path) -> None:
+    """KITTI's colour cameras have a Tx each, that of the left one behind the origin."""
+    ros = Ros.of("ros1")
+    both, neither = ((-0.06, 0.06), (0.0, 0.0))
+    film, turn = bare(ros, asl, both), so3_exp(np.array([0.01, -0.02, 0.03]))
+    next(item.value for item in film if item.topic == "/cam0/camera_info").R[:] = turn.ravel()
+    rig = load_images(str(ros.write(tmp_path / "both.bag", film))).rig
+    assert rig.baseline_m == pytest.approx(0.12, rel=1e-12)
+    # The frame of an image is its camera's own (REP 104), which R turns into the rectified one's.
+    np.testing.assert_array_equal(rig.R_rect_cam, turn)
+    path = ros.write(tmp_path / "neither.bag", bare(ros, asl, neither))
+    expected = float(np.linalg.norm([0.12, 0.001, 0.0015]))
+    assert load_images(str(path)).rig.baseline_m == pytest.approx(expected, rel=1e-9)
+
+
+def test_transforms_of_tf_that_never_change_mount_the_camera(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("ros1")
+    film = bare(ros, asl)
+    static = next(item for item in film if item.topic == "/tf_static")
+    stamps = [item.t_ns for item in film if item.topic == "/cam0/image_raw"]
+    moving = np.eye(4)
+    repeated = []
+    for k, t_ns in enumerate(stamps):
+        moving[0, 3] = 0.1 * k
+        value = ros.store.types[TF]([*static.value.transforms, ros.transform(t_ns, "odom", "imu0", moving)])
+        repeated.append(Item(t_ns, "/tf", TF, value))
+    film = [item for item in film if item.topic != "/tf_static"]
+    path = ros.write(tmp_path / "tf.bag", [*film, *repeated])
+    bag = load_sequence(str(path))
+    np.testing.assert_allclose(bag.rig.T_imu_cam, load_sequence(str(asl)).rig.T_imu_cam, atol=1e-9)
+    assert any("the transforms of /tf that never change" in fact for fact in bag.provenance.facts)
+
+
+def test_images_that_are_rectified_already_are_found_by_their_rows(plain: Any, asl: Path, tmp_path: Path) -> None:
+    """As kitti2bag writes them: lenses and turns of the raw cameras, and nothing in the name of the topic."""
+    ros = Ros.of("ros1")
+    stamps = [int(path.stem) for path in sorted((asl / "mav0/cam0/data").iterdir())]
+    images = [
+        ros.image(t_ns, camera, pair[side])
+        for t_ns, pair in zip(stamps, plain.images, strict=True)
+        for side, camera in enumerate(("cam0", "cam1"))
+    ]
+    infos = [item for item in bare(ros, asl, (0.0, 0.12)) if item.topic.endswith("camera_info")]
+    for item in infos:
+        turn = so3_exp(np.array([0.012, 0.003, -0.004]) * (1.0 if "cam1" in item.topic else -1.0))
+        item.value.R[:] = turn.ravel()
+    rest = [item for item in bare(ros, asl) if item.topic in ("/imu0", "/tf_static")]
+    bag = load_sequence(str(ros.write(tmp_path / "kitti.bag", [*images, *infos, *rest])))
+    assert (bag.rig.fx_px, bag.rig.baseline_m) == pytest.approx((230.0, 0.12))
+    assert any(fact.startswith("the images are rectified already") for fact in bag.provenance.facts)
+
+
+def zeroed(_ros: Ros, film: list[Item]) -> list[Item]:
+    for item in film:
+        if "image" in item.topic:
+            item.value.header.stamp.sec = item.value.header.stamp.nanosec = 0
+    return film
+
+
+def on_another_clock(_ros: Ros, film: list[Item]) -> list[Item]:
+    for item in film:
+        if "image" in item.topic:
+            item.value.header.stamp.sec -= 1_000_000
+    return film
+
+
+def late(_ros: Ros, film: list[Item]) -> list[Item]:
+    for item in film:
+        if item.topic == "/cam1/image_raw":
+            item.value.header.stamp.nanosec += 3_000_000
+    return film
+
+
+def of_one_frame(_ros: Ros, film: list[Item]) -> list[Item]:
+    for item in film:
+        if item.topic in ("/imu0", "/cam0/image_raw"):
+            item.value.header.frame_id = "0"
+    return film
+
+
+def with_a_second_imu(ros: Ros, film: list[Item]) -> list[Item]:
+    elsewhere = []
+    for item in film:
+        if item.topic == "/imu0":
+            for shift_ns in (0, 1_000_000):
+                value = ros.imu(item.t_ns + shift_ns, [0.1] * 3, [1.0] * 3)
+                value.value.header.frame_id = "base_link"
+                elsewhere.append(value._replace(topic="/base/imu"))
+    return [*film, *elsewhere]
+
+
+@pytest.mark.parametrize(
+    ("edit", "pattern"),
+    [
+        (on_another_clock, r"the images are of .* s and /imu0 of .* s: two clocks"),
+        (late, r"no image of /cam0/image_raw has one of /cam1/image_raw within 1 ms \(10 left ones\)"),
+        (of_one_frame, "no /tf_static joins the frames '0' and '0'"),
+        (with_a_second_imu, r"'base_link' and 'cam0'.*or name another Imu with --topics imu=TOPIC \(/imu0\)"),
+    ],
+)
+def test_what_does_not_belong_together_is_told_in_one_line(
+    asl: Path, tmp_path: Path, edit: Edited, pattern: str
+) -> None:
+    ros = Ros.of("ros1")
+    with pytest.raises(DataError, match=pattern) as told:
+        load_sequence(str(ros.write(tmp_path / "film.bag", edit(ros, bare(ros, asl)))))
+    assert "\n" not in str(told.value)
+
+
+def test_where_images_have_no_stamp_it_is_when_they_were_recorded(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("ros1")
+    bag = load_sequence(str(ros.write(tmp_path / "film.bag", zeroed(ros, bare(ros, asl)))))
+    np.testing.assert_array_equal(bag.frames_t_ns, load_sequence(str(asl)).frames_t_ns)
+    assert "20 images have no stamp, and when they were recorded is taken for it" in bag.provenance.facts
+
+
+def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("mcap")
+    path = ros.write(tmp_path / "drive", bare(ros, asl))
+    (path / "metadata.yaml").unlink()
+    assert len(load_images(str(path)).pairs) == 10
+    shutil.copy(path / "drive.mcap", path / "again.mcap")
+    with pytest.raises(DataError, match=r"holds 2 bags and no metadata.yaml that joins them: again.mcap, drive.mcap"):
+        load_images(str(path))
+    (path / "notes.txt").write_text("a drive")
+    with pytest.raises(DataError, match=r"is no recording, and holds some: name again.mcap or drive.mcap in it"):
+        load_images(str(path))
 
 
 def test_without_the_library_a_bag_is_recognised_and_the_extra_named(

@@ -25,6 +25,29 @@ def test_a_grey_scene_is_grey_in_every_encoding_of_colour(encoding: str, channel
     np.testing.assert_allclose(grey(Pixels(6, 8, encoding, 0, 8 * channels, data.ravel()), "here"), scene, atol=1)
 
 
+@pytest.mark.parametrize("encoding", ["rgb16", "bgr16"])
+def test_sixteen_bits_of_a_colour_stay(encoding: str) -> None:
+    scene = np.random.default_rng(0).integers(0, 65536, (6, 8), dtype=np.uint16)
+    data = np.repeat(scene[..., None], 3, axis=2)
+    found = grey(Pixels(6, 8, encoding, 0, 48, data.view(np.uint8).ravel()), "here")
+    assert found.dtype == np.uint16
+    np.testing.assert_allclose(found.astype(int), scene, atol=2)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "place"), [("uyvy", 1), ("yuyv", 0), ("yuv422", 1), ("yuv422_yuy2", 0), ("nv12", None)]
+)
+def test_of_brightness_and_colour_apart_the_brightness_is_taken(encoding: str, place: int | None) -> None:
+    scene = np.random.default_rng(0).integers(0, 256, (6, 8), dtype=np.uint8)
+    if place is None:
+        data, step = np.concatenate([scene.ravel(), np.full(24, 128, np.uint8)]), 8
+    else:
+        pixels = np.full((6, 8, 2), 128, np.uint8)
+        pixels[..., place] = scene
+        data, step = pixels.ravel(), 16
+    np.testing.assert_array_equal(grey(Pixels(6, 8, encoding, 0, step, data), "here"), scene)
+
+
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_a_bayer_pattern_has_its_red_where_it_says(pattern: str) -> None:
     """Of a red scene the brightness is that of red, 0.3 of the sensor's, and of a blue one 0.11."""

@@ -9,7 +9,8 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.documents import schema
-from toolkit.report.diff_text import DiffRecord
+from toolkit.report.diff_text import DiffRecord, diff_text
+from toolkit.report.differences import Change, Differences
 
 DOCUMENTS = Path(__file__).parent / "documents"
 
@@ -88,6 +89,13 @@ def test_a_run_does_not_differ_from_itself(told, runs, name: str, capsys) -> Non
     assert found["settings"] == found["data"] == found["environment"] == found["ends"] == []
     assert main(["diff", str(runs / name), str(runs / name)]) == 0
     assert "the results are the same, to a millionth" in capsys.readouterr().out
+
+
+def test_what_differs_at_the_end_of_a_long_text_is_shown() -> None:
+    """As of a commit and the same commit changed."""
+    commit = "8498ca72c387555fad878cff71f56b44dc9a20cc"
+    revision = Change("git_revision", commit, f"{commit}+changed")
+    assert "+changed" in diff_text(Differences(("a", "b"), (), (revision,), (), (), (), 0, paired=False))
 
 
 def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(told, runs, capsys) -> None:

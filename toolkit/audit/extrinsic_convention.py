@@ -3,7 +3,9 @@
 The same four by four numbers can take the IMU to the camera or the camera to the IMU, and the camera's axes can be
 x right, y down, z forward (optical) or x forward, y left, z up (regular). Points triangulated in one frame, moved
 by the motion samples through each of the four and projected into the next, miss the tracks the least through the right
-one. The intervals' medians decide, which wrong matches do not reach.
+one. The intervals' medians decide, which wrong matches do not reach. Two readings whose cameras look nearly the same
+way, as an extrinsic in regular axes and its inverse, differ in where the camera is: then it decides where, in turns,
+the camera's own velocity puts it.
 """
 
 import math
@@ -12,13 +14,19 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import median_one_step_px, one_step_px_by_interval
-from toolkit.geometry import Array, se3, se3_inverse
+from toolkit.audit.parts.intervals import Intervals, median_one_step_px, one_step_px_by_interval
+from toolkit.audit.parts.robust import Scalar, slope
+from toolkit.geometry import Array, se3, se3_inverse, so3_log
 from toolkit.sequence import EXTRINSIC_IN_DOUBT, Sequence
 
 # Mean difference of the logarithms of two readings' residuals, in its own standard errors: between readings that a
 # file allows alike it needs to be beyond chance only (intervals are correlated over about a second).
 AGAINST_SECOND = 4.0
+# Cameras that look the same way to this angle: there the noise of the samples, which the lever arm makes a motion of
+# the camera, moves the residuals more than which reading is right.
+SAME_WAY_RAD = 0.05
+# Largest standard error of the share of the way between two readings: twice that is the way to the middle.
+LARGEST_ERROR = 0.25
 # Optical axes (right, down, forward) in regular ones (forward, left, up).
 _T_REGULAR_OPTICAL = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 
@@ -39,6 +47,17 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if len(as_good) == len(others):
         return Undecided(f"the tracks follow every reading of the extrinsic alike, {first} and {as_good[0]} the best")
     doubt = "".join(f"; it explains the motion as well {name} ({certainty[name]:.1f} sigma)" for name in as_good)
+    for name in others:
+        same_way = _turned_rad(readings[first], readings[name]) < SAME_WAY_RAD
+        if not (same_way or name in as_good):
+            continue
+        share = _share(evidence.intervals, readings[first], readings[name])
+        if share is not None:
+            way = f"{share.value:.2f} +- {share.error:.2f} of the way from {first} to {name}"
+            doubt += f"; in turns the camera's velocity is {way}"
+            first = name if share.value > 0.5 else first
+        elif same_way:
+            doubt += f"; the camera looks the same way {name}, and there is too little rotation to tell where it is"
     each_px = ", ".join(f"{median_one_step_px(sequence, camera, T):.2f} px {name}" for name, T in readings.items())
     return Symptom(
         count=1,
@@ -58,6 +77,35 @@ def _readings(T_imu_cam: Array) -> dict[str, Array]:
         "inverted, camera axes optical": inverse,
         "inverted, camera axes regular": inverse @ _T_REGULAR_OPTICAL,
     }
+
+
+def _share(intervals: Intervals, T_imu_first: Array, T_imu_other: Array) -> Scalar | None:
+    """Return how far the measured velocity is on its way from that through one extrinsic to that through another.
+
+    Constant differences do not count, for a wheel's slip and an error of the rotation are such. The measured rate of
+    rotation is the instrument, which the camera's noise cannot touch: its rotation and its velocity err together. None
+    where no velocity is measured, or there was too little rotation to tell.
+    """
+    if intervals.v_mps is None:
+        return None
+    one, other = (_velocities(intervals, T) for T in (T_imu_first, T_imu_other))
+    in_turns = -np.cross(intervals.w_radps, T_imu_other[:3, 3] - T_imu_first[:3, 3])
+    share = slope(*(_centred(values) for values in (in_turns, other - one, intervals.v_mps - one)))
+    return share if share.error < LARGEST_ERROR else None
+
+
+def _velocities(intervals: Intervals, T_imu_cam: Array) -> Array:
+    """Return the velocity (M, 3) of the IMU that the camera's own motion has through an extrinsic."""
+    w_imu = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    return np.asarray(intervals.v_cam_mps @ T_imu_cam[:3, :3].T - np.cross(w_imu, T_imu_cam[:3, 3]))
+
+
+def _centred(values: Array) -> Array:
+    return np.asarray(values - np.median(values, axis=0))
+
+
+def _turned_rad(T_imu_first: Array, T_imu_other: Array) -> float:
+    return float(np.linalg.norm(so3_log(T_imu_first[:3, :3].T @ T_imu_other[:3, :3])))
 
 
 def _settled(sequence: Sequence, T_imu_cam: Array, reading: str) -> Sequence:

@@ -261,7 +261,7 @@ def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes
 
 
 # Repeated from toolkit.datasets.io.bag_topics (a test compares them), which would cost the help a third of a second.
-TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "twist", "truth")
+TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "accel", "twist", "truth")
 
 
 def topics(text: str) -> str:

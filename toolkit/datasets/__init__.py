@@ -17,11 +17,12 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
+from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
 from toolkit.frontend import ImageRecording
-from toolkit.inputs import is_regular, open_input, unreadable
+from toolkit.inputs import open_input, unreadable
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, check_stated
 from toolkit.settings import DEFAULTS, Frontend, Tracks
@@ -229,11 +230,13 @@ def load_references(source: str) -> dict[str, Trajectory]:
 
 def _reader_of(path: Path, source: str) -> RecordingFormat:
     _check_readable(path, source)
-    for reader in _readers().values():
-        if reader.recognises(path):
-            return reader
-    empty = is_regular(path) and path.stat().st_size == 0
-    what = "the file is empty and so of no known format" if empty else "its content is of no known format"
+    try:
+        for reader in _readers().values():
+            if reader.recognises(path):
+                return reader
+    except OSError as error:  # a file that can be opened and not read, as on a failing disk
+        raise DataError(unreadable(path, error)) from error
+    what = why_unrecognised(path, lambda inside: any(reader.recognises(inside) for reader in _readers().values()))
     lacking = "".join(f"; {name} is unavailable: {why}" for name, why in unavailable().items())
     raise DataError(f"{source}: {what}; there are {', '.join(formats())}{lacking}")
 

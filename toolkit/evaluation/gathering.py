@@ -52,12 +52,24 @@ def gather(truth: Path, given: Iterable[str], runs: int | None = None) -> Gather
         for sequence in scored
         for item in _items(name, sequence, files.get(sequence, ()), runs or _runs_elsewhere(files, sequence))
     ]
-    return Gathered({s: truths[s] for s in scored}, tuple(items), tuple(_left_out(truths, known)))
+    notes = (*_left_out(truths, known), *(() if runs else _fewer_runs(found, scored)))
+    return Gathered({s: truths[s] for s in scored}, tuple(items), notes)
 
 
 def _runs_elsewhere(files: Mapping[str, tuple[Path, ...]], sequence: str) -> int:
     """Return how many runs a system without any of a sequence ought to have: as many as of another one."""
     return 0 if sequence in files else max(map(len, files.values()))
+
+
+def _fewer_runs(found: _Found, scored: Iterable[str]) -> Iterable[str]:
+    """Yield which systems have fewer runs of one sequence than of another, for one that crashed may have no file."""
+    for name, files in found.items():
+        counts = {sequence: len(files[sequence]) for sequence in scored if sequence in files}
+        most = max(counts.values(), default=0)
+        fewer = [f"{count} of {sequence}" for sequence, count in counts.items() if count < most]
+        if fewer:
+            there = f"{name} has {', '.join(fewer)} and {most} runs elsewhere"
+            yield f"{there}; --runs {most} counts those missing as failed"
 
 
 def _items(system: str, sequence: str, files: tuple[Path, ...], runs: int) -> list[Item]:

@@ -5,7 +5,7 @@ Read ``tracker`` first: it is the algorithm. ``tracking`` runs it over a recordi
 
 from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified
 from toolkit.frontend.images import StampedPair, size_of
-from toolkit.frontend.tracking import ImageRecording, ImageTracks, track_images
+from toolkit.frontend.tracking import ImageRecording, ImageTracks, matched_corners, track_images
 
 __all__ = [
     "Camera",
@@ -15,6 +15,7 @@ __all__ = [
     "RectifiedPair",
     "StampedPair",
     "already_rectified",
+    "matched_corners",
     "rectified",
     "size_of",
     "track_images",

@@ -6,6 +6,7 @@ left and right are what they are called, and that the calibration is theirs.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,6 +71,11 @@ def track_images(
     return found
 
 
+def matched_corners(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend) -> int:
+    """Return how many corners of the left images of a few pairs are found in the same rows of the right ones."""
+    return _looked_at(pairs, rig, settings, _bits_of(pairs)).matched
+
+
 def read_pair(
     pair: StampedPair, rig: RectifiedPair, bits: int, sides: tuple[int, int] = (0, 1)
 ) -> tuple[Image, Image] | Unusable:
@@ -124,8 +130,16 @@ def _tracked(
     )
 
 
-def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> None:
-    """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
+class _Matches(NamedTuple):
+    """Corners of a few pairs that were looked for, found, and found where left and right are exchanged."""
+
+    wanted: int
+    matched: int
+    swapped: int
+
+
+def _looked_at(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> _Matches:
+    """Match the corners of a few pairs, each by itself."""
     places = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
     matched = swapped = wanted = 0
     for place in places.tolist():
@@ -137,6 +151,12 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
         matched += _count(as_called, *images)
         swapped += _count(Tracker(rig, settings), exchanged[1], exchanged[0])
         wanted += as_called.tried
+    return _Matches(wanted, matched, swapped)
+
+
+def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> None:
+    """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
+    wanted, matched, swapped = _looked_at(pairs, rig, settings, bits)
     folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
     if swapped > _MOST_SWAPPED * matched and swapped > _LEAST_MATCHED * wanted:
         raise DataError(

@@ -11,6 +11,8 @@ from toolkit.report.differences import FALSE_ALARM_RATE, Change, Differences, Me
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.table import MISSING, Table, as_text, cell
 
+_LONGEST = 40
+
 
 class ChangeRecord(Struct, frozen=True, kw_only=True):
     """A thing that the two have otherwise, as text; empty where one has none."""
@@ -99,7 +101,9 @@ def _section(title: str, changes: tuple[Change, ...]) -> list[str]:
 
 
 def _short(text: str) -> str:
-    return (text if len(text) <= 40 else f"{text[:37]}...") or MISSING
+    """Return a text, a long one without its middle: what differs is at the end, as of a file or of a changed commit."""
+    half = (_LONGEST - 3) // 2
+    return (text if len(text) <= _LONGEST else f"{text[:half]}...{text[-half:]}") or MISSING
 
 
 def _table(moved: list[MetricChange], metrics: dict[str, Metric]) -> Table:

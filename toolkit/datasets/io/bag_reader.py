@@ -6,7 +6,7 @@ Formats: http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the fol
 """
 
 import importlib.util
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -21,13 +21,30 @@ _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}
 _SQLITE, _ROS_TABLES = b"SQLite format 3\0", (b"topics", b"messages")
 _METADATA, _IN_METADATA = "metadata.yaml", b"rosbag2_bagfile_information"
 _LOOKED_AT = 1 << 16
-_TF, _TF_DEFINITION = "tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms"
+# The second is what tf called the same message before tf2.
+_TF, _OLD_TF, _TF_DEFINITION = (
+    "tf2_msgs/msg/TFMessage",
+    "tf/msg/tfMessage",
+    "geometry_msgs/TransformStamped[] transforms",
+)
+_ENDINGS = (".mcap", ".db3", ".bag")
+# What writes the missing index, by kind of bag.
+_MENDS = {
+    "ros1": "copy it again, or run rosbag reindex on it",
+    "mcap": "copy it again, or run mcap recover on it",
+    "sqlite": "copy it again, or run ros2 bag reindex on its folder",
+    "folder": "copy it again, or run ros2 bag reindex on it",
+}
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO, IMU, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", _TF
+CAMERA_INFO, IMU, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", (_TF, _OLD_TF)
 ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST, TWIST_COV = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped"
 POSE, TRANSFORM = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"
-KNOWN_TYPES = frozenset({IMAGE, COMPRESSED, CAMERA_INFO, IMU, TRANSFORMS, ODOMETRY, POSE, TRANSFORM})
+POSE_COV = "geometry_msgs/msg/PoseWithCovarianceStamped"
+KNOWN_TYPES = frozenset(
+    {IMAGE, COMPRESSED, CAMERA_INFO, IMU, *TRANSFORMS, ODOMETRY, TWIST, TWIST_COV, POSE, POSE_COV, TRANSFORM}
+)
 
 
 @dataclass(frozen=True)
@@ -53,10 +70,21 @@ class Message:
     value: Any
 
 
+@dataclass(frozen=True, eq=False)
+class Held:
+    """The messages of the topics that are small enough to be held in memory, in the order of recording."""
+
+    by_topic: Mapping[str, list[Message]]
+
+    def of(self, topic: Topic | None) -> list[Message]:
+        """Return the messages of a topic; none where there is no such topic."""
+        return [] if topic is None else self.by_topic.get(topic.name, [])
+
+
 def kind_of(path: Path) -> Kind | None:
     """Return the kind of bag a path is, from its content; None where it is none."""
     if path.is_dir():
-        return "folder" if _of_rosbag2(path / _METADATA) else None
+        return "folder" if _of_rosbag2(path / _METADATA) or _files_alone(path) else None
     if not is_regular(path):
         return None
     with open_input(path) as file:
@@ -73,14 +101,22 @@ def _of_rosbag2(metadata: Path) -> bool:
         return _IN_METADATA in file.read(_LOOKED_AT)
 
 
+def _files_alone(folder: Path) -> list[Path]:
+    """Return the bags in a folder that holds nothing else but YAML files; none where it does."""
+    files = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    bags = [path for path in files if path.suffix in _ENDINGS and is_regular(path) and kind_of(path) is not None]
+    return bags if all(path in bags or path.suffix == ".yaml" for path in files) else []
+
+
 class Bag:
     """An open bag."""
 
     def __init__(self, path: Path, kind: Kind, reader: Any) -> None:
         self.path = path
         self._reader = reader
+        self._kind = kind
         self._of_ros1 = kind == "ros1"
-        with _guarded(path):
+        with _guarded(path, kind):
             self._connections = list(reader.connections)
             self.topics = tuple(self._topic(name) for name in sorted({c.topic for c in self._connections}))
 
@@ -89,7 +125,7 @@ class Bag:
         connections = [connection for connection in self._connections if connection.topic in topics]
         coming = iter(self._reader.messages(connections)) if connections else iter(())
         while True:
-            with _guarded(self.path):
+            with _guarded(self.path, self._kind):
                 found = next(coming, None)
                 if found is None:
                     return
@@ -133,13 +169,29 @@ def opened(path: Path) -> Iterator[Bag]:
         raise DataError(f"{path}: is no bag of ROS 1 or 2 and no MCAP")
     if importlib.util.find_spec("rosbags") is None:
         raise DataError(f'{path}: bags are read with the package rosbags; pip install "vislam-toolkit[bags]"')
-    with _guarded(path):
+    if kind == "folder" and not _of_rosbag2(path / _METADATA):
+        path = _only(path)
+        kind = kind_of(path)
+        assert kind is not None
+    with _guarded(path, kind):
         reader = _reader(kind)(path)
         reader.open()
     try:
         yield Bag(path, kind, reader)
     finally:
         reader.close()
+
+
+def _only(folder: Path) -> Path:
+    """Return the one bag in a folder without metadata.yaml; raises DataError where there are several."""
+    bags = _files_alone(folder)
+    if len(bags) > 1:
+        names = printable(", ".join(bag.name for bag in bags))[:200]
+        raise DataError(
+            f"{folder}: holds {len(bags)} bags and no {_METADATA} that joins them: {names}; name one of them, or run "
+            "ros2 bag reindex on the folder"
+        )
+    return bags[0]
 
 
 def _reader(kind: Kind) -> Any:
@@ -164,8 +216,9 @@ def _store(of_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if of_ros1 else Stores.ROS2_HUMBLE)
-    if _TF not in store.types:
-        store.register(get_types_from_msg(_TF_DEFINITION, _TF))
+    for name in TRANSFORMS:
+        if name not in store.types:
+            store.register(get_types_from_msg(_TF_DEFINITION, name))
     return store
 
 
@@ -176,7 +229,7 @@ def _digest(store: Any, message_type: str, *, of_ros1: bool) -> str:
 
 
 @contextmanager
-def _guarded(path: Path) -> Iterator[None]:
+def _guarded(path: Path, kind: Kind) -> Iterator[None]:
     """Raise as DataError whatever the library raises: of a damaged bag that can be anything."""
     try:
         yield
@@ -184,6 +237,6 @@ def _guarded(path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         why = printable(" ".join(str(error).split()))[:200] or type(error).__name__
-        raise DataError(
-            f"{path}: damaged, cut off, or a bag that cannot be read ({why}); copy or reindex it"
-        ) from error
+        of_folder = kind in ("mcap", "sqlite") and _of_rosbag2(path.parent / _METADATA)
+        mend = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _MENDS[kind]
+        raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {mend}") from error

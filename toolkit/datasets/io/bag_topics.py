@@ -1,5 +1,6 @@
 """Which topics of a bag are what: as asked for with ``--topics``, else guessed from their types and names."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,27 +13,34 @@ from toolkit.datasets.io.bag_reader import (
     KNOWN_TYPES,
     ODOMETRY,
     POSE,
+    POSE_COV,
     TRANSFORM,
     TRANSFORMS,
+    TWIST,
+    TWIST_COV,
     Topic,
 )
 from toolkit.errors import DataError, no_such
 
-_IMAGES, _POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE, TRANSFORM)
+_IMAGES, _POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE, POSE_COV, TRANSFORM)
 ROLES: dict[str, tuple[str, ...]] = {
     "left": _IMAGES,
     "right": _IMAGES,
     "left_info": (CAMERA_INFO,),
     "right_info": (CAMERA_INFO,),
     "imu": (IMU,),
-    "twist": (ODOMETRY,),
+    "accel": (IMU,),
+    "twist": (ODOMETRY, TWIST, TWIST_COV),
     "truth": _POSES,
 }
-# What distinguishes the names of the two cameras of a pair, left first.
-_SIDES = (("left", "right"), ("0", "1"), ("1", "2"), ("l", "r"), ("Left", "Right"))
+# What distinguishes the names of the two cameras of a pair, left first: as words of their own, or anywhere.
+_SIDES = (("0", "1"), ("1", "2"), ("l", "r"))
+_SIDES_ANYWHERE = (("left", "right"), ("Left", "Right"))
+# Of a sensor that publishes both by themselves, as RealSense's cameras do.
+_GYRO, _ACCEL = "gyro", "accel"
 # In the name of a topic whose poses are a truth, and not another system's estimate.
-_OF_TRUTH = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "leica")
-_STATIC, _RECTIFIED, _LEAST_IMAGES = "tf_static", "rect", 2
+_OF_TRUTH = ("truth", "gt", "groundtruth", "vicon", "mocap", "optitrack", "qualisys", "vrpn", "leica")
+_STATIC, _MOVING, _RECTIFIED, _LEAST_IMAGES = "tf_static", "tf", "rect", 2
 # Of a message that lists the topics of a bag, which may be hundreds.
 _LONGEST = 900
 _COMPRESSED_SUFFIX = "/compressed"
@@ -40,16 +48,23 @@ _COMPRESSED_SUFFIX = "/compressed"
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics of a recording by what they are; None where there is none, and what must be known of the choice."""
+    """The topics of a recording by what they are; None where there is none, and what must be known of the choice.
+
+    ``accel`` is there where the accelerometer has a topic by itself, and ``imu`` is the gyro's; ``moving`` are the
+    transforms that may change, and ``other_imus`` those that were not chosen.
+    """
 
     left: Topic
     right: Topic
     left_info: Topic | None
     right_info: Topic | None
     imu: Topic | None
+    accel: Topic | None
     twist: Topic | None
     truth: Topic | None
     transforms: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
+    other_imus: tuple[str, ...]
     facts: tuple[str, ...] = ()
 
     @property
@@ -64,7 +79,9 @@ def choose(path: Path, topics: Sequence[Topic], asked: str | None) -> Chosen:
     usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
     left, right = _pair(path, topics, usable, given)
     truth = given.get("truth") or _truth(usable)
-    imu = given.get("imu") or (None if "twist" in given else _most(_of_types(usable, (IMU,))))
+    imus = _of_types(usable, (IMU,))
+    imu = given.get("imu") or (None if "twist" in given else _imu(imus))
+    accel = given.get("accel") or _partner(imu, imus)
     odometry = [topic for topic in _of_types(usable, (ODOMETRY,)) if topic != truth]
     chosen = Chosen(
         left=left,
@@ -72,9 +89,12 @@ def choose(path: Path, topics: Sequence[Topic], asked: str | None) -> Chosen:
         left_info=given.get("left_info") or _info(usable, left),
         right_info=given.get("right_info") or _info(usable, right),
         imu=imu,
+        accel=accel,
         twist=given.get("twist") or (None if imu else _most(odometry)),
         truth=truth,
-        transforms=tuple(topic for topic in _of_types(usable, (TRANSFORMS,)) if topic.name.endswith(_STATIC)),
+        transforms=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.endswith(_STATIC)),
+        moving=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
+        other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
     )
     return replace(chosen, facts=_facts(topics, chosen, given))
 
@@ -104,22 +124,50 @@ def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: d
     pairs = [(one, two) for one in images for two in images if _are_sides(one.name, two.name)]
     pairs = [(one, two) for one, two in pairs if given.get("left", one) == one and given.get("right", two) == two]
     if not pairs:
-        there = ", ".join(map(str, topics)) or "nothing"
-        raise DataError(
-            f"{path}: no two topics of images are a stereo pair by their names; say which with --topics "
-            f"left=TOPIC,right=TOPIC; there are {there}"[:_LONGEST]
-        )
+        raise DataError(_no_pair(path, topics, images))
     # Rectified images need no calibration of a lens; of raw and compressed ones raw ones are whole.
     return min(
         pairs, key=lambda pair: (_RECTIFIED not in pair[0].name, pair[0].type != IMAGE, -pair[0].count, pair[0].name)
     )
 
 
+def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
+    """Return what to tell of a bag in which no two topics of images are a pair by their names."""
+    there = ", ".join(map(str, topics)) or "nothing"
+    if not images:
+        why = "holds no images that can be read, and the tracks are made of them"
+    elif len(images) == 1:
+        why = f"holds images of one camera, {images[0].name}, and the tracks are made of a stereo pair's"
+    else:
+        why = "no two topics of images are a stereo pair by their names; say which with --topics left=TOPIC,right=TOPIC"
+    return f"{path}: {why}; there are {there}"[:_LONGEST]
+
+
 def _are_sides(one: str, two: str) -> bool:
     """Say whether two names differ in nothing but the side of a pair, the left one first."""
-    return one != two and any(
-        two in (one[:at] + right + one[at + len(left) :] for at in _places(one, left)) for left, right in _SIDES
+    return any(_differ_by(one, two, left, right) for left, right in _SIDES) or any(
+        two in (one[: at.start()] + right + one[at.end() :] for at in re.finditer(left, one))
+        for left, right in _SIDES_ANYWHERE
     )
+
+
+def _differ_by(one: str, two: str, word: str, other: str) -> bool:
+    """Say whether a name becomes another where a word in it is exchanged."""
+    return two in (one[:at] + other + one[at + len(word) :] for at in _places(one, word))
+
+
+def _imu(imus: Sequence[Topic]) -> Topic | None:
+    """Return the IMU with the most messages; gyros whose accelerometers publish by themselves only for want of one."""
+    gyros = [topic for topic in imus if _partner(topic, imus)]
+    halves = {topic for gyro in gyros for topic in (gyro, _partner(gyro, imus))}
+    return _most(topic for topic in imus if topic not in halves) or _most(gyros)
+
+
+def _partner(gyro: Topic | None, imus: Sequence[Topic]) -> Topic | None:
+    """Return the accelerometer that has the name of a gyro but for that word."""
+    if gyro is None:
+        return None
+    return next((topic for topic in imus if _differ_by(gyro.name.lower(), topic.name.lower(), _GYRO, _ACCEL)), None)
 
 
 def _places(text: str, part: str) -> Iterable[int]:
@@ -140,8 +188,9 @@ def _info(usable: Sequence[Topic], image: Topic) -> Topic | None:
     namespace = base
     while namespace:
         namespace = namespace.rpartition("/")[0]
-        if f"{namespace}/camera_info" in infos:
-            return infos[f"{namespace}/camera_info"]
+        for name in (f"{namespace}/camera_info", f"{namespace}/info/camera_info"):
+            if name in infos:
+                return infos[name]
     return None
 
 

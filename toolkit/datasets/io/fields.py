@@ -30,6 +30,13 @@ _UNITS = (
     (1e-6, "microseconds: divide by 1e6"),
     (1e-3, "milliseconds: divide by 1e3"),
 )
+# Nobody states more than two thousand samples a second, so closer stamps do not count nanoseconds. What they count is
+# told from the step: halfway, as factors go, between steps of 50 ms in one unit and the next.
+_UNITS_OF_NS = (
+    (1.6, "seconds: multiply by 1e9"),
+    (1.6e3, "milliseconds: multiply by 1e6"),
+    (5e5, "microseconds: multiply by 1e3"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +106,7 @@ def check_numeric(path: Path, key: str, dtype: np.dtype[np.generic]) -> None:
     if dtype.kind == "O":
         raise DataError(f"{path}: {key} holds objects, which are never unpickled; save it as plain numbers")
     if dtype.kind not in "fiu":
-        raise DataError(f"{path}: {key} holds {dtype}, expected real numbers")
+        raise DataError(f"{path}: {key} holds {'text' if dtype.kind in 'US' else dtype}, expected real numbers")
 
 
 def rigid(path: Path, key: str, T: Array) -> Array:
@@ -140,6 +147,13 @@ def probable_unit(stamps_s: Array) -> str | None:
         if largest * scale > 1e8 or step * scale > 1e-3:
             return name
     return _UNITS[-1][1]
+
+
+def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:
+    """Return the unit, with its remedy, that stamps (N,) are probably in, or None where nanoseconds are plausible."""
+    steps = np.diff(np.unique(t_ns))
+    step = float(np.median(steps)) if steps.size else np.inf
+    return next((name for below, name in _UNITS_OF_NS if step < below), None)
 
 
 def check_rows(path: Path, corners_px: Array) -> None:

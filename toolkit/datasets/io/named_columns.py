@@ -1,5 +1,6 @@
 """Columns by name, of a CSV file or of a program's own values, with every complaint naming table, column and row."""
 
+import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
@@ -9,26 +10,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import probable_unit, stamps_ns
+from toolkit.datasets.io.fields import probable_unit, probable_unit_of_ns, stamps_ns
 from toolkit.datasets.io.tables import read_whole
 from toolkit.errors import DataError, nearest, printable
 from toolkit.geometry import Array, IntArray
 from toolkit.resampling import NS_PER_S
 
 SECONDS, NANOSECONDS = "t", "t_ns"
-# A row of a file is counted as an editor does: the heading is line 1.
-_FIRST_LINE = 2
+_SEPARATORS = (",", ";", "\t")
 _LARGEST = 2**63 - 1
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """A table: what it is called in a complaint, its columns (N,), texts or numbers, by name, and where row 0 is."""
+    """A table: what it is called in a complaint, its columns (N,), texts or numbers, by name, and what rows are called.
+
+    ``numbers_of_rows`` are those of a file's lines, as an editor counts them; None counts from 0.
+    """
 
     what: Path
     values: Mapping[str, Sequence[Any] | npt.NDArray[Any]]
     row: str = "row"
-    first: int = 0
+    numbers_of_rows: tuple[int, ...] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,7 +81,11 @@ class Columns:
         if SECONDS in self.values and NANOSECONDS in self.values:
             raise DataError(f"{self.what}: has the columns {SECONDS} and {NANOSECONDS}; leave one out")
         if NANOSECONDS in self.values:
-            return self.whole(NANOSECONDS)
+            t_ns = self.whole(NANOSECONDS)
+            unit = probable_unit_of_ns(t_ns)
+            if unit is not None:
+                raise DataError(f"{self.what}: {NANOSECONDS} must be in nanoseconds, but the stamps look like {unit}")
+            return t_ns
         values = self.values[SECONDS]
         if isinstance(values, np.ndarray) and values.dtype.kind in "fiu":
             return stamps_ns(self.what, SECONDS, values.astype(np.float64))
@@ -90,7 +97,7 @@ class Columns:
 
     def at(self, row: int) -> str:
         """Return how a row is called."""
-        return f"{self.row} {row + self.first}"
+        return f"{self.row} {row if self.numbers_of_rows is None else self.numbers_of_rows[row]}"
 
     def unused(self, used: Iterable[str]) -> tuple[str, ...]:
         """Return the names of the columns that are none of those used."""
@@ -102,15 +109,18 @@ class Columns:
         if values.ndim != 1:
             raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
         try:
+            if values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any():
+                raise ValueError  # Python takes 1_0 for ten
             return values.astype(np.float64)
         except (TypeError, ValueError):
             bad = next(i for i, value in enumerate(values.tolist()) if not _is_number(value))
             shown = printable(str(values[bad]))[:50] or "empty"
-            raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number") from None
+            point = " with a decimal point" if "," in shown else ""
+            raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}") from None
 
     def _whole(self, name: str, row: int, value: Any) -> int:
         try:
-            exact = Decimal(value) if isinstance(value, str) else value
+            exact = Decimal(value.replace("_", "?")) if isinstance(value, str) else value
             number = int(exact) if abs(exact) <= _LARGEST else None
         except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
             exact, number = value, None
@@ -121,7 +131,7 @@ class Columns:
 
     def _decimal(self, row: int, text: str) -> Decimal:
         try:
-            seconds = Decimal(text)
+            seconds = Decimal(text.replace("_", "?"))
         except InvalidOperation:
             seconds = Decimal("nan")
         if not seconds.is_finite():
@@ -142,34 +152,61 @@ def _is_number(value: Any) -> bool:
         float(value)
     except (TypeError, ValueError):
         return False
-    return True
+    return "_" not in str(value)
 
 
 def columns_of_file(path: Path) -> Columns:
     """Read a CSV, plain or gzipped, whose first line names its columns; comments and units after names are left out.
 
-    Raises DataError where it cannot be read, has no rows, a column twice, or a row of another length.
+    Cells stand between commas, semicolons or tabs, in quotes or not. Raises DataError where the file cannot be read,
+    has no names or no rows, a column twice, or a row of another length.
     """
     try:
         text = read_whole(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not a text file; write a CSV, one row a line, with names in the first") from error
-    heading, *lines = text.splitlines() or [""]
-    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in heading.split(",")]
-    if len(set(names)) < len(names):
+    heading, lines = _heading(path, text)
+    separator = max(_SEPARATORS, key=heading.count)
+    if separator not in heading and len(heading.split()) > 1:
+        raise DataError(f"{path}: its columns stand between blanks; separate them by commas, semicolons or tabs")
+    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in _cells(heading, separator)]
+    kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
+    if len(set(kept)) < len(kept):
         raise DataError(f"{path}: a column name is there twice in {printable(heading)[:200]}; rename or remove one")
-    rows = [line.split(",") for line in lines]
-    while rows and rows[-1] == [""]:
-        rows.pop()
+    rows = [_cells(line, separator) for _, line in lines]
     wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
     if wrong is not None:
-        raise DataError(f"{path}: line {wrong + _FIRST_LINE} has {len(rows[wrong])} columns, expected {len(names)}")
+        raise DataError(f"{path}: line {lines[wrong][0]} has {len(rows[wrong])} columns, expected {len(names)}")
     if not rows:
         raise DataError(f"{path}: holds no rows; its first line names the columns, the others hold them")
-    values = {
-        name: [cell.strip() for cell in cells] for name, cells in zip(names, zip(*rows, strict=True), strict=True)
-    }
-    return Columns(path, values, "line", _FIRST_LINE)
+    values = dict(zip(kept, zip(*rows, strict=True), strict=False))
+    return Columns(path, values, "line", tuple(number for number, _ in lines))
+
+
+def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
+    """Return the line that names the columns, and the others with their numbers, without comments and empty ones.
+
+    The names may be a comment, the last one before the rows. Raises DataError where no line names them.
+    """
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
+    before = [line for number, line in lines if not rows or number < rows[0][0]]
+    if rows and not _begins_with_number(rows[0][1]):
+        return rows[0][1], rows[1:]
+    if not before:
+        what = "holds numbers and no names" if rows else "holds no rows"
+        raise DataError(f"{path}: {what}; its first line names the columns, the others hold them")
+    return before[-1], rows
+
+
+def _begins_with_number(line: str) -> bool:
+    return any(_is_number(_cells(line, separator)[0]) for separator in _SEPARATORS)
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if '"' in line:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [cell.strip() for cell in line.split(separator)]
 
 
 def columns_given(what: str, given: Any) -> Columns:

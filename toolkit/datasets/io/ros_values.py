@@ -19,8 +19,18 @@ from toolkit.frontend.cameras import Distortion
 from toolkit.geometry import Array, rotation_from_quaternion, se3, se3_inverse
 from toolkit.resampling import NS_PER_S
 
-_GREY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16, "16UC1": np.uint16}
-# Channels, and OpenCV's conversion.
+# Of the planar encodings the first plane is the brightness.
+_GREY = {
+    "mono8": np.uint8,
+    "8UC1": np.uint8,
+    "mono16": np.uint16,
+    "16UC1": np.uint16,
+    "nv12": np.uint8,
+    "nv21": np.uint8,
+    "nv24": np.uint8,
+    "i420": np.uint8,
+}
+# Channels, and OpenCV's conversion. Names that end in 16 are of 16 bits.
 _COLOURS = {
     "rgb8": (3, "COLOR_RGB2GRAY"),
     "bgr8": (3, "COLOR_BGR2GRAY"),
@@ -34,15 +44,21 @@ _COLOURS = {
     "bayer_grbg8": (1, "COLOR_BayerGB2GRAY"),
     "yuv422": (2, "COLOR_YUV2GRAY_UYVY"),
     "yuv422_yuy2": (2, "COLOR_YUV2GRAY_YUY2"),
+    "uyvy": (2, "COLOR_YUV2GRAY_UYVY"),
+    "yuyv": (2, "COLOR_YUV2GRAY_YUY2"),
+}
+_COLOURS |= {
+    f"{name.removesuffix('8')}16": what for name, what in _COLOURS.items() if name.startswith(("rgb", "bgr", "bayer"))
 }
 _PNG, _JPEG = b"\x89PNG", b"\xff\xd8"
 # Of plumb_bob and rational_polynomial OpenCV takes the coefficients as they stand.
 _MODELS: dict[str, tuple[Distortion, tuple[int, ...]]] = {
     "plumb_bob": ("radtan", (4, 5)),
     "radtan": ("radtan", (4, 5)),
-    "rational_polynomial": ("radtan", (8,)),
+    "rational_polynomial": ("radtan", (8, 12, 14)),
     "equidistant": ("equidistant", (4,)),
     "fisheye": ("equidistant", (4,)),
+    "kannala_brandt4": ("equidistant", (4,)),
     "none": ("none", (0, 4, 5)),
 }
 
@@ -51,8 +67,12 @@ Grey = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 def stamp_ns(header: Any, recorded_ns: int) -> int:
     """Return the stamp of a header; where it has none, when the message was recorded."""
-    t_ns = int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
-    return t_ns or recorded_ns
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec) if is_stamped(header) else recorded_ns
+
+
+def is_stamped(header: Any) -> bool:
+    """Say whether a header has a stamp."""
+    return bool(header.stamp.sec or header.stamp.nanosec)
 
 
 def grey(message: Any, what: str) -> Grey:
@@ -66,8 +86,9 @@ def grey(message: Any, what: str) -> Grey:
     import cv2
 
     channels, conversion = _COLOURS[encoding]
-    raw = np.ascontiguousarray(_rows(message, what, height, width, channels, np.dtype(np.uint8)))
-    return np.asarray(cv2.cvtColor(raw, getattr(cv2, conversion)), dtype=np.uint8)
+    dtype = np.dtype(np.uint16 if encoding.endswith("16") else np.uint8)
+    raw = np.ascontiguousarray(_rows(message, what, height, width, channels, dtype), dtype=dtype)
+    return np.asarray(cv2.cvtColor(raw, getattr(cv2, conversion)), dtype=dtype)
 
 
 def _rows(message: Any, what: str, height: int, width: int, channels: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
@@ -99,12 +120,15 @@ def camera(info: Any, what: str) -> Camera:
     if name not in _MODELS:
         raise DataError(f"{what}: distortion_model {printable(name)[:50]} is unknown; there are {', '.join(_MODELS)}")
     model, counts = _MODELS[name]
+    # Some programs fill up with zeros.
+    count = next((n for n in counts if np.trim_zeros(coefficients, "b").size <= n <= coefficients.size), None)
     if not coefficients.any():
         model, coefficients = "none", np.zeros(4)
-    elif coefficients.size not in counts or not np.isfinite(coefficients).all():
+    elif count is None or not np.isfinite(coefficients).all():
         wanted = " or ".join(map(str, counts))
         raise DataError(f"{what}: {coefficients.size} distortion coefficients, expected {wanted} of {name}")
-    return Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), model, coefficients, (int(info.width), int(info.height)))
+    size_px = (int(info.width), int(info.height))
+    return Camera((K[0, 0], K[1, 1], K[0, 2], K[1, 2]), model, coefficients[:count], size_px)
 
 
 def camera_matrix_of(info: Any, what: str) -> Array:
@@ -121,20 +145,21 @@ def camera_matrix_of(info: Any, what: str) -> Array:
 class Rectification:
     """What a CameraInfo says of rectified images: R_rect_cam (3, 3), fx, fy, cx, cy, and how far right the camera is.
 
-    The baseline is 0 where none is stated, as for the left camera.
+    That is from the origin of the rectified axes: 0 for most left cameras, and where nothing is stated.
     """
 
     R_rect_cam: Array
     pinhole_px: Pinhole
-    baseline_m: float
+    right_m: float
 
 
 def rectification(info: Any) -> Rectification:
     """Return how the images of a CameraInfo are rectified."""
     P = np.asarray(_field(info, "P"), dtype=np.float64).reshape(3, 4)
-    baseline_m = -float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0
+    right_m = -float(P[0, 3] / P[0, 0]) if P[0, 0] > 0.0 else 0.0
     pinhole_px = (float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
-    return Rectification(np.asarray(_field(info, "R"), dtype=np.float64).reshape(3, 3), pinhole_px, baseline_m)
+    R_rect_cam = np.asarray(_field(info, "R"), dtype=np.float64).reshape(3, 3)
+    return Rectification(R_rect_cam if R_rect_cam.any() else np.eye(3), pinhole_px, right_m)
 
 
 def _field(info: Any, name: str) -> Any:
@@ -143,19 +168,29 @@ def _field(info: Any, name: str) -> Any:
 
 
 def pose_of(value: Any) -> tuple[list[float], str]:
-    """Return x y z qx qy qz qw of an Odometry, PoseStamped or TransformStamped, and the frame that it is of."""
+    """Return x y z qx qy qz qw of an Odometry, Pose(WithCovariance)Stamped or TransformStamped, and whose frame."""
     if hasattr(value, "transform"):
         at, turn, child = value.transform.translation, value.transform.rotation, str(value.child_frame_id)
-    elif hasattr(value, "twist"):
-        at, turn, child = value.pose.pose.position, value.pose.pose.orientation, str(value.child_frame_id)
     else:
-        at, turn, child = value.pose.position, value.pose.orientation, ""
+        pose = getattr(value.pose, "pose", value.pose)
+        at, turn, child = pose.position, pose.orientation, str(getattr(value, "child_frame_id", ""))
     return [at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w], frame_name(child)
 
 
 def frame_name(name: Any) -> str:
     """Return the name of a frame without the slash that ROS 1 may write before it."""
     return str(name).lstrip("/")
+
+
+def fixed(transforms: Iterable[Any]) -> list[Any]:
+    """Return those of many transforms that never change, each once."""
+    first: dict[tuple[str, str], Any] = {}
+    moved: set[tuple[str, str]] = set()
+    for transform in transforms:
+        edge = (frame_name(transform.header.frame_id), frame_name(transform.child_frame_id))
+        if pose_of(first.setdefault(edge, transform)) != pose_of(transform):
+            moved.add(edge)
+    return [transform for edge, transform in first.items() if edge not in moved]
 
 
 class Tree:

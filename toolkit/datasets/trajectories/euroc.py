@@ -6,6 +6,7 @@ micro aerial vehicle datasets" (IJRR 2016).
 
 import numpy as np
 
+from toolkit.datasets.io.fields import probable_unit_of_ns
 from toolkit.datasets.trajectories.poses import OtherOrder, PosesFile, checked_poses, finite, rows_text
 from toolkit.datasets.trajectories.rows import Rows
 from toolkit.errors import DataError
@@ -19,14 +20,6 @@ W_LAST = OtherOrder(
 )
 _WIDTH = 8
 _TO_XYZW = [0, 1, 2, 4, 5, 6, 3]
-# Nobody states more than two thousand poses a second, so closer stamps do not count nanoseconds.
-_SHORTEST_STEP_NS = 5e5
-# What they count where the step is below: halfway, as factors go, between steps of 50 ms in one unit and the next.
-_UNITS = (
-    (1.6, "seconds: multiply by 1e9"),
-    (1.6e3, "milliseconds: multiply by 1e6"),
-    (_SHORTEST_STEP_NS, "microseconds: multiply by 1e3"),
-)
 
 
 def recognises(rows: Rows) -> bool:
@@ -42,8 +35,7 @@ def parse(rows: Rows) -> PosesFile:
     """
     table = rows.numbers(rows.width, COLUMNS)
     t_ns = rows.stamps(1)
-    step = float(np.median(np.abs(np.diff(table[:, 0])))) if len(table) > 1 else np.inf
-    unit = next((name for below, name in _UNITS if step < below), None)
+    unit = probable_unit_of_ns(table[:, 0])
     if unit is not None:
         raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}")
     T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, 1:_WIDTH][:, _TO_XYZW])

@@ -6,7 +6,7 @@ own poses are the left camera's; here, as in every file of this package, they ar
 
 import numpy as np
 
-from toolkit.datasets.trajectories.poses import UNIT_TOLERANCE, PosesFile, rows_text
+from toolkit.datasets.trajectories.poses import FARTHEST_M, TOO_FAR, UNIT_TOLERANCE, PosesFile, rows_text
 from toolkit.datasets.trajectories.rows import Rows
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
@@ -32,6 +32,7 @@ def parse(rows: Rows) -> PosesFile:
     off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
     checks = (
         (np.isfinite(matrices).all(axis=(1, 2)), "holds a value that is not finite; write a pose for every frame"),
+        (np.abs(matrices[:, :, 3]).max(axis=1, initial=0.0) < FARTHEST_M, TOO_FAR),
         (off < UNIT_TOLERANCE, f"does not hold a rotation; expected {COLUMNS}"),
         (np.linalg.det(rotations) > 0.0, "holds a reflection, not a rotation: the sign of an axis is wrong"),
     )

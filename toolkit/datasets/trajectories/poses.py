@@ -12,6 +12,9 @@ from toolkit.geometry import Array, IntArray, quaternion_from_rotation, rotation
 
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
 UNIT_TOLERANCE = 1e-2
+# The Moon is nearer. Squares of 1e200 m are no numbers any more, and a metric without a value would say nothing.
+FARTHEST_M = 1e9
+TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
 # A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
 _IDENTITY_TOLERANCE = 1e-2
 # Mean resultant length of the directions of travel in the body frame: 1 for a vehicle, about 0 for the wrong order.
@@ -73,6 +76,10 @@ def checked_poses(path: Path, line_numbers: list[int], t_ns: IntArray, values: A
     """
     checks = (
         (np.isfinite(values).all(axis=1), "holds a value that is not finite; remove the line"),
+        (
+            np.abs(values[:, :3]).max(axis=1, initial=0.0) < FARTHEST_M,
+            TOO_FAR,
+        ),
         (np.diff(t_ns, prepend=t_ns[:1] - 1) > 0, "is not later than the line before it; sort the file by time"),
         (
             np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1.0) < UNIT_TOLERANCE,

@@ -16,6 +16,8 @@ from toolkit.inputs import read_text_input
 from toolkit.resampling import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1
+# As many digits before the point fit with nanoseconds into 64 bits, if the first is no 9.
+_MOST_DIGITS, _DECIMALS = 10, 9
 # How seconds are usually printed; as digits they are read several times as fast as through decimals.
 _USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 
@@ -24,13 +26,15 @@ _USUAL_STAMP = re.compile(r"([0-9]{1,10})\.([0-9]{1,9})")
 class Rows:
     """What a table in a text file holds: the number and the cells of each line that is not empty or a comment.
 
-    There is at least one line; ``commas`` is True where commas separate the cells, and not blanks.
+    There is at least one line; ``commas`` is True where commas separate the cells, and not blanks; ``underscored``
+    where a cell has an underscore, for Python takes 1_0 for ten and no other program does.
     """
 
     path: Path
     line_numbers: list[int]
     cells: list[list[str]]
     commas: bool
+    underscored: bool = False
 
     @property
     def width(self) -> int:
@@ -42,7 +46,7 @@ class Rows:
 
         Raises DataError naming the line that has another number of cells or one that is no number.
         """
-        if all(len(cells) == width for cells in self.cells):
+        if not self.underscored and all(len(cells) == width for cells in self.cells):
             with suppress(ValueError):  # told below, with the line
                 return np.array(list(map(float, chain.from_iterable(self.cells)))).reshape(-1, width)
         return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
@@ -53,6 +57,10 @@ class Rows:
         A double holds today's seconds to 0.2 us only. Raises DataError naming the line where one is not finite
         or beyond what 64 bits hold.
         """
+        first = [cells[0] for cells in self.cells]
+        alike = _printed_alike(first) if per_unit_ns == NS_PER_S else None
+        if alike is not None:
+            return alike
         return np.array([self._stamp(n, cells[0], per_unit_ns) for n, cells in self], dtype=np.int64)
 
     def __iter__(self) -> Iterator[tuple[int, list[str]]]:
@@ -63,17 +71,20 @@ class Rows:
             found = f"{self.path}: line {line_number} has {len(cells)} columns"
             raise DataError(f"{found}, expected {width} ({columns})")
         try:
-            return [float(cell) for cell in cells]
+            return [_number(cell) for cell in cells]
         except ValueError as error:
             raise DataError(f"{self.path}: line {line_number} is not numeric ({error}); expected {columns}") from error
 
     def _stamp(self, line_number: int, cell: str, per_unit_ns: int) -> int:
         if per_unit_ns == NS_PER_S and (usual := _USUAL_STAMP.fullmatch(cell)):
-            return int(usual[1] + usual[2].ljust(9, "0"))
-        try:
-            t_ns = int((Decimal(cell) * per_unit_ns).to_integral_value())
-        except (InvalidOperation, OverflowError, ValueError):
-            raise DataError(f"{self.path}: line {line_number} has no finite time ({cell}); remove the line") from None
+            t_ns = int(usual[1] + usual[2].ljust(9, "0"))
+        else:
+            try:
+                t_ns = int((Decimal(cell) * per_unit_ns).to_integral_value())
+            except (InvalidOperation, OverflowError, ValueError):
+                raise DataError(
+                    f"{self.path}: line {line_number} has no finite time ({cell}); remove the line"
+                ) from None
         if abs(t_ns) > _LARGEST_NS:
             raise DataError(f"{self.path}: line {line_number} has the time {cell}, beyond any clock; check its unit")
         return t_ns
@@ -84,16 +95,39 @@ def read_rows(path: Path, kind: str) -> Rows:
 
     ``kind`` describes such a file in an error. Raises DataError where it is missing, empty or not text.
     """
-    text = read_text_input(path, kind)
-    stripped = (line.partition("#")[0].strip() for line in text.splitlines())
-    lines = [(n, line) for n, line in enumerate(stripped, start=1) if line]
-    commas = bool(lines) and "," in lines[-1][1]
-    rows = [(n, _cells(line, commas=commas)) for n, line in lines]
+    lines = read_text_input(path, kind).splitlines()
+    if any("#" in line for line in lines):
+        lines = [line.partition("#")[0] for line in lines]
+    last = next((line for line in reversed(lines) if line and not line.isspace()), "")
+    commas = "," in last
+    rows = [(n, cells) for n, line in enumerate(lines, start=1) if (cells := _cells(line, commas=commas))]
     if commas and not _is_number(rows[0][1][0]):
         rows = rows[1:]
     if not rows:
         raise DataError(f"{path}: the file holds no poses; {kind}")
-    return Rows(path, [n for n, _ in rows], [cells for _, cells in rows], commas)
+    cells_of_rows = [cells for _, cells in rows]
+    underscored = any("_" in line for line in lines)
+    return Rows(path, [n for n, _ in rows], cells_of_rows, commas, underscored)
+
+
+def _printed_alike(cells: list[str]) -> IntArray | None:
+    """Return seconds as nanoseconds (N,) where all have as many digits before and after the point; None elsewhere."""
+    width, point = len(cells[0]), cells[0].find(".")
+    after = width - point - 1
+    if not (0 < point <= _MOST_DIGITS and 0 < after <= _DECIMALS) or set(map(len, cells)) != {width}:
+        return None
+    characters = np.frombuffer("".join(cells).encode(), dtype=np.uint8)
+    if characters.size != width * len(cells):  # some are no digits of ours
+        return None
+    digits = characters.reshape(-1, width) - np.int64(ord("0"))
+    is_digit = (digits >= 0) & (digits <= 9)
+    is_digit[:, point] = digits[:, point] == ord(".") - ord("0")
+    if not is_digit.all() or (point == _MOST_DIGITS and digits[:, 0].max() == 9):
+        return None
+    weights = np.zeros(width, dtype=np.int64)
+    weights[:point] = 10 ** np.arange(point + _DECIMALS - 1, _DECIMALS - 1, -1)
+    weights[point + 1 :] = 10 ** np.arange(_DECIMALS - 1, _DECIMALS - 1 - after, -1)
+    return np.asarray(digits @ weights)
 
 
 def stamp_text(t_ns: int) -> str:
@@ -103,8 +137,17 @@ def stamp_text(t_ns: int) -> str:
 
 
 def _cells(line: str, *, commas: bool) -> list[str]:
-    """Split a line; some programs end theirs with a comma."""
-    return [cell.strip() for cell in line.removesuffix(",").split(",")] if commas else line.split()
+    """Split a line, which has none where it is empty; some programs end theirs with a comma."""
+    if not commas:
+        return line.split()
+    stripped = line.strip()
+    return [cell.strip() for cell in stripped.removesuffix(",").split(",")] if stripped else []
+
+
+def _number(cell: str) -> float:
+    if "_" in cell:
+        raise ValueError(f"could not convert string to float: {cell!r}")
+    return float(cell)
 
 
 def _is_number(cell: str) -> bool:

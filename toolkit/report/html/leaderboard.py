@@ -23,6 +23,8 @@ _STYLE = """
 main { padding: 1rem clamp(.75rem, 3vw, 2rem); display: grid; gap: var(--gap); max-width: 90rem; margin: 0 auto; }
 .card > h2 { margin-bottom: .5rem; }
 .scroll { overflow-x: auto; }
+thead th { padding: .35rem .55rem; font-size: .84rem; white-space: normal; line-height: 1.25; min-width: 3.6rem; }
+td .unit, th .unit { white-space: nowrap; }
 figure { margin: 0; }
 svg text { fill: var(--text); font-size: 11px; }
 svg .grid { stroke: var(--grid); }
