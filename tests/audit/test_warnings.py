@@ -8,12 +8,12 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
+from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.geometry import se3, so3_exp
+from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
-
-WARNINGS = {"conflict", "miscalibration", "thin-vision"}
 
 
 @pytest.mark.parametrize("seed", [11, 12])
@@ -59,3 +59,51 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
     # Five of its standard errors, about 0.001 rad, and what the roll turns the sides into each other.
     assert np.linalg.norm(found.rad) == pytest.approx(0.05, abs=0.01)
     assert (np.abs(turn_of_camera(intervals, T_imu_cam).rad) < 0.006).all()
+
+
+def found_in(sequence: Sequence) -> dict[str, str]:
+    """Return what the audit says of each fault that it finds and does not repair."""
+    return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}
+
+
+def test_vision_that_is_too_long_beside_odometry_is_told_with_its_error() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 4)
+    (said,) = found_in(faults.stretched_disparity(sound, 1.06)).values()
+    told = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", said)
+    assert told is not None
+    # 1 - 1 / 1.06 is 5.7 %; the tracks' noise makes half a percent of bias.
+    assert float(told[1]) == pytest.approx(5.7, abs=1.0)
+    assert float(told[2]) < 0.6
+
+
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_scale_and_lever_arm_are_measured_within_their_errors(scenario: str) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=20.0), 5)
+    faulty = faults.displaced_camera(faults.stretched_disparity(sound, 1.1), 0.5, 1)
+    intervals = (evidence := Evidence(faulty)).intervals
+    assert intervals is not None
+    found = alignment(faulty, evidence.camera_motion, intervals)
+    assert found is not None
+    missing = sound.rig.T_imu_cam[:3, 3] - faulty.rig.T_imu_cam[:3, 3]
+    # Four standard errors, and 1 % that the tracks' noise shortens the camera's motion by.
+    assert found.scale.value == pytest.approx(1.0 / 1.1 - 1.0, abs=4.0 * found.scale.error + 0.01)
+    assert (np.abs(found.lever_m - missing) < 4.0 * found.lever_error_m).all()
+    assert found.lever_error_m[0] < 0.1
+
+
+def test_a_camera_that_is_elsewhere_is_told_and_one_that_hardly_turns_is_not_judged() -> None:
+    sound = simulate(replace(SCENARIOS["flight"], duration_s=12.0), 6)
+    T_imu_cam = sound.rig.T_imu_cam.copy()
+    T_imu_cam[1, 3] += 0.5
+    said = found_in(replace(sound, rig=replace(sound.rig, T_imu_cam=T_imu_cam)))
+    assert re.search(r"the camera is off by -0\.[45]\d \+- 0\.\d\d m along y", said["lever-arm"])
+    straight = sound.truncated(40)
+    assert "too little rotation" in audit(straight).undecided["lever-arm"]
+    assert "too little change of velocity" in audit(straight).undecided["vision-scale"]
+
+
+def test_tracks_that_scatter_more_than_their_noise_are_told_and_a_tenth_of_mismatches_is_not() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=8.0), 7)
+    assert set(found_in(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter"}
+    assert "scatter 2.9" in found_in(faults.wrong_noise(sound, 1.0 / 3.0))["track-scatter"]
+    assert found_in(faults.outlier_tracks(sound, 0.05, 7)) == {}

@@ -15,7 +15,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, interval_means
-from toolkit.audit.parts.robust import Scalar, slope, spread
+from toolkit.audit.parts.robust import Scalar, jackknife_error, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
 from toolkit.geometry import Array, BoolArray
@@ -30,9 +30,9 @@ REFINEMENTS = 5
 # interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
 # which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
 SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
-# The standard error is that of a jackknife over so many stretches of the recording, for a corner is one event and not
-# ten intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
-STRETCHES, SCATTER = 10, 1.45
+# The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
+# intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+SCATTER = 1.45
 # With a larger standard error (s) than these nothing is said.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S = 0.0064, 0.0125
 # The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
@@ -103,15 +103,11 @@ def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | 
         return None
     if isinstance(sequence.motion, TwistSamples):
         return found
-    return Scalar(found.value, SCATTER * _jackknife_error(instrument, change, residual))
+    return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
 
 
-def _jackknife_error(instrument: Array, change: Array, residual: Array) -> float:
-    """Return the standard error of the slope from what it is without each stretch of the rows (M, d) in turn."""
-    stretch = np.arange(len(residual)) * STRETCHES // len(residual)
-    without = [stretch != k for k in range(STRETCHES)]
-    slopes = np.array([slope(instrument[rows], change[rows], residual[rows]).value for rows in without])
-    return float(np.sqrt((STRETCHES - 1) * slopes.var()))
+def _slope(instrument: Array, change: Array, residual: Array) -> float:
+    return slope(instrument, change, residual).value
 
 
 def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:
