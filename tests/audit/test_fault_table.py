@@ -61,6 +61,7 @@ CASES = [
     Case(faults.motion_gap, 0.02, "motion-gap", "repaired", "1 gap(s)", IMU),
     Case(faults.camera_clock, 0.02, "time-offset", "repaired", "stamped late", IMU),
     Case(faults.camera_clock, -0.02, "time-offset", "repaired", "stamped early", IMU),
+    Case(faults.camera_clock, 0.06, "time-offset", "repaired", "stamped late", TWIST),
     Case(faults.camera_clock, 0.25, "time-offset", "repaired", "stamped late"),
     Case(faults.disturbed_motion, 2.0, "conflict", "warned", "vision and odometry disagree at 5-10 s", TWIST),
     Case(faults.disturbed_motion, 2.0, "conflict", "warned", "m/s^2 of specific force", IMU),

@@ -107,3 +107,35 @@ def test_tracks_that_scatter_more_than_their_noise_are_told_and_a_tenth_of_misma
     assert set(found_in(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter"}
     assert "scatter 2.9" in found_in(faults.wrong_noise(sound, 1.0 / 3.0))["track-scatter"]
     assert found_in(faults.outlier_tracks(sound, 0.05, 7)) == {}
+
+
+@pytest.mark.parametrize(
+    ("channels", "told"),
+    [
+        ([0, 1, 2, 3, 5, 4], "x, z, y"),
+        ([0, 1, 2, 5, 4, 3], "z, y, x"),
+        ([1, 0, 2, 3, 4, 5], "x, y, z"),  # velocities exchanged, the gyro as the extrinsic has it
+    ],
+)
+def test_channels_that_are_exchanged_are_named_and_no_turn_of_the_extrinsic_is_taken(
+    channels: list[int], told: str
+) -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    exchanged = sound.motion.of(sound.motion.t_ns, sound.motion.values[:, channels])
+    said = found_in(replace(sound, motion=exchanged))["mixed-axes"]
+    assert f"the gyro's x, y, z are the extrinsic's {told}, which" in said
+
+
+def test_a_unit_that_holds_for_half_of_a_recording_is_told_and_not_converted() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    values = sound.motion.values.copy()
+    values[len(values) // 2 :, 3:] *= 180.0 / np.pi
+    half = replace(sound, motion=sound.motion.of(sound.motion.t_ns, values))
+    assert "deg/s in a part of the recording" in found_in(half)["units"]
+
+
+def test_feet_are_no_kilometres_an_hour() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    (unit,) = (f.detail for f in audit(faults.linear_unit(sound, 3.281)).findings if f.fault == "units")
+    assert "it is in ft/s" in unit
+    assert "units" not in found_in(faults.linear_unit(sound, 3.43))  # half-way between the two: nobody's

@@ -6,7 +6,8 @@ median (a gyro has a bias), finds it to a fraction of a sample; for twists, whos
 rotation, the change that the camera sees is the instrument. Source: Furgale, Rehder & Siegwart, "Unified temporal and
 spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
 
-A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains.
+A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains. Where it
+is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit.
 """
 
 from dataclasses import replace
@@ -30,6 +31,8 @@ REFINEMENTS = 5
 # interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
 # which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
 SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
+# Between frames nothing of that can be told from the clock, and what the shift mends is either.
+LEAST_OFF_FRAMES = 0.25
 # The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
 # intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
@@ -51,9 +54,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         error = "unknown" if found is None else f"known to {1e3 * found.error:.0f} ms"
         return Undecided(f"too little change of rotation: the offset of camera and gyro is {error}")
     expected_s, least_s = _expected(sequence)
-    if abs(found.value) < max(least_s, SIGMAS * found.error):
-        return None
     offset_s = found.value - expected_s
+    beyond_s = found.value if _stamped_at_frames(sequence) else offset_s
+    if abs(beyond_s) < max(least_s, SIGMAS * found.error):
+        return None
     late = "late" if offset_s < 0.0 else "early"
     return Symptom(
         count=1,
@@ -71,7 +75,15 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
     if not isinstance(sequence.motion, TwistSamples):
         return 0.0, LEAST_S
     step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
-    return (LAG[sequence.motion.pairing] - 0.5) * step_s, LEAST_TWIST_INTERVALS * step_s
+    least_s = (
+        LEAST_TWIST_INTERVALS * step_s if _stamped_at_frames(sequence) else max(LEAST_S, LEAST_OFF_FRAMES * step_s)
+    )
+    return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
+
+
+def _stamped_at_frames(sequence: Sequence) -> bool:
+    """Say whether most frames have a motion sample of the same stamp."""
+    return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
 
 
 def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
@@ -101,7 +113,7 @@ def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | 
         found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
     if abs(found.value) >= 2.0 * MOST_S:
         return None
-    if isinstance(sequence.motion, TwistSamples):
+    if isinstance(sequence.motion, TwistSamples) and _stamped_at_frames(sequence):
         return found
     return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
 

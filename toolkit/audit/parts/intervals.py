@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, transform
 from toolkit.measured_motion import NoSamples, TwistSamples
 from toolkit.models.camera_motion import CameraMotion, usable_pairs
 from toolkit.models.stereo import project, triangulate
@@ -29,6 +29,11 @@ class Intervals(NamedTuple):
     v_mps: Array | None
     w_cam_radps: Array
     v_cam_mps: Array
+
+    def select(self, rows: BoolArray) -> "Intervals":
+        """Return those of a mask (M,)."""
+        v_mps = None if self.v_mps is None else self.v_mps[rows]
+        return Intervals(self.interval[rows], self.w_radps[rows], v_mps, self.w_cam_radps[rows], self.v_cam_mps[rows])
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
