@@ -47,6 +47,14 @@ def test_what_scatters_all_along_is_no_conflict_and_what_stands_out_is() -> None
     assert (span.begin_s, span.end_s) == pytest.approx((30.0, 35.0), abs=1.0)
 
 
+def test_a_conflict_that_begins_in_the_middle_and_stays_is_no_usual_scatter() -> None:
+    rng, t_s = np.random.default_rng(1), 0.1 * np.arange(600)
+    value = rng.normal(0.0, 0.05, (600, 3))
+    value[300:] += np.array([1.0, 0.0, 0.0])
+    (span,) = sustained(Deviation("velocity", "m/s", t_s, value, np.full(3, 0.06), False), 10.0, 0.2)
+    assert span.begin_s == pytest.approx(30.0, abs=1.0)
+
+
 def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determines() -> None:
     """A car drives ahead: its velocity tells pitch and yaw, and nothing of the roll."""
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 3)

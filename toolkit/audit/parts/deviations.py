@@ -74,18 +74,25 @@ def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
     """Return the spans in which the means of the stretches deviate by so many of their standard deviations.
 
-    Those are what white noise makes of them, or in a long recording what they scatter by in its quieter half, if that
-    is more. ``least`` is the smallest deviation that counts, in its unit.
+    Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either of
+    its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
     """
     stretches = _stretches(deviation)
     if not stretches.centre_s.size:
         return []
     noise = stretches.noise
     if np.ptp(stretches.centre_s) > LEAST_STRETCHES * STRETCH_S:
-        off_centre = np.abs(stretches.mean - np.median(stretches.mean, axis=0))
-        noise = np.maximum(noise, np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
+        # A fault that begins in the middle and stays must not be what is usual.
+        first, second = (_scatter_of_means(half) for half in np.array_split(stretches.mean, 2))
+        noise = np.maximum(noise, np.minimum(first, second))
     improbable = np.linalg.norm(stretches.mean / noise, axis=1) > sigmas
     return _spans(stretches, np.asarray(improbable & (np.linalg.norm(stretches.mean, axis=1) > least)))
+
+
+def _scatter_of_means(mean: Array) -> Array:
+    """Return the standard deviation (3,) of means (m, 3) by the quieter half of them."""
+    off_centre = np.abs(mean - np.median(mean, axis=0))
+    return np.asarray(np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
 
 
 class _Stretches(NamedTuple):
