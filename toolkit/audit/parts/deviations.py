@@ -74,8 +74,8 @@ def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
     """Return the spans in which the means of the stretches deviate by so many of their standard deviations.
 
-    Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either of
-    its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
+    Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either
+    of its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
     """
     stretches = _stretches(deviation)
     if not stretches.centre_s.size:
