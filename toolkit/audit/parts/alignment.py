@@ -92,8 +92,8 @@ def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Int
 
 def _strides(sequence: Sequence, camera: CameraMotion, kept: IntArray) -> CameraMotion:
     """Return the camera's motion between the frames ``kept`` (n,), from tracks that are seen in both."""
-    chained = _chained(moved_by(camera, sequence))
-    start = se3_inverse(chained[kept[:-1]]) @ chained[kept[1:]]
+    path = chained(moved_by(camera, sequence))
+    start = se3_inverse(path[kept[:-1]]) @ path[kept[1:]]
     found = camera_motion(keep_frames(sequence, kept), start)
     unknown = np.concatenate([[0], np.cumsum(~camera.known)])
     return found._replace(known=found.known & (unknown[kept[1:]] == unknown[kept[:-1]]))
@@ -142,7 +142,7 @@ def _integrated(sequence: Sequence, frames_t_ns: IntArray, w_bias: Array) -> _Pa
     h_s = np.diff(frames_t_ns)[:, None] / NS_PER_S
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, frames_t_ns)
     half = so3_exp(0.5 * h_s * (mean[:, 3:] - w_bias))
-    R_first_imu = _chained(half @ half)
+    R_first_imu = chained(half @ half)
     middle = R_first_imu[:-1] @ half
     force = (middle @ mean[:, :3, None]).squeeze(-1)
     turned = _from_zero(-middle * h_s[:, :, None])
@@ -161,12 +161,12 @@ def _from_zero(steps: Array) -> Array:
     return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
 
 
-def _chained(step: Array) -> Array:
+def chained(step: Array) -> Array:
     """Return the products (n + 1, d, d) of the first 0, 1, ... n matrices (n, d, d)."""
-    chained = np.tile(np.eye(step.shape[1]), (len(step) + 1, 1, 1))
+    products = np.tile(np.eye(step.shape[1]), (len(step) + 1, 1, 1))
     for k in range(len(step)):
-        chained[k + 1] = chained[k] @ step[k]
-    return chained
+        products[k + 1] = products[k] @ step[k]
+    return products
 
 
 def _robust(response: Array, jacobian: Array) -> Array:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter, minimum_filter
 
+from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
 from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
@@ -158,7 +159,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     h_s = np.diff(middle_ns)[:, None] / NS_PER_S
     mean = interval_means(motion.t_ns, motion.values, middle_ns)
     half = so3_exp(0.5 * h_s * (mean[:, 3:] - bias_radps))
-    R_first_imu = _chained(half @ half)
+    R_first_imu = chained(half @ half)
     v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
     smooth = np.asarray(median_filter(v_first, size=(_MEDIAN_OF, 1), mode="nearest"))
     force = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1)
@@ -170,14 +171,6 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
-
-
-def _chained(rotation: Array) -> Array:
-    """Return the products (n + 1, 3, 3) of the first 0, 1, ... n rotations (n, 3, 3)."""
-    chained = np.tile(np.eye(3), (len(rotation) + 1, 1, 1))
-    for k in range(len(rotation)):
-        chained[k + 1] = chained[k] @ rotation[k]
-    return chained
 
 
 def _around(t_s: Array, value: Array) -> Array:
