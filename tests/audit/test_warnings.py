@@ -8,12 +8,12 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
+from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.geometry import se3, so3_exp
+from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
-
-WARNINGS = {"conflict", "miscalibration", "thin-vision"}
 
 
 @pytest.mark.parametrize("seed", [11, 12])
@@ -47,6 +47,14 @@ def test_what_scatters_all_along_is_no_conflict_and_what_stands_out_is() -> None
     assert (span.begin_s, span.end_s) == pytest.approx((30.0, 35.0), abs=1.0)
 
 
+def test_a_conflict_that_begins_in_the_middle_and_stays_is_no_usual_scatter() -> None:
+    rng, t_s = np.random.default_rng(1), 0.1 * np.arange(600)
+    value = rng.normal(0.0, 0.05, (600, 3))
+    value[300:] += np.array([1.0, 0.0, 0.0])
+    (span,) = sustained(Deviation("velocity", "m/s", t_s, value, np.full(3, 0.06), False), 10.0, 0.2)
+    assert span.begin_s == pytest.approx(30.0, abs=1.0)
+
+
 def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determines() -> None:
     """A car drives ahead: its velocity tells pitch and yaw, and nothing of the roll."""
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 3)
@@ -59,3 +67,85 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
     # Five of its standard errors, about 0.001 rad, and what the roll turns the sides into each other.
     assert np.linalg.norm(found.rad) == pytest.approx(0.05, abs=0.01)
     assert (np.abs(turn_of_camera(intervals, T_imu_cam).rad) < 0.006).all()
+
+
+def found_in(sequence: Sequence) -> dict[str, str]:
+    """Return what the audit says of each fault that it finds and does not repair."""
+    return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}
+
+
+def test_vision_that_is_too_long_beside_odometry_is_told_with_its_error() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 4)
+    (said,) = found_in(faults.stretched_disparity(sound, 1.06)).values()
+    told = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", said)
+    assert told is not None
+    # 1 - 1 / 1.06 is 5.7 %; the tracks' noise makes half a percent of bias.
+    assert float(told[1]) == pytest.approx(5.7, abs=1.0)
+    assert float(told[2]) < 0.6
+
+
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_scale_and_lever_arm_are_measured_within_their_errors(scenario: str) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=20.0), 5)
+    faulty = faults.displaced_camera(faults.stretched_disparity(sound, 1.1), 0.5, 1)
+    intervals = (evidence := Evidence(faulty)).intervals
+    assert intervals is not None
+    found = alignment(faulty, evidence.camera_motion, intervals)
+    assert found is not None
+    missing = sound.rig.T_imu_cam[:3, 3] - faulty.rig.T_imu_cam[:3, 3]
+    # Four standard errors, and 1 % that the tracks' noise shortens the camera's motion by.
+    assert found.scale.value == pytest.approx(1.0 / 1.1 - 1.0, abs=4.0 * found.scale.error + 0.01)
+    assert (np.abs(found.lever_m - missing) < 4.0 * found.lever_error_m).all()
+    assert found.lever_error_m[0] < 0.1
+
+
+def test_a_camera_that_is_elsewhere_is_told_and_one_that_hardly_turns_is_not_judged() -> None:
+    sound = simulate(replace(SCENARIOS["flight"], duration_s=12.0), 6)
+    T_imu_cam = sound.rig.T_imu_cam.copy()
+    T_imu_cam[1, 3] += 0.5
+    said = found_in(replace(sound, rig=replace(sound.rig, T_imu_cam=T_imu_cam)))
+    assert re.search(r"the camera is off by -0\.[45]\d \+- 0\.\d\d m along y", said["lever-arm"])
+    straight = sound.truncated(40)
+    assert "too little rotation" in audit(straight).undecided["lever-arm"]
+    assert "too little change of velocity" in audit(straight).undecided["vision-scale"]
+
+
+def test_tracks_that_scatter_more_than_their_noise_are_told_and_a_tenth_of_mismatches_is_not() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=8.0), 7)
+    assert set(found_in(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter"}
+    told = re.search(r"scatter ([\d.]+) \+-", found_in(faults.wrong_noise(sound, 1.0 / 3.0))["track-scatter"])
+    assert told is not None
+    assert float(told[1]) == pytest.approx(3.0, abs=0.1)
+    assert found_in(faults.outlier_tracks(sound, 0.05, 7)) == {}
+
+
+@pytest.mark.parametrize(
+    ("channels", "told"),
+    [
+        ([0, 1, 2, 3, 5, 4], "x, z, y"),
+        ([0, 1, 2, 5, 4, 3], "z, y, x"),
+        ([1, 0, 2, 3, 4, 5], "x, y, z"),  # velocities exchanged, the gyro as the extrinsic has it
+    ],
+)
+def test_channels_that_are_exchanged_are_named_and_no_turn_of_the_extrinsic_is_taken(
+    channels: list[int], told: str
+) -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    exchanged = sound.motion.of(sound.motion.t_ns, sound.motion.values[:, channels])
+    said = found_in(replace(sound, motion=exchanged))["mixed-axes"]
+    assert f"the gyro's x, y, z are the extrinsic's {told}, which" in said
+
+
+def test_a_unit_that_holds_for_half_of_a_recording_is_told_and_not_converted() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    values = sound.motion.values.copy()
+    values[len(values) // 2 :, 3:] *= 180.0 / np.pi
+    half = replace(sound, motion=sound.motion.of(sound.motion.t_ns, values))
+    assert "deg/s in a part of the recording" in found_in(half)["units"]
+
+
+def test_feet_are_no_kilometres_an_hour() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
+    (unit,) = (f.detail for f in audit(faults.linear_unit(sound, 3.281)).findings if f.fault == "units")
+    assert "it is in ft/s" in unit
+    assert "units" not in found_in(faults.linear_unit(sound, 3.43))  # half-way between the two: nobody's

@@ -33,7 +33,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     if evidence.intervals.v_mps is None:
-        return Undecided("an IMU measures no velocity, which alone shows where the camera is")
+        return None  # no velocity to weigh: lever-arm measures the position itself
     rig = evidence.sequence.rig
     rotation, given = rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3]
     candidate = -rotation.T @ given

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
@@ -91,6 +92,11 @@ class Evidence:
         if self.spoilt_by or not is_comparable(self.sequence):
             return None
         return compare(self.sequence, self.camera_motion)
+
+    @cached_property
+    def alignment(self) -> Alignment | None:
+        """The scale of vision and the place of the camera; None where ``intervals`` is, or where nothing tells them."""
+        return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
     def after(self, remedy: Sequence) -> "Evidence":
         """Return the evidence after a repair; the camera's motion is kept where the repair left it as it was."""

@@ -10,11 +10,11 @@ from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.turn import turn_of_camera
-from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
+from toolkit.audit.parts.units import force_ratio, rotation_ratio
 
 SIGMAS = 5.0
 # What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
-# and by rotations; ratios of speed of 0.96 to 1.02. Chosen with them in view.
+# and by rotations. Chosen with them in view.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
 SYSTEMATIC_RATIO = 0.05
 
@@ -31,9 +31,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
             f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
         )
-    speed, rotation = speed_ratio(intervals), rotation_ratio(intervals)
-    if speed is not None and 1.0 / MOST_RATIO < speed.value < MOST_RATIO and _is_off(speed):
-        said.append(f"the samples' speed is {speed.value:.3f} +- {speed.error:.3f} times the camera's")
+    rotation = rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
         said.append(f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera")
     force = force_ratio(evidence.sequence)
@@ -44,7 +42,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom(
         count=len(said),
         detail="; ".join(said),
-        treatment="check the extrinsic, the principal point, the baseline and the scale of the samples",
+        treatment="check the extrinsic, the principal point and the scale of the samples",
         remedy=None,
         harmful=False,
         warns=True,

@@ -4,6 +4,10 @@ The camera's own motion, taken through the extrinsic, must be the measured motio
 to name three axes, and the inverse of the extrinsic, the one that explains the samples best is found; if it is not
 the recording's own, and the difference is beyond doubt, the extrinsic is turned to it, or inverted. A gyro bias does
 not matter here: the median is off.
+
+The rotations alone must not speak against it, over all ways to exchange and negate three channels: where they do, some
+channels are wrong and not the extrinsic, and nothing is repaired. Velocities alone decide nothing: cars slip sideways,
+against the signs of the small components.
 """
 
 import itertools
@@ -24,6 +28,7 @@ AGAINST_SECOND = 4.0
 # What the camera's own rotation (rad/s) and velocity (m/s) of one interval are good for.
 LEAST_SPREAD_W = 0.003
 LEAST_SPREAD_V = 0.05
+_OWN = "x, y, z"
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -34,6 +39,14 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     candidates = np.concatenate([se3(turns, np.zeros(3)) @ given, se3_inverse(given)[None]])  # the first is the given
     costs = _costs(evidence.intervals, candidates)  # (25, M)
     first, second = np.argsort(costs.mean(axis=1))[:2]
+    if _of_rotations(evidence.intervals, candidates[first]) != _OWN:
+        alone = _of_rotations(evidence.intervals, given)
+        return Symptom(
+            count=1,
+            detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
+            treatment="channels of the samples are exchanged or have the wrong sign, and not all alike: set them right",
+            remedy=None,
+        )
     if first == 0 and (certainty := _sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
         return Undecided(
             f"{_named(turns, second)} explains the motion as well as what is given ({certainty:.1f} sigma)"
@@ -56,12 +69,27 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 def _right_handed_axes() -> Array:
     """Return the rotations (24, 3, 3) that map axes to axes, the identity first."""
-    signed = (
-        np.eye(3)[list(order)] * np.array(signs)[:, None]
-        for order in itertools.permutations(range(3))
-        for signs in itertools.product((1.0, -1.0), repeat=3)
+    signed = _signed_axes()
+    return np.asarray(signed[np.linalg.det(signed) > 0.0])
+
+
+def _signed_axes() -> Array:
+    """Return the matrices (48, 3, 3) that exchange and negate axes, the identity first."""
+    return np.stack(
+        [
+            np.eye(3)[list(order)] * np.array(signs)[:, None]
+            for order in itertools.permutations(range(3))
+            for signs in itertools.product((1.0, -1.0), repeat=3)
+        ]
     )
-    return np.stack([turn for turn in signed if np.linalg.det(turn) > 0.0])
+
+
+def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
+    """Name the axes of an extrinsic that the gyro's channels are: its own ones, but where others are beyond doubt."""
+    signed, w_imu = _signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    costs = _cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
+    best = int(np.argmin(costs.mean(axis=1)))
+    return _axes_named(signed[best]) if _sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
 
 
 def _costs(intervals: Intervals, candidates: Array) -> Array:
@@ -94,7 +122,10 @@ def _named(turns: Array, candidate: int) -> str:
     """Name a candidate: the axes that the new x, y and z are, for example "x, -y, -z", or the inverse."""
     if candidate == len(turns):
         return "the inverse of the extrinsic"
-    turn = turns[candidate]
+    return _axes_named(turns[candidate])
+
+
+def _axes_named(turn: Array) -> str:
     largest = np.argmax(np.abs(turn), axis=1)
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 

@@ -6,7 +6,8 @@ median (a gyro has a bias), finds it to a fraction of a sample; for twists, whos
 rotation, the change that the camera sees is the instrument. Source: Furgale, Rehder & Siegwart, "Unified temporal and
 spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
 
-A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains.
+A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains. Where it
+is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit.
 """
 
 from dataclasses import replace
@@ -15,7 +16,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, interval_means
-from toolkit.audit.parts.robust import Scalar, slope, spread
+from toolkit.audit.parts.robust import Scalar, jackknife_error, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
 from toolkit.geometry import Array, BoolArray
@@ -30,9 +31,11 @@ REFINEMENTS = 5
 # interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
 # which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
 SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
-# The standard error is that of a jackknife over so many stretches of the recording, for a corner is one event and not
-# ten intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
-STRETCHES, SCATTER = 10, 1.45
+# Between frames nothing of that can be told from the clock, and what the shift mends is either.
+LEAST_OFF_FRAMES = 0.25
+# The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
+# intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+SCATTER = 1.45
 # With a larger standard error (s) than these nothing is said.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S = 0.0064, 0.0125
 # The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
@@ -51,9 +54,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         error = "unknown" if found is None else f"known to {1e3 * found.error:.0f} ms"
         return Undecided(f"too little change of rotation: the offset of camera and gyro is {error}")
     expected_s, least_s = _expected(sequence)
-    if abs(found.value) < max(least_s, SIGMAS * found.error):
-        return None
     offset_s = found.value - expected_s
+    beyond_s = found.value if _stamped_at_frames(sequence) else offset_s
+    if abs(beyond_s) < max(least_s, SIGMAS * found.error):
+        return None
     late = "late" if offset_s < 0.0 else "early"
     return Symptom(
         count=1,
@@ -71,7 +75,15 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
     if not isinstance(sequence.motion, TwistSamples):
         return 0.0, LEAST_S
     step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
-    return (LAG[sequence.motion.pairing] - 0.5) * step_s, LEAST_TWIST_INTERVALS * step_s
+    least_s = (
+        LEAST_TWIST_INTERVALS * step_s if _stamped_at_frames(sequence) else max(LEAST_S, LEAST_OFF_FRAMES * step_s)
+    )
+    return (LAG[sequence.motion.pairing] - 0.5) * step_s, least_s
+
+
+def _stamped_at_frames(sequence: Sequence) -> bool:
+    """Say whether most frames have a motion sample of the same stamp."""
+    return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
 
 
 def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
@@ -101,17 +113,13 @@ def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | 
         found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
     if abs(found.value) >= 2.0 * MOST_S:
         return None
-    if isinstance(sequence.motion, TwistSamples):
+    if isinstance(sequence.motion, TwistSamples) and _stamped_at_frames(sequence):
         return found
-    return Scalar(found.value, SCATTER * _jackknife_error(instrument, change, residual))
+    return Scalar(found.value, SCATTER * jackknife_error(_slope, instrument, change, residual))
 
 
-def _jackknife_error(instrument: Array, change: Array, residual: Array) -> float:
-    """Return the standard error of the slope from what it is without each stretch of the rows (M, d) in turn."""
-    stretch = np.arange(len(residual)) * STRETCHES // len(residual)
-    without = [stretch != k for k in range(STRETCHES)]
-    slopes = np.array([slope(instrument[rows], change[rows], residual[rows]).value for rows in without])
-    return float(np.sqrt((STRETCHES - 1) * slopes.var()))
+def _slope(instrument: Array, change: Array, residual: Array) -> float:
+    return slope(instrument, change, residual).value
 
 
 def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tuple[Array, BoolArray]:

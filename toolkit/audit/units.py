@@ -6,13 +6,15 @@ is a unit's, and far from one, names the unit; one that is neither is not judged
 are lengths that a rig cannot have in another unit.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import median_one_step_px
+from toolkit.audit.parts.intervals import Intervals, median_one_step_px
+from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.units import (
     force_ratio,
     in_other_unit,
@@ -25,12 +27,15 @@ from toolkit.geometry import se3
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-SPEEDS = {"km/h": 3.6, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
+SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
 RATES = {"deg/s": 180.0 / np.pi}
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
 FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665}
 # A unit is named where the ratio is within this factor of it, and this many standard errors from one.
 WITHIN_FACTOR, SIGMAS = 1.25, 5.0
+# Vision's speed is good to 5 % in sound recordings, which tells km/h from ft/s, a factor of 1.1 apart.
+WITHIN_FACTOR_OF_SPEED = 1.08
+IN_A_PART = " in a part of the recording and not in another"
 # Baselines of rigs on vehicles, in the hand or in the air (m), and the farthest that a camera stands from its IMU.
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
 
@@ -57,7 +62,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     return Symptom(
         count=len(found),
         detail="; ".join(wrong.words for wrong in found),
-        treatment="converted to SI" if certain else "two units are as likely: mend the recording",
+        treatment="converted to SI" if certain else "no one unit fits it all: mend the recording",
         remedy=now.sequence if certain else None,
         spoils_vision=True,
     )
@@ -105,10 +110,12 @@ def _lever_arm(evidence: Evidence) -> _Wrong | None:
 
 def _speed(evidence: Evidence) -> _Wrong | None:
     ratio = speed_ratio(evidence.intervals)
-    unit = None if ratio is None else in_other_unit(ratio, SPEEDS, WITHIN_FACTOR, SIGMAS)
+    unit = None if ratio is None else in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, SIGMAS)
     if ratio is None or unit is None:
         return None
     words = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
+    if not _all_along(evidence, speed_ratio, SPEEDS[unit]):
+        return _Wrong(f"{words}{IN_A_PART}", None)
     return _Wrong(words, linear_scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
 
 
@@ -121,7 +128,19 @@ def _rotation(evidence: Evidence) -> _Wrong | None:
     if unit is None:
         return None
     words = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
+    if not _all_along(evidence, rotation_ratio, RATES[unit]):
+        return _Wrong(f"{words}{IN_A_PART}", None)
     return _Wrong(words, linear_scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
+
+
+def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
+    """Say whether either half of the recording has a ratio nearer to that of a unit than to one."""
+    intervals = evidence.intervals
+    assert intervals is not None
+    first = np.arange(intervals.interval.size) < intervals.interval.size // 2
+    halves = (intervals.select(first), intervals.select(~first))
+    ratios = [ratio for half in halves if (ratio := ratio_of(half)) is not None]
+    return all((ratio.value > np.sqrt(factor)) == (factor > 1.0) for ratio in ratios)
 
 
 def _force(evidence: Evidence) -> _Wrong | None:

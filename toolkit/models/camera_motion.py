@@ -104,15 +104,20 @@ def usable_pairs(sequence: Sequence) -> Neighbours:
     return pairs.select(usable[pairs.before] & usable[pairs.after])
 
 
-def camera_motion(sequence: Sequence) -> CameraMotion:
-    """Estimate the camera's twist over every interval between frames."""
+def camera_motion(sequence: Sequence, start: Array | None = None) -> CameraMotion:
+    """Estimate the camera's twist over every interval between frames.
+
+    ``start`` (K - 1, 4, 4) is where to begin, else at rest: what lies far from the next frame needs it.
+    """
     intervals = max(sequence.frame_count - 1, 0)
     views = _two_views(sequence, intervals)
     if views.interval.size == 0:
         return CameraMotion(np.zeros((intervals, 3)), np.zeros((intervals, 3)), np.zeros(intervals, dtype=bool))
-    T_before_after, support = np.tile(np.eye(4), (intervals, 1, 1)), np.zeros(intervals)
+    T_before_after = np.tile(np.eye(4), (intervals, 1, 1)) if start is None else start.copy()
+    support = np.zeros(intervals)
     for stretch in _stretches(views.first):
-        T_before_after[stretch], support[stretch] = _motion_over(views.over(stretch), sequence.rig)
+        there = views.over(stretch)
+        T_before_after[stretch], support[stretch] = _motion_over(there, T_before_after[stretch], sequence.rig)
     known = (support > LEAST_SUPPORT) & np.isfinite(T_before_after).all(axis=(1, 2))
     dt_s = np.diff(sequence.frames_t_ns)[known] / NS_PER_S
     twist = np.zeros((intervals, 6))
@@ -130,9 +135,9 @@ def _stretches(first: IntArray) -> Iterator[slice]:
         begin = end
 
 
-def _motion_over(views: _TwoViews, rig: StereoRig) -> tuple[Array, Array]:
-    """Return the motion (K, 4, 4) over every interval and the sum of its weights (K,)."""
-    T_before_after, support = np.tile(np.eye(4), (views.first.size - 1, 1, 1)), np.zeros(views.first.size - 1)
+def _motion_over(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Return the motion (K, 4, 4) over every interval, from a first guess, and the sum of its weights (K,)."""
+    support = np.zeros(views.first.size - 1)
     for _ in range(ITERATIONS):
         step, support, points = _gauss_newton(views, T_before_after, rig)
         T_before_after, views = T_before_after @ se3_exp(step), views._replace(points=points)

@@ -132,6 +132,13 @@ def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Se
     return _with_pixels(sequence, sequence.observations.uv_px + np.array([0.0, 0.0, 0.5 * dose]))
 
 
+def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
+    """Multiply all disparities by the dose: images scaled after the matching, a matcher that is biased."""
+    uv_px = sequence.observations.uv_px.copy()
+    uv_px[:, 1] = uv_px[:, 0] - dose * (uv_px[:, 0] - uv_px[:, 1])
+    return _with_pixels(sequence, uv_px)
+
+
 # The motion samples -------------------------------------------------------------------------------------------------
 
 
@@ -281,6 +288,13 @@ def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequ
     axis = np.random.default_rng(seed).standard_normal(3)
     T_imu_cam = sequence.rig.T_imu_cam
     return _with_rig(sequence, T_imu_cam=T_imu_cam @ se3(so3_exp(dose * axis / np.linalg.norm(axis)), np.zeros(3)))
+
+
+def displaced_camera(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Sequence:
+    """Write the camera so many metres from where it is, in a direction drawn: a tape measure, a bracket moved since."""
+    axis, T_imu_cam = np.random.default_rng(seed).standard_normal(3), sequence.rig.T_imu_cam
+    displaced = se3(T_imu_cam[:3, :3], T_imu_cam[:3, 3] + dose * axis / np.linalg.norm(axis))
+    return _with_rig(sequence, T_imu_cam=displaced)
 
 
 def truth_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter, minimum_filter
 
+from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
 from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
@@ -74,18 +75,25 @@ def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -
 def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
     """Return the spans in which the means of the stretches deviate by so many of their standard deviations.
 
-    Those are what white noise makes of them, or in a long recording what they scatter by in its quieter half, if that
-    is more. ``least`` is the smallest deviation that counts, in its unit.
+    Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either
+    of its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
     """
     stretches = _stretches(deviation)
     if not stretches.centre_s.size:
         return []
     noise = stretches.noise
     if np.ptp(stretches.centre_s) > LEAST_STRETCHES * STRETCH_S:
-        off_centre = np.abs(stretches.mean - np.median(stretches.mean, axis=0))
-        noise = np.maximum(noise, np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
+        # A fault that begins in the middle and stays must not be what is usual.
+        first, second = (_scatter_of_means(half) for half in np.array_split(stretches.mean, 2))
+        noise = np.maximum(noise, np.minimum(first, second))
     improbable = np.linalg.norm(stretches.mean / noise, axis=1) > sigmas
     return _spans(stretches, np.asarray(improbable & (np.linalg.norm(stretches.mean, axis=1) > least)))
+
+
+def _scatter_of_means(mean: Array) -> Array:
+    """Return the standard deviation (3,) of means (m, 3) by the quieter half of them."""
+    off_centre = np.abs(mean - np.median(mean, axis=0))
+    return np.asarray(np.quantile(off_centre, 0.25, axis=0) / _LOWER_QUARTILE)
 
 
 class _Stretches(NamedTuple):
@@ -151,7 +159,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     h_s = np.diff(middle_ns)[:, None] / NS_PER_S
     mean = interval_means(motion.t_ns, motion.values, middle_ns)
     half = so3_exp(0.5 * h_s * (mean[:, 3:] - bias_radps))
-    R_first_imu = _chained(half @ half)
+    R_first_imu = chained(half @ half)
     v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
     smooth = np.asarray(median_filter(v_first, size=(_MEDIAN_OF, 1), mode="nearest"))
     force = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1)
@@ -163,14 +171,6 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
-
-
-def _chained(rotation: Array) -> Array:
-    """Return the products (n + 1, 3, 3) of the first 0, 1, ... n rotations (n, 3, 3)."""
-    chained = np.tile(np.eye(3), (len(rotation) + 1, 1, 1))
-    for k in range(len(rotation)):
-        chained[k + 1] = chained[k] @ rotation[k]
-    return chained
 
 
 def _around(t_s: Array, value: Array) -> Array:

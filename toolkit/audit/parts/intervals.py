@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, IntArray, se3_exp, se3_inverse, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, transform
 from toolkit.measured_motion import NoSamples, TwistSamples
 from toolkit.models.camera_motion import CameraMotion, usable_pairs
 from toolkit.models.stereo import project, triangulate
@@ -29,6 +29,11 @@ class Intervals(NamedTuple):
     v_mps: Array | None
     w_cam_radps: Array
     v_cam_mps: Array
+
+    def select(self, rows: BoolArray) -> "Intervals":
+        """Return those of a mask (M,)."""
+        v_mps = None if self.v_mps is None else self.v_mps[rows]
+        return Intervals(self.interval[rows], self.w_radps[rows], v_mps, self.w_cam_radps[rows], self.v_cam_mps[rows])
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
@@ -81,7 +86,7 @@ def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam:
 
 def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
     """Return the same median where the points are moved by a motion of the camera, for example its own."""
-    return _median(_one_step_px(sequence, camera, _moved_by(camera, sequence))[1])
+    return _median(_one_step_px(sequence, camera, moved_by(camera, sequence))[1])
 
 
 def _moved(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
@@ -94,10 +99,11 @@ def _moved(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
         T_before_after_imu = se3_exp(dt_s * np.concatenate([w_radps, v_mps], axis=1))
         return np.asarray(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
     bias_radps = np.median((w_radps - camera.w_radps @ R_imu_cam.T)[camera.known], axis=0)
-    return _moved_by(camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam), sequence)
+    return moved_by(camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam), sequence)
 
 
-def _moved_by(camera: CameraMotion, sequence: Sequence) -> Array:
+def moved_by(camera: CameraMotion, sequence: Sequence) -> Array:
+    """Return the motion (K - 1, 4, 4) of a camera over every interval."""
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     return se3_exp(dt_s * np.concatenate([camera.w_radps, camera.v_mps], axis=1))
 

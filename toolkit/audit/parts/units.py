@@ -18,12 +18,12 @@ FROM_SCATTER = 0.5
 
 
 def in_other_unit(ratio: Scalar, factors: Mapping[str, float], within_factor: float, sigmas: float) -> str | None:
-    """Return the unit whose factor a ratio is, or None where it is none's or may be one."""
+    """Return the one unit whose factor a ratio is, or None where it is none's, may be one or may be two units'."""
     if not ratio.value > 0.0 or abs(ratio.value - 1.0) < sigmas * ratio.error:
         return None
     apart = {unit: abs(np.log(ratio.value / factor)) for unit, factor in factors.items()}
-    unit = min(apart, key=lambda name: apart[name])
-    return unit if apart[unit] < np.log(within_factor) else None
+    near = [unit for unit in apart if apart[unit] < np.log(within_factor)]
+    return near[0] if len(near) == 1 else None
 
 
 def rotation_ratio(intervals: Intervals) -> Scalar:

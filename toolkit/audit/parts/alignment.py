@@ -1,0 +1,203 @@
+"""By how much the camera's translation is longer than the measured one, and where the camera is: one linear regression.
+
+Twists measure a velocity to compare with. An IMU measures its change: in the axes of a window's first frame, into
+which the gyro turns everything, the displacement of the IMU is that of the integrated specific force, but for a
+velocity and a gravity of each window's own, so that a scale shows in the accelerations and a lever arm in the turns.
+Source: Martinelli, "Closed-form solution of visual-inertial structure from motion" (2014); Qin, Li & Shen, "VINS-Mono"
+(2018), section V-B, with the position of the camera as a further unknown.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, jackknife_error, spread
+from toolkit.audit.parts.subsets import keep_frames
+from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
+from toolkit.models.camera_motion import CameraMotion, camera_motion
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
+
+# Beside an IMU the camera's displacement is taken over so long, for its noise hardly grows, within windows so long.
+STRIDE_S, WINDOW_S = 0.25, 6.0
+# Equations for each unknown below which a regression follows the noise.
+LEAST_EQUATIONS = 3.0
+# Standard deviations of what an accelerometer (m/s^2) reads too much, and a gyro less its median (rad/s).
+ACCEL_BIAS, GYRO_BIAS = 0.2, 0.01
+# Unknowns: the scale, the camera's position (3), its turn (3), with an IMU both biases (6).
+_LEVER, _COMMON = slice(1, 4), 13
+
+
+class Alignment(NamedTuple):
+    """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m."""
+
+    scale: Scalar
+    lever_m: Array
+    lever_error_m: Array
+
+
+def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
+    """Regress the camera's translation on the measured motion; None where there is too little to solve for it."""
+    if intervals.v_mps is not None:
+        return _with_velocities(intervals, intervals.v_mps, sequence.rig.T_imu_cam)
+    return _with_accelerations(sequence, camera, intervals)
+
+
+def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> Alignment:
+    """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
+
+    Noise of the regressor feigns a scale. What the regression of the one on the other and its inverse leave open
+    between them counts for nothing (Frisch, "Statistical confluence analysis", 1934).
+    """
+    R_imu_cam, p_imu_cam = T_imu_cam[:3, :3], T_imu_cam[:3, 3]
+    w_radps, seen = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
+    measured = v_mps + np.cross(w_radps, p_imu_cam)
+    jacobian = np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
+    found = _robust(measured - seen, jacobian)
+    errors = [jackknife_error(lambda y, j, k=k: float(_robust(y, j)[k]), measured - seen, jacobian) for k in range(4)]
+    one, other = 1.0 / (1.0 - float(found[0])) - 1.0, float(_robust(seen - measured, measured[:, :, None])[0])
+    scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
+    return Alignment(Scalar(scale, errors[0] * (1.0 + scale) ** 2), found[_LEVER], np.array(errors[1:]))
+
+
+def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
+    """Solve for the scale and the lever arm from displacements of the camera over strides within windows."""
+    frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    stride = max(1, round(STRIDE_S / float(np.median(np.diff(frame_s)))))
+    kept = np.arange(0, sequence.frame_count, stride)
+    strides = _strides(sequence, camera, kept)
+    if kept.size < 3:
+        return None
+    w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
+    windows = max(1, round(frame_s[kept[-1]] / WINDOW_S))
+    edges = np.linspace(0, kept.size - 1, windows + 1).round().astype(int)
+    equations = [_window(sequence, strides, kept, w_bias, range(*edge)) for edge in pairwise(edges.tolist())]
+    response = np.concatenate([response for response, _, _ in equations])
+    unknowns = _COMMON + 6 * windows
+    if 3 * len(response) < LEAST_EQUATIONS * unknowns:
+        return None
+    jacobian = np.zeros((len(response), 3, unknowns))
+    row = 0
+    for k, (_, common, own) in enumerate(equations):
+        here = slice(row, row + len(common))
+        jacobian[here, :, :_COMMON], jacobian[here, :, _COMMON + 6 * k : _COMMON + 6 * (k + 1)] = common, own
+        row = here.stop
+    prior = np.repeat([0.0, 1.0 / ACCEL_BIAS**2, 1.0 / GYRO_BIAS**2, 0.0], [7, 3, 3, 6 * windows])
+    block = np.arange(len(response)) * STRIDE_S // 1.0
+    found, error = _robust_with_error(response, jacobian, prior, block.astype(int))
+    return Alignment(Scalar(float(found[0]), float(error[0])), found[_LEVER], error[_LEVER])
+
+
+def _strides(sequence: Sequence, camera: CameraMotion, kept: IntArray) -> CameraMotion:
+    """Return the camera's motion between the frames ``kept`` (n,), from tracks that are seen in both."""
+    path = chained(moved_by(camera, sequence))
+    start = se3_inverse(path[kept[:-1]]) @ path[kept[1:]]
+    found = camera_motion(keep_frames(sequence, kept), start)
+    unknown = np.concatenate([[0], np.cumsum(~camera.known)])
+    return found._replace(known=found.known & (unknown[kept[1:]] == unknown[kept[:-1]]))
+
+
+def _window(
+    sequence: Sequence, strides: CameraMotion, kept: IntArray, w_bias: Array, window: range
+) -> tuple[Array, Array, Array]:
+    """Return response (M, 3), jacobian of the common unknowns (M, 3, 13) and of the window's own (M, 3, 6), in m/s.
+
+    The window's strides are those from ``kept[k]`` to ``kept[k + 1]``, k in ``window``, whose motion is known.
+    """
+    first, frames_t_ns = kept[window.start], sequence.frames_t_ns[kept[window.start] : kept[window.stop] + 1]
+    path = _integrated(sequence, frames_t_ns, w_bias)
+    rows = np.array([k for k in window if strides.known[k]], dtype=int)
+    a, b = kept[rows] - first, kept[rows + 1] - first
+    t_s = (frames_t_ns - frames_t_ns[0]) / NS_PER_S
+    dt_s = (t_s[b] - t_s[a])[:, None]
+    R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
+    T_before_after = moved_by(strides, keep_frames(sequence, kept))[rows]
+    seen = T_before_after[:, :3, 3] @ R_imu_cam.T
+    R_first_a, R_a_b = path.R_first_imu[a], path.R_first_imu[a].swapaxes(1, 2) @ path.R_first_imu[b]
+    displaced = (R_first_a @ (seen + p_imu_cam - R_a_b @ p_imu_cam)[:, :, None]).squeeze(-1)
+    force = path.moved[b] - path.moved[a]
+    lever, turn = R_first_a @ (R_a_b - np.eye(3)), R_first_a @ skew(seen)
+    biases = [path.d_moved_d_accel[b] - path.d_moved_d_accel[a], path.d_moved_d_gyro[b] - path.d_moved_d_gyro[a]]
+    common = np.concatenate([force[:, :, None], lever, turn, *biases], axis=2) / dt_s[:, :, None]
+    later_s = 0.5 * (t_s[b] + t_s[a])[:, None, None]
+    own = np.concatenate([np.tile(np.eye(3), (len(rows), 1, 1)), later_s * np.eye(3)], axis=2)
+    return (displaced - force) / dt_s, common, own
+
+
+class _Path(NamedTuple):
+    """Orientation (n, 3, 3) and displacement (n, 3) m of an IMU, in its first axes and as if it had begun at rest in
+    free fall, and what the displacement changes by with the biases of the accelerometer and the gyro (n, 3, 3).
+    """
+
+    R_first_imu: Array
+    moved: Array
+    d_moved_d_accel: Array
+    d_moved_d_gyro: Array
+
+
+def _integrated(sequence: Sequence, frames_t_ns: IntArray, w_bias: Array) -> _Path:
+    """Integrate the samples from frame to frame, by the mean between two."""
+    h_s = np.diff(frames_t_ns)[:, None] / NS_PER_S
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, frames_t_ns)
+    half = so3_exp(0.5 * h_s * (mean[:, 3:] - w_bias))
+    R_first_imu = chained(half @ half)
+    middle = R_first_imu[:-1] @ half
+    force = (middle @ mean[:, :3, None]).squeeze(-1)
+    turned = _from_zero(-middle * h_s[:, :, None])
+    per_gyro = -skew(force) @ (0.5 * (turned[:-1] + turned[1:]))
+    return _Path(R_first_imu, _twice(force, h_s), _twice(-middle, h_s[:, :, None]), _twice(per_gyro, h_s[:, :, None]))
+
+
+def _twice(rate: Array, h_s: Array) -> Array:
+    """Integrate constant rates (n, ...) twice over durations, from zero: (n + 1, ...)."""
+    once = _from_zero(rate * h_s)
+    return _from_zero(once[:-1] * h_s + 0.5 * rate * h_s**2)
+
+
+def _from_zero(steps: Array) -> Array:
+    """Return the sums (n + 1, ...) of the first 0, 1, ... n steps (n, ...)."""
+    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+
+
+def chained(step: Array) -> Array:
+    """Return the products (n + 1, d, d) of the first 0, 1, ... n matrices (n, d, d)."""
+    products = np.tile(np.eye(step.shape[1]), (len(step) + 1, 1, 1))
+    for k in range(len(step)):
+        products[k + 1] = products[k] @ step[k]
+    return products
+
+
+def _robust(response: Array, jacobian: Array) -> Array:
+    """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights."""
+    return _weighted(response, jacobian, np.zeros(jacobian.shape[2]))[0]
+
+
+def _robust_with_error(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:
+    """Solve the same with the information (m,) of a prior about zero; errors (m,) robust to scatter that lasts a block.
+
+    Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
+    """
+    found, information, score = _weighted(response, jacobian, prior)
+    of_block = np.zeros((block[-1] + 1, found.size))
+    np.add.at(of_block, block, score)
+    inverse = np.asarray(np.linalg.inv(information))
+    cov = inverse @ (of_block.T @ of_block + np.diag(prior)) @ inverse
+    return found, np.sqrt(np.maximum(np.diag(cov), np.diag(inverse)))
+
+
+def _weighted(response: Array, jacobian: Array, prior: Array) -> tuple[Array, Array, Array]:
+    """Return the solution (m,), its information (m, m) and the weighted gradient (M, m) of every row there."""
+    unknowns = jacobian.shape[2]
+    found = np.linalg.lstsq(jacobian.reshape(-1, unknowns), response.ravel())[0]
+    for _ in range(ITERATIONS):
+        residual = response - jacobian @ found
+        scale = np.maximum(spread(residual), 1e-9)
+        weight = 1.0 / (1.0 + (residual / scale) ** 2 / CAUCHY_SIGMAS**2) / scale**2
+        weighted = jacobian * weight[:, :, None]
+        information: Array = weighted.reshape(-1, unknowns).T @ jacobian.reshape(-1, unknowns) + np.diag(prior)
+        information += 1e-12 * np.trace(information) * np.eye(unknowns)
+        found = np.linalg.solve(information, weighted.reshape(-1, unknowns).T @ response.ravel())
+    score = np.einsum("nij,ni->nj", weighted, response - jacobian @ found)
+    return np.asarray(found), information, score

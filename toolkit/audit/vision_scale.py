@@ -1,0 +1,49 @@
+"""Vision's steps that are longer or shorter than the measured ones: disparities, baseline, focal length or wheels.
+
+A share of the depths scales every step of the camera. Odometry shows it in velocities, an IMU in accelerations.
+"""
+
+from toolkit.audit.disagreement import MOST_RATIO
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+
+# A scale counts from so many standard errors on, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the
+# odometry of cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
+SIGMAS, SYSTEMATIC = 5.0, {"twist": 0.03, "imu": 0.025}
+# A scale that is known worse than this is not judged.
+LARGEST_ERROR = 0.02
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Compare the camera's translation with the measured one in size; what is beyond MOST_RATIO is a disagreement."""
+    if evidence.intervals is None:
+        return evidence.blind
+    kind, found = evidence.sequence.motion_kind, evidence.alignment
+    if found is None or found.scale.error > LARGEST_ERROR:
+        known = "unknown" if found is None else f"known to {100.0 * found.scale.error:.0f} %"
+        return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
+    scale, error = found.scale
+    is_told = kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO
+    if is_told or abs(scale) < SYSTEMATIC[kind] + SIGMAS * error:
+        return None
+    measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
+    if kind == "imu":
+        measured, causes = "IMU's", ": check K and the baseline"
+    return Symptom(
+        count=1,
+        detail=(
+            f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
+            f"{'longer' if scale > 0.0 else 'shorter'} than the {measured}"
+        ),
+        treatment=f"disparities, baseline or focal length are off{causes}",
+        remedy=None,
+        harmful=False,
+        warns=True,
+    )
+
+
+FAULT = Fault(
+    "vision-scale",
+    "steps of vision that are a few percent longer or shorter than the measured ones",
+    check,
+    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+)
