@@ -57,6 +57,7 @@ def test_exactly_one_format_recognises_a_recording(course: dict[str, Any], openv
         (bytes(257) + b"ustar" + bytes(9), r"is packed \(tar\)"),
         (b"1.5 0 0 0 0 0 0 1\n2.5 1 0 0 0 0 0 1\n", "is a trajectory and no recording; .* --trajectory NAME=FILE"),
     ],
+    ids=["gzip", "zstd", "tar", "trajectory"],
 )
 def test_what_a_file_is_instead_is_told(tmp_path: Path, content: bytes, pattern: str) -> None:
     (tmp_path / "drive").write_bytes(content)

@@ -103,9 +103,9 @@ def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noi
     ours, theirs = (
         tell(tracks, window, rig, FrameGate(probability, huber)) for tell in (tracks_in_view.told, kernels[1].told)
     )
-    assert ours.in_front.tolist() == theirs.in_front.tolist()
-    assert 0 < ours.in_front.sum() < TRACKS
-    some = ours.in_front
+    assert ours.usable.tolist() == theirs.usable.tolist()
+    assert 0 < ours.usable.sum() < TRACKS
+    some = ours.usable
     assert ours.points[some] == pytest.approx(theirs.points[some], rel=TOLERANCE)
     assert ours.weights[some] == pytest.approx(theirs.weights[some], rel=TOLERANCE)
     assert (ours.weights[some] == 0.0).any() == (probability is not None)
@@ -133,7 +133,7 @@ def test_nothing_is_told_by_no_track(kernels, flight):
     none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
     for tell in (tracks_in_view.told, kernels[1].told):
         nothing = tell(none, window, rig, FrameGate(0.95))
-        assert len(nothing.weights) == len(nothing.in_front) == 0
+        assert len(nothing.weights) == len(nothing.usable) == 0
         assert not nothing.matrix.any() and not nothing.vector.any()
 
 

@@ -21,8 +21,9 @@ WINDOW = types.Tuple((STACK, STACK, MATRIX))
 # walk and offset, a channel a column, and the channels (3, 3), both (0, 3) where the noise of tracks is white.
 CAMERA = types.Tuple((ROW, STACK, MATRIX, MATRIX, MATRIX))
 
-# Sums may be taken in any order; what is not called from Python needs no wrapper for it, half of the compilation.
-_OPTIONS = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy", "no_cfunc_wrapper": True}
+# No fast mathematics: were sums taken in any order, what a process has compiled and what it has found on disk would
+# round another way. What is not called from Python needs no wrapper for it, which is half of the compilation.
+_OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 compiled = njit(no_cpython_wrapper=True, **_OPTIONS)
 
 
