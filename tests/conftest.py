@@ -37,9 +37,11 @@ _OF_ONE_MACHINE = re.compile(
 
 
 def pytest_configure() -> None:
-    """Let interrupts be tested also where the tests run in the background, to which a shell gives none."""
+    """Let interrupts be tested also where the tests run in the background, where a shell has some ignored."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 # What takes longest comes first, or one worker would still be at it when all others have ended. What stays together

@@ -21,13 +21,13 @@ SETTINGS = Settings(outliers=POLICIES["none"])
 @pytest.mark.parametrize("estimator", [msckf_fej, msckf_slam, fixed_lag], ids=lambda module: module.__name__[8:])
 def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(estimator, oracle):
     told, white = [], []
-    for seed in range(2):
+    for seed in range(3):
         sequence = oracle.with_track_errors(SCENARIO, NOISE, seed)
         untold = replace(sequence, rig=replace(sequence.rig, track_noise=None))
         for which, found in ((sequence, told), (untold, white)):
             result = run("one", estimator.build, which, which.prior, settings=SETTINGS)
             found.append(score_run(result, "causal", which).values["nees_pose_mean"])
-    # Errors of successive poses are nearly the same one: of two runs the mean is known to a third at best.
+    # Errors of successive poses are nearly the same one: of three runs the mean is known to a third at best.
     assert 0.5 < np.mean(told) < 1.6
-    # Above what is let pass for honest, by more than the mean of two runs of an honest filter varies.
+    # Above what is let pass for honest, by more than the mean of the runs of an honest filter varies.
     assert np.mean(white) > 1.8

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from toolkit.errors import OutputError
 from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
-from toolkit.report import run_directory
+from toolkit.report import figures, run_directory
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.records import read_manifest, read_metrics
 from toolkit.report.run_directory import MadeBy, check_run_directory, write_run
@@ -25,7 +25,7 @@ one_figure = pytest.mark.usefixtures("one_figure")
 def _one_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have an empty figure stand for all there are: to draw them takes longer than to write all else."""
     monkeypatch.setattr(
-        run_directory, "drawn", lambda _comparison, _choice: [NamedFigure("top_all", "From above.", Figure())]
+        figures, "drawn", lambda _comparison, _choice: [NamedFigure("top_all", "From above.", Figure())]
     )
 
 
@@ -41,12 +41,12 @@ def test_everything_is_there(comparison: Comparison, tmp_path: Path) -> None:
     assert {f"trajectories/{name}.tum" for name in ("steady_causal", "steady_final", "late_final")} <= files
     assert "trajectories/late_causal.tum" not in files
     assert {f"landmarks/{run.estimator}.csv" for run in comparison.runs} <= files
-    figures = ("top_all", "errors_over_time")
-    assert {f"figures/{name}.png" for name in figures} == {name for name in files if name.startswith("figures/")}
+    drawn = ("top_all", "errors_over_time")
+    assert {f"figures/{name}.png" for name in drawn} == {name for name in files if name.startswith("figures/")}
     assert read_metrics(target / "metrics.json") == metrics_document(comparison)
     assert read_manifest(target / "manifest.json").command == "vislam compare"
     report = (target / "report.md").read_text()
-    assert all(f"(figures/{name}.png)" in report for name in figures)
+    assert all(f"(figures/{name}.png)" in report for name in drawn)
 
 
 @one_figure
@@ -69,7 +69,7 @@ def test_a_failure_while_writing_leaves_nothing(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(run_directory, "drawn", fail)
+    monkeypatch.setattr(figures, "drawn", fail)
     with pytest.raises((KeyboardInterrupt, OutputError)):
         write(comparison, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
@@ -85,7 +85,7 @@ def test_a_failure_while_writing_keeps_the_earlier_run(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_directory, "drawn", fail)
+    monkeypatch.setattr(figures, "drawn", fail)
     with pytest.raises(KeyboardInterrupt):
         write(comparison, tmp_path / "run")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -198,7 +198,7 @@ def test_no_directory_is_left_above_a_run_that_failed(
     def fail(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run_directory, "drawn", fail)
+    monkeypatch.setattr(figures, "drawn", fail)
     with pytest.raises(KeyboardInterrupt):
         write(comparison, tmp_path / "runs" / "of" / "today")
     assert list(tmp_path.iterdir()) == []
