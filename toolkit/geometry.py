@@ -192,17 +192,28 @@ def quaternion_from_rotation(rotation: Array) -> Array:
     r = np.asarray(rotation, dtype=float)
     diagonal = np.diagonal(r, axis1=-2, axis2=-1)
     trace = diagonal.sum(axis=-1)
+    of_vector, of_scalar = 1.0 + 2.0 * diagonal - trace[..., None], 1.0 + trace
+    if (of_vector < of_scalar[..., None]).all():
+        # By less than 90 degrees or so each, as what lies between two estimates nearly always is.
+        vee = (r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1])
+        row = np.stack([*vee, of_scalar], axis=-1)
+    else:
+        row = _largest_row(r, of_vector, of_scalar)
+    row = row / np.sqrt(_squared_norm(row))[..., None]
+    return np.where(row[..., 3:] < 0.0, -row, row)
+
+
+def _largest_row(r: Array, of_vector: Array, of_scalar: Array) -> Array:
+    """Return the row (..., 4) of 4 q q^T with the largest of the diagonals (..., 3) and (...)."""
     outer = np.zeros((*r.shape[:-2], 4, 4))
     for i in range(3):
-        outer[..., i, i] = 1.0 + 2.0 * diagonal[..., i] - trace
+        outer[..., i, i] = of_vector[..., i]
         j, k = (i + 1) % 3, (i + 2) % 3
         outer[..., j, k] = outer[..., k, j] = r[..., j, k] + r[..., k, j]
         outer[..., i, 3] = outer[..., 3, i] = r[..., k, j] - r[..., j, k]
-    outer[..., 3, 3] = 1.0 + trace
+    outer[..., 3, 3] = of_scalar
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
-    row = row / np.sqrt(_squared_norm(row))[..., None]
-    return np.where(row[..., 3:] < 0.0, -row, row)
+    return np.asarray(np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :])
 
 
 def rotation_from_quaternion(quaternion: Array) -> Array:

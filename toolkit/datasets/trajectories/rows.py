@@ -46,9 +46,9 @@ class Rows:
 
         Raises DataError naming the line that has another number of cells or one that is no number.
         """
-        if not self.underscored and all(len(cells) == width for cells in self.cells):
+        if not self.underscored and set(map(len, self.cells)) == {width}:
             with suppress(ValueError):  # told below, with the line
-                return np.array(list(map(float, chain.from_iterable(self.cells)))).reshape(-1, width)
+                return np.fromiter(map(float, chain.from_iterable(self.cells)), dtype=float).reshape(-1, width)
         return np.array([self._numbers(n, cells, width, columns) for n, cells in self], dtype=float)
 
     def stamps(self, per_unit_ns: int) -> IntArray:
@@ -95,19 +95,21 @@ def read_rows(path: Path, kind: str) -> Rows:
 
     ``kind`` describes such a file in an error. Raises DataError where it is missing, empty or not text.
     """
-    lines = read_text_input(path, kind).splitlines()
-    if any("#" in line for line in lines):
+    text = read_text_input(path, kind)
+    lines = text.splitlines()
+    if "#" in text:
         lines = [line.partition("#")[0] for line in lines]
     last = next((line for line in reversed(lines) if line and not line.isspace()), "")
     commas = "," in last
-    rows = [(n, cells) for n, line in enumerate(lines, start=1) if (cells := _cells(line, commas=commas))]
-    if commas and not _is_number(rows[0][1][0]):
-        rows = rows[1:]
-    if not rows:
+    cells = [_between_commas(line) for line in lines] if commas else [line.split() for line in lines]
+    line_numbers = [n for n, of_line in enumerate(cells, start=1) if of_line]
+    cells = [of_line for of_line in cells if of_line]
+    if commas and not _is_number(cells[0][0]):
+        line_numbers, cells = line_numbers[1:], cells[1:]
+    if not cells:
         raise DataError(f"{path}: the file holds no poses; {kind}")
-    cells_of_rows = [cells for _, cells in rows]
-    underscored = any("_" in line for line in lines)
-    return Rows(path, [n for n, _ in rows], cells_of_rows, commas, underscored)
+    underscored = "_" in text and any("_" in line for line in lines)
+    return Rows(path, line_numbers, cells, commas, underscored)
 
 
 def _printed_alike(cells: list[str]) -> IntArray | None:
@@ -136,10 +138,8 @@ def stamp_text(t_ns: int) -> str:
     return f"{sign}{seconds}.{rest_ns:09d}"
 
 
-def _cells(line: str, *, commas: bool) -> list[str]:
-    """Split a line, which has none where it is empty; some programs end theirs with a comma."""
-    if not commas:
-        return line.split()
+def _between_commas(line: str) -> list[str]:
+    """Split a line, which has no cells where it is empty; some programs end theirs with a comma."""
     stripped = line.strip()
     return [cell.strip() for cell in stripped.removesuffix(",").split(",")] if stripped else []
 
