@@ -316,8 +316,8 @@ def _assert_tables_agree(shown: str, printed: str) -> None:
     there = _rows(printed)
     for row, cells in _rows(shown).items():
         assert row in there
-        if row[-1] == "diverged":
-            continue  # what such a run comes to hangs on the last digits
+        if "--no-repair" in shown and row[1] == _DIVERGED_ON_03[1]:
+            continue
         for cell, fresh in zip(cells[:-2], there[row][:-2], strict=True):  # the last two are times of a machine
             if "-" in (cell, fresh):
                 assert cell == fresh, row

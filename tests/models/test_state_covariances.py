@@ -9,15 +9,31 @@ import pytest
 from filters.smoothing import indeterminate
 from toolkit.models import state_covariances
 from toolkit.models.motion import state_cov
-from toolkit.models.state_covariances import state_covs
+from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.settings import Settings, Window
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=5.0)}
 
 
-@pytest.mark.parametrize("scenario", SHORT)
-def test_every_state_has_gtsams_marginal(scenario, run_estimator, monkeypatch):
+def _only_dissected(eliminated):
+    """Return an elimination that fails the first time, which is in the order of time."""
+    failed = []
+
+    def eliminate(*given):
+        if not failed:
+            failed.append(True)
+            raise RoundingError("not in the order of time")
+        return eliminated(*given)
+
+    return eliminate
+
+
+@pytest.mark.parametrize(("scenario", "in_time"), [("drive", True), ("flight", True), ("drive", False)])
+def test_every_state_has_gtsams_marginal(scenario, in_time, run_estimator, monkeypatch):
+    """In the order of time, and by nested dissection where that is no good."""
+    if not in_time:
+        monkeypatch.setattr(state_covariances, "_eliminated", _only_dissected(state_covariances._eliminated))
     calls = []
 
     def spy(linear, motion, poses):
@@ -45,6 +61,13 @@ def test_the_newest_state_of_a_window_that_never_leaves_has_the_batchs_covarianc
     smoothed = run_estimator("batch", sequence).final.cov[-1]
     sigma_ratio = np.sqrt(np.diag(newest)[:6] / np.diag(smoothed)[:6])
     np.testing.assert_allclose(sigma_ratio, 1.0, atol=0.25)
+
+
+def test_a_dissection_that_loses_its_digits_over_an_imu_is_not_shown(run_estimator, monkeypatch):
+    monkeypatch.setattr(state_covariances, "_eliminated", _only_dissected(state_covariances._eliminated))
+    run = run_estimator("batch", simulate(SHORT["flight"], 3))
+    assert run.status == "ok"
+    assert run.final.cov is None
 
 
 def test_covariances_that_rounding_spoils_are_not_shown(run_estimator, monkeypatch):
