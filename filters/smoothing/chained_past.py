@@ -1,4 +1,4 @@
-"""The chained sightings of a smoother that keeps every state: linearised where they came in, renewed as they stray.
+"""The chained sightings of a smoother that keeps every state: linearised where they came in, renewed as they move.
 
 The graph has their linearisations. One of a recent frame is replaced once what is new in its sighting is no longer what
 the linearisation says, or weighs something else by the loss; those of older frames stay as they are until the end.
@@ -104,7 +104,7 @@ class ChainedPast:
         self._older: list[tuple[SightingRows, IntArray]] = []
 
     def renewal(self, frame: StereoFrame, k: int, read: Read, first_slot: int) -> Renewal:
-        """Take in frame k; return the factors of what is new and of what has strayed, which get the slots from one on.
+        """Take in frame k; return the factors of what is new and of what has moved, which get the slots from one on.
 
         ``read`` returns the values of keys.
         """

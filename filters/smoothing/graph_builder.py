@@ -29,7 +29,7 @@ from toolkit.sequence import Packet, StereoFrame
 class GraphExtension:
     """New factors and values, and every state and landmark they are on.
 
-    ``chained`` are the sightings of the frame, by its number, whose errors hang together with earlier ones: factors of
+    ``chained`` are the sightings of the frame, by its number, whose errors are correlated with earlier ones: factors of
     them are the smoother's affair.
     """
 

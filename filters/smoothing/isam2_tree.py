@@ -43,7 +43,7 @@ RECENT_FRAMES, LONG_LIVED_SIGHTINGS = 100, 10
 FROZEN_AFTER_FRAMES = 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
-# How far variables may stray from where they are linearised: rad, m/s, the biases' units; and for positions and
+# How far variables may move from where they are linearised: rad, m/s, the biases' units; and for positions and
 # landmarks multiples of the baseline, the length that sets the scale of what stereo sees. Coarser thresholds mix
 # linearisation points: with five times these a flight of two minutes was five times less accurate.
 ROTATION_THRESHOLD_RAD, OTHER_THRESHOLDS = 0.01, {"v": 0.01, "b": 0.01}

@@ -58,7 +58,7 @@ def solve(
     stage: str = "solving",
     beside: Beside | None = None,
 ) -> Solution:
-    """Minimise the error of a graph from a start; ``progress`` hears of every iteration, under the stage's name.
+    """Minimise the error of a graph from a start; ``progress`` is called at every iteration with the stage's name.
 
     Where no step, however short, lowers the error, the start is a minimum. Raises EstimatorError where the error at the
     start is not finite: some measurement or initial value is NaN.

@@ -86,7 +86,7 @@ def _solve_chained(
     outliers: Outliers,
     progress: Progress,
 ) -> Smoothed:
-    """Solve with sightings whose errors hang together along their tracks, from the answer of those that do not.
+    """Solve with sightings whose errors are correlated along their tracks, from the answer of those that do not.
 
     First under Cauchy's loss of what is new in each sighting, a track being Student-t distributed as a whole; then
     without those innovations that chance does not explain there: after such a jump a track may be anywhere, and its

@@ -152,7 +152,7 @@ class Vision:
 
 
 class ChainedVision(Vision):
-    """Sightings whose errors hang together along their tracks: what is new in each is a residual of two poses.
+    """Sightings whose errors are correlated along their tracks: what is new in each is a residual of two poses.
 
     Huber's loss is that of what is new.
     """

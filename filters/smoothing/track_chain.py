@@ -1,4 +1,4 @@
-"""Sightings whose errors hang together along their tracks, as linear factors on two poses and a landmark each.
+"""Sightings whose errors are correlated along their tracks, as linear factors on two poses and a landmark each.
 
 A sighting's error follows from that of the sighting before it (:class:`toolkit.models.correlated_noise.Chain`), so what
 is new in it is a residual of both poses and of the landmark. GTSAM has no such factor, and one written in Python is
@@ -34,7 +34,7 @@ _MOST_TERMS = 3
 
 @dataclass(frozen=True, eq=False)
 class ChainedSightings:
-    """N sightings: frame and track (N,), both by number, (uL, uR, v) (N, 3) px, and how their errors hang together.
+    """N sightings: frame and track (N,), both by number, (uL, uR, v) (N, 3) px, and how their errors are correlated.
 
     ``counted`` (N,) says which of the innovations count: an outlying one leaves the track free to be anywhere else from
     there on. ``track_ids`` (M,) ascending are the tracks; ``channels`` (3, 3), or
@@ -115,7 +115,7 @@ class SightingRows:
         return [*map(X, np.unique(self.pose).tolist()), *map(L, np.unique(self.track_id).tolist())]
 
     def chained(self, noise: TrackNoise) -> ChainedSightings:
-        """Return all of them as they hang together; what is new counts where it is known what came before."""
+        """Return all of them as one chain a track; what is new counts where it is known what came before."""
         ids, point = np.unique(self.track_id, return_inverse=True)
         chain = Chain.of(noise, point.astype(np.int64), self.age, is_left_only(self.uv_px))
         counted = self.begins | (chain.before >= 0)

@@ -19,7 +19,7 @@ def check(evidence: Evidence) -> Symptom | None:
     """Count sightings and motion samples beyond anything physical; drop them."""
     sequence = evidence.sequence
     sightings: BoolArray = np.asarray((np.abs(sequence.observations.uv_px) > MOST_PX).any(axis=1))
-    samples = _wild(sequence)
+    samples = _implausible_samples(sequence)
     if not (sightings.any() or samples.any()):
         return None
     remedy = sequence
@@ -38,16 +38,16 @@ def check(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _wild(sequence: Sequence) -> BoolArray:
+def _implausible_samples(sequence: Sequence) -> BoolArray:
     """Say which motion samples (S,) hold a value that is neither physical nor like the others."""
     most_linear = MOST_MPS if sequence.motion_kind == "twist" else MOST_MPS2
     size = np.abs(sequence.motion.values)
-    wild = np.zeros(len(size), dtype=bool)
+    beyond = np.zeros(len(size), dtype=bool)
     for columns, most in ((size[:, :3], most_linear), (size[:, 3:], MOST_RADPS)):
         largest = columns.max(axis=1, initial=0.0)
         if largest.size:
-            wild |= (largest > most) & (largest > BEYOND_MEDIAN * np.median(largest))
-    return wild
+            beyond |= (largest > most) & (largest > BEYOND_MEDIAN * np.median(largest))
+    return beyond
 
 
 def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> float:

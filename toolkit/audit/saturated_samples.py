@@ -24,7 +24,7 @@ def check(evidence: Evidence) -> Symptom | None:
     told, rows = list[str](), np.zeros(len(values), dtype=bool)
     for name, unit, column in zip(AXES, UNITS, values.T, strict=True):
         for sign in (1.0, -1.0):
-            at_end = _piled_up(sign * column)
+            at_end = _at_range_end(sign * column)
             if at_end.any():
                 rows |= at_end
                 told.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
@@ -40,7 +40,7 @@ def check(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _piled_up(column: Array) -> BoolArray:
+def _at_range_end(column: Array) -> BoolArray:
     """Say which samples (S,) are at the largest value, if they are too many to be the largest by chance."""
     distinct, counts = np.unique(column, return_counts=True)
     if distinct.size < 2 or counts[-1] < max(LEAST_COUNT, LEAST_RATIO * counts[-2]):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, stamps_ns
-from toolkit.datasets.io.npz_archive import NpzArchive, glance, opened
+from toolkit.datasets.io.npz_archive import NpzArchive, array_names, opened
 from toolkit.datasets.io.sparse import corners_of, sightings
 from toolkit.geometry import se3_inverse
 from toolkit.measured_motion import TwistSamples
@@ -31,7 +31,7 @@ _NAMES = {"features"}.union(*(keys.split("|") for keys in _REQUIRED))
 
 def recognises(path: Path) -> bool:
     """Say whether the path is an npz with at least one of the format's keys."""
-    return bool(_NAMES & glance(path))
+    return bool(_NAMES & array_names(path))
 
 
 def load(path: Path) -> Sequence:

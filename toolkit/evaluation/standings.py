@@ -120,7 +120,7 @@ class PairedTest:
     p_holm: float
 
     @property
-    def told_apart(self) -> bool:
+    def is_significant(self) -> bool:
         """Say whether the two differ by more than chance, at 5 % for all pairs together."""
         return self.p_holm <= FALSE_ALARM_RATE
 

@@ -137,7 +137,7 @@ def paired_lines(evaluation: Evaluation) -> Iterator[str]:
     tests = evaluation.paired
     leader = evaluation.leaderboard[0].system
     for test in tests:
-        if test.system == leader or test.told_apart:
+        if test.system == leader or test.is_significant:
             yield _paired_line(test, len(tests), evaluation.ranked_by)
     count = len(evaluation.ranked_sequences)
     if tests and 2.0 ** (1 - count) * len(tests) > FALSE_ALARM_RATE:
@@ -148,7 +148,7 @@ def _paired_line(test: PairedTest, pairs: int, metric: Metric) -> str:
     counts = f"better on {test.better}, worse on {test.worse}" + (f", equal on {test.tied}" if test.tied else "")
     ratio = "" if test.median_ratio is None else f", {metric.name} {test.median_ratio:.3g} times as large in the median"
     corrected = f", {test.p_holm:.2g} with Holm's correction for {pairs} pairs" if pairs > 1 else ""
-    verdict = "" if test.told_apart else ": may be chance"
+    verdict = "" if test.is_significant else ": may be chance"
     return f"{test.system} against {test.other}: {counts} of the sequences{ratio}; p = {test.p:.2g}{corrected}{verdict}"
 
 

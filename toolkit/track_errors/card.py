@@ -67,7 +67,7 @@ class Card:
 
     @property
     def correlated(self) -> bool:
-        """Say whether the errors of a track hang together."""
+        """Say whether the errors of a track are correlated."""
         return self.noise.is_correlated
 
 

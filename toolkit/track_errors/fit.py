@@ -51,7 +51,7 @@ _RICHEST = _KINDS["walk and offset"]
 class Fit:
     """What was fitted, and what speaks for it.
 
-    ``noise`` is that of most tracks, ``degrees`` of freedom those of the tracks' Student-t: the fewer, the more stray.
+    ``noise`` is that of most tracks, ``degrees`` of freedom those of the tracks' Student-t (fewer: heavier tails).
     ``gain`` is the log-likelihood a track over white noise, with its standard error. ``adjusted`` has the poses and
     landmarks it was fitted about.
     """
@@ -64,7 +64,7 @@ class Fit:
 
     @property
     def correlated(self) -> bool:
-        """Say whether the errors of a track hang together."""
+        """Say whether the errors of a track are correlated."""
         return self.noise.is_correlated
 
     @property

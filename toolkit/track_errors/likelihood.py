@@ -42,13 +42,13 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class Tailed:
-    """The noise of most tracks, and the degrees of freedom of the Student-t: the fewer, the more stray."""
+    """The noise of most tracks, and the degrees of freedom of the Student-t: the fewer, the heavier its tails."""
 
     noise: TrackNoise
     degrees: float
 
     def weights(self, chi2: Array, equations: int) -> Array:
-        """Return what tracks (B,) count, by their squared whitened residuals: about 1 for most, little for strays."""
+        """Return what tracks (B,) count, by their squared whitened residuals: about 1 for most, less for outliers."""
         return np.asarray((self.degrees + equations) / (self.degrees + chi2))
 
 

@@ -95,7 +95,7 @@ def opened(path: Path) -> Iterator[NpzArchive]:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
 
 
-def glance(path: Path) -> set[str]:
+def array_names(path: Path) -> set[str]:
     """Return the keys of an archive without reading arrays; of a damaged one its first key, of anything else none."""
     if not is_regular(path):
         return set()

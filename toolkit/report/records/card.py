@@ -26,7 +26,7 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     white_px: Channels
     walk_px: Annotated[Channels, Meta(description="per root frame")]
     offset_px: Channels
-    degrees_of_freedom: Annotated[float, Meta(description="of the tracks' Student-t: the fewer, the more stray")]
+    degrees_of_freedom: Annotated[float, Meta(description="of the tracks' Student-t: the fewer, the heavier its tails")]
     gain: Annotated[float, Meta(description="log-likelihood a track over white noise")]
     gain_error: float
     correlation: Annotated[Lags, Meta(description="autocorrelation of residuals along a track")]
