@@ -1,6 +1,7 @@
 """What is said about many seeds: spreads over the runs that are ok, the NEES of all against the band of as many."""
 
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,8 +14,8 @@ import pytest
 from toolkit.datasets import is_drawn_from_a_seed
 from toolkit.documents import parse, to_text
 from toolkit.errors import DataError
-from toolkit.experiment.comparison import Comparison
-from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, spread_of
+from toolkit.experiment.comparison import Comparison, in_order
+from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means, spread_of
 from toolkit.experiment.units import Outcome
 from toolkit.metrics import Scores, describe
 from toolkit.metrics._shared.consistency import nees_band
@@ -138,8 +139,12 @@ def test_under_the_table_stands_who_differs_from_the_best(over: Comparison) -> N
 
 
 def _with_ate(outcome: Outcome, ate_m: float) -> Outcome:
+    return _with_values(outcome, {"ate_none_m": ate_m})
+
+
+def _with_values(outcome: Outcome, values: dict[str, float | None]) -> Outcome:
     scored = outcome.outputs["causal"]
-    scores = Scores(scored.scores.values | {"ate_none_m": ate_m}, scored.scores.notes)
+    scores = Scores(scored.scores.values | values, scored.scores.notes)
     return replace(outcome, outputs={"causal": replace(scored, scores=scores)})
 
 
@@ -196,6 +201,31 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) 
         assert "broken failed under seeds 3, 4, 5, 6: failed after 0 estimates: no gauge" in text
         assert "too sure of itself" in " ".join(text.split())
     assert max(map(len, comparison_text(over).splitlines())) <= 100
+
+
+def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_error(over: Comparison) -> None:
+    honest = over.rows[0].outcomes
+    claims, excesses = (1.2, 1.0, 1.1, 1.1), (0.1, 0.3, -0.1, 0.1)
+    told = [
+        _with_values(one, {"claimed_variance": claim, "excess_variance": excess})
+        for one, claim, excess in zip(honest, claims, excesses, strict=True)
+    ]
+    known = replace(over, outcomes=in_order((*told, *over.rows[2].outcomes), ("honest", "astray"), over.seeds))
+    assert "it states 1.00 ± 0.10 of its true variance" in " ".join(report_text(known, {}).split())
+    ratio = ratio_of_means((1.2, 1.0, 1.1, 1.1), (1.1, 1.3, 0.9, 1.1))
+    assert ratio is not None and ratio.value == pytest.approx(1.0)
+    assert ratio.error == pytest.approx(math.sqrt((0.1**2 + 0.3**2 + 0.2**2) / 3 / 4) / 1.1)
+
+
+def test_the_error_of_a_ratio_of_means_is_that_of_repeating_the_experiment() -> None:
+    rng = np.random.default_rng(6)
+    below = rng.uniform(0.5, 1.5, (4000, 20))
+    above = 2.0 * below + rng.normal(scale=0.3, size=below.shape)
+    found = [ratio_of_means(a, b) for a, b in zip(above.tolist(), below.tolist(), strict=True)]
+    values, errors = np.array([(one.value, one.error) for one in found if one is not None]).T
+    assert values.mean() == pytest.approx(2.0, abs=0.005)  # its standard error is 0.001
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(values.std(), rel=0.05)
+    assert ratio_of_means([1.0, None], [None, 1.0]) is None
 
 
 def test_both_figures_are_drawn(over: Comparison, tmp_path: Path) -> None:

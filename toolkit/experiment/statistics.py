@@ -90,6 +90,30 @@ def paired(one: Iterable[float | None], other: Iterable[float | None]) -> Paired
     return Paired(given.size, float(given.mean()), float(given.std(ddof=1) / np.sqrt(given.size)))
 
 
+@dataclass(frozen=True)
+class Ratio:
+    """A ratio of two means over n seeds, with its standard error."""
+
+    n: int
+    value: float
+    error: float
+
+
+def ratio_of_means(above: Iterable[float | None], below: Iterable[float | None]) -> Ratio | None:
+    """Return the mean of the first over that of the second; None with fewer than two common seeds.
+
+    Its error is that of ``above - ratio * below``, whose mean is zero (Cochran, "Sampling techniques", 1977, section
+    2.11): a mean of the seeds' own ratios would be biased.
+    """
+    common = [(a, b) for a, b in zip(above, below, strict=True) if a is not None and b is not None]
+    if len(common) < 2:
+        return None
+    over, under = np.array(common).T
+    value = over.mean() / under.mean()
+    error = np.std(over - value * under, ddof=1) / np.sqrt(len(common)) / under.mean()
+    return Ratio(len(common), float(value), float(error))
+
+
 @dataclass(frozen=True, eq=False)
 class MeanNees:
     """Pose NEES over 6 averaged over runs: at each frame (K,) the mean, the number of runs and the band for it."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.statistics import Paired, paired
+from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
@@ -247,10 +247,18 @@ def consistency_lines(comparison: Comparison) -> Iterator[str]:
             above, below = nees.too_sure_percent, 100.0 - nees.in_band_percent - nees.too_sure_percent
             how = _MARK.get(row.mark, "over the whole run no more than errors that last from frame to frame explain")
             verdict += f", above it at {above:.0f} %, below at {below:.0f} %: {how}"
+        verdict += _stated_over_true(row)
         if verdict not in given:
             given.add(verdict)
             same = sum(r.estimator == row.estimator and _equal(r, row) for r in comparison.rows) > 1
             yield verdict.format("" if same else f" {row.output}")
+
+
+def _stated_over_true(row: Row) -> str:
+    """Say how much of its true variance an output states, the bound and its excess over it, where both are known."""
+    true = [None if excess is None else 1.0 + excess for excess in row.good_values("excess_variance")]
+    found = ratio_of_means(row.good_values("claimed_variance"), true)
+    return "" if found is None else f"; it states {found.value:.2f} ± {found.error:.2f} of its true variance"
 
 
 def paired_lines(comparison: Comparison) -> Iterator[str]:
@@ -286,7 +294,8 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
 
 def _equal(one: Row, other: Row) -> bool:
     nees, others = one.mean_nees, other.mean_nees
-    return nees is not None and others is not None and nees.in_band_percent == others.in_band_percent
+    alike = nees is not None and others is not None and nees.in_band_percent == others.in_band_percent
+    return alike and _stated_over_true(one) == _stated_over_true(other)
 
 
 def truth_lines(comparison: Comparison) -> Iterator[str]:
