@@ -31,8 +31,20 @@ def test_bash_completes_commands_options_and_choices(capsys) -> None:
     assert completed(text, "report", "runs/") == []  # files, which bash itself completes
 
 
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_the_names_that_are_known_here_also_in_a_list(capsys) -> None:
+    text = script("bash", capsys)
+    assert completed(text, "compare", "--estimators", "msckf-f") == ["msckf-fej"]
+    assert completed(text, "compare", "--estimators", "ekf,msckf-s") == ["ekf,msckf-slam"]
+    assert completed(text, "compare", "fli") == ["flight", "flight-realistic"]
+    assert completed(text, "compare", "--keep", "time-off") == ["time-offset"]
+    assert completed(text, "compare", "--set", "noise.pix") == ["noise.pixel_sigma_px="]
+    assert completed(text, "evaluate", "--metric", "ate_se3_m") == ["ate_se3_m"]
+    assert completed(text, "tracks", "dri") == []  # it draws images, which no built-in sequence has
+
+
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_hear_of_every_command(shell: str, capsys) -> None:
+def test_the_scripts_of_other_shells_have_every_command(shell: str, capsys) -> None:
     text = script(shell, capsys)
     for command in ("compare", "evaluate", "diff", "verify", "cite"):
         assert command in text

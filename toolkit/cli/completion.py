@@ -1,4 +1,4 @@
-"""``vislam completion``: what a shell needs to complete commands, options and their choices."""
+"""``vislam completion``: what a shell needs to complete commands, options, their choices and the names they take."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from toolkit.cli.arguments import epilog
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from toolkit.cli.arguments import Subcommands
 
@@ -16,7 +16,7 @@ _SHELLS = ("bash", "zsh", "fish")
 
 
 class _Option(NamedTuple):
-    """The words of an option, what it is for, what may follow it, and whether a value does."""
+    """The words of an option, what it is for, which words may follow it, and whether a value does."""
 
     words: tuple[str, ...]
     help: str
@@ -37,7 +37,8 @@ def add_to(subcommands: Subcommands) -> None:
     parser = subcommands.add_parser(
         "completion",
         help="print what a shell needs to complete vislam's words",
-        description="Print a script that completes commands, options and their choices. bash and zsh: put "
+        description="Print a script that completes commands, options, their choices, and the names of estimators, "
+        "built-in sequences, metrics, faults and settings that are installed now. bash and zsh: put "
         'eval "$(vislam completion bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as '
         "~/.config/fish/completions/vislam.fish.",
         epilog=epilog("vislam completion bash"),
@@ -50,22 +51,40 @@ def command(options: argparse.Namespace) -> int:
     """Print the script."""
     from toolkit.cli import parser
 
-    commands = list(_commands(parser()))
+    commands = list(_commands(parser(), _known_names()))
     print({"bash": _bash, "zsh": _zsh, "fish": _fish}[options.shell](commands), end="")
     return 0
 
 
-def _commands(root: argparse.ArgumentParser) -> Iterator[_Command]:
+def _known_names() -> dict[str, tuple[str, ...]]:
+    """Return the names that arguments take without having them as choices, by the argument's destination."""
+    from toolkit import datasets, metrics
+    from toolkit.audit import faults
+    from toolkit.estimator import discover
+    from toolkit.settings import describe
+
+    return {
+        "estimators": tuple(discover()),
+        "sequence": datasets.built_in_names(),
+        "sequences": datasets.built_in_names(),
+        "columns": ("all", *metrics.describe()),
+        "metric": tuple(metrics.describe()),
+        "keep": tuple(faults()),
+        "set": tuple(f"{one.key}=" for one in describe()),
+    }
+
+
+def _commands(root: argparse.ArgumentParser, known: Mapping[str, tuple[str, ...]]) -> Iterator[_Command]:
     for action in root._actions:
         if isinstance(action, argparse._SubParsersAction):
             helps = {one.dest: one.help or "" for one in action._choices_actions}
             for name, parser in action.choices.items():
-                yield _Command(name, helps.get(name, ""), tuple(_options(parser)))
+                yield _Command(name, helps.get(name, ""), tuple(_options(parser, known)))
 
 
-def _options(parser: argparse.ArgumentParser) -> Iterator[_Option]:
+def _options(parser: argparse.ArgumentParser, known: Mapping[str, tuple[str, ...]]) -> Iterator[_Option]:
     for action in parser._actions:
-        choices = tuple(map(str, action.choices or ()))
+        choices = tuple(map(str, action.choices or known.get(action.dest, ())))
         # Positional choices are offered where no option is under way.
         yield _Option(tuple(action.option_strings), action.help or "", choices, action.nargs != 0)
 
@@ -75,7 +94,7 @@ def _bash(commands: list[_Command]) -> str:
     names = " ".join(one.name for one in commands)
     return f"""# Completion of vislam for bash. Load it with: eval "$(vislam completion bash)"
 _vislam() {{
-  local word="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}" words="" chosen=""
+  local word="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}" words="" chosen="" listed=""
   if [ "$COMP_CWORD" -eq 1 ]; then
     COMPREPLY=($(compgen -W "{names} --help --version" -- "$word"))
     return
@@ -83,7 +102,9 @@ _vislam() {{
   case "${{COMP_WORDS[1]}}" in
 {cases}  esac
   if [ -n "$chosen" ]; then
-    COMPREPLY=($(compgen -W "$chosen" -- "$word"))
+    [[ "$word" == *,* ]] && listed="${{word%,*}},"
+    COMPREPLY=($(compgen -P "$listed" -W "$chosen" -- "${{word##*,}}"))
+    [[ "${{COMPREPLY[0]-}}" == *= ]] && compopt -o nospace 2>/dev/null
   else
     COMPREPLY=($(compgen -W "$words" -- "$word"))
   fi

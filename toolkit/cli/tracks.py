@@ -23,7 +23,7 @@ def add_to(subcommands: Subcommands) -> None:
         "and right image side by side, a circle a track, blue where it is new, red where it is old.",
         epilog=epilog("vislam tracks kitti/sequences/06 --out stills --count 4"),
     )
-    parser.add_argument("sequence", metavar="SEQUENCE", help="a folder with images, as EuRoC's or KITTI's, or a bag")
+    parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--count", metavar="N", type=at_least(1), default=10, help="how many stills (default: 10)")
@@ -47,14 +47,14 @@ def command(options: argparse.Namespace) -> int:
     if options.topics is not None:
         frontend = msgspec.structs.replace(frontend, topics=options.topics)
     check_parent(options.out.parent)
-    recording = load_images(options.sequence, frontend)
-    with of_this_process()(options.sequence) as progress:
+    recording = load_images(options.images, frontend)
+    with of_this_process()(options.images) as progress:
         tracks = track_images(recording.pairs, recording.rig, frontend, progress)
         if options.video:
             names = write_video(recording, tracks, options.out, progress)
         else:
             names = write_stills(recording, tracks, options.out, options.count, progress)
-    print(f"{printable(options.sequence)}: {_summary(tracks)}")
+    print(f"{printable(options.images)}: {_summary(tracks)}")
     for skipped in tracks.skipped:
         print(f"left out: {printable(skipped)}")
     print(f"{printable(str(options.out))}: {', '.join(names)}")

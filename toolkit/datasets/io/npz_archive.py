@@ -8,6 +8,7 @@ import math
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -90,6 +91,9 @@ def opened(path: Path) -> Iterator[NpzArchive]:
     """Open an archive; damage met while it is open is raised as DataError."""
     try:
         with open_input(path) as file, zipfile.ZipFile(file) as archive:
+            twice = [key for key, times in Counter(_keys(archive)).items() if times > 1]
+            if twice:
+                raise DataError(f"{path}: {twice[0]} is in the archive twice; save it with one array of that name")
             yield NpzArchive(path, archive)
     except (OSError, *_DAMAGE) as error:
         raise DataError(f"{path}: damaged or truncated npz ({_first_line(error)}); copy or save it again") from error
