@@ -34,8 +34,10 @@ _OF_NEES = (
 )
 _OF_NIS = (
     "Innovations of each frame, squared, over what the estimator's own covariances let expect of them behind its gate "
-    "(NIS). It needs no truth. Above the band (grey, 95 %; how many are in it stands above each panel) the "
-    "measurements surprise the estimator more than they should."
+    "(NIS). It needs no truth. The band (grey) holds 95 % of independent innovations without a gate; how many frames "
+    "are in it stands above each panel. A gate makes them scatter less, the error of the pose that they share more: "
+    "of the joint filters' frames on the simulated drive and flight 85 to 100 % are in it. A long stay above it is of "
+    "measurements that surprise the estimator more than they should."
 )
 
 
