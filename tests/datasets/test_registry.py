@@ -95,6 +95,17 @@ def test_an_unknown_source_names_the_built_ins() -> None:
         load_sequence("no-such-drive")
 
 
+def test_a_path_that_is_not_there_is_answered_with_what_is(tmp_path: Path) -> None:
+    for name in ("drive_10.npz", "drive_12.npz"):
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"no such file or directory; did you mean drive_12\.npz\?"):
+        load_sequence(tmp_path / "drive12.npz")
+    with pytest.raises(DataError, match=r"directory; .* has drive_10\.npz, drive_12\.npz"):
+        load_sequence(tmp_path / "utias")
+    with pytest.raises(DataError, match=r"there is no folder .*recordings"):
+        load_sequence(tmp_path / "recordings" / "drive.npz")
+
+
 @pytest.mark.parametrize("content", [b"", b"P", b"PK\x03\x04", b"hello world", bytes(1000)])
 def test_unknown_content_names_the_formats(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "03.npz"

@@ -27,6 +27,9 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, check_stated
 from toolkit.settings import DEFAULTS, Frontend, Tracks
 
+# So many names of a folder are shown to somebody who asked for one that is not in it.
+_SHOWN = 8
+
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
 
@@ -252,6 +255,20 @@ def _check_readable(path: Path, source: str) -> None:
     except DataError as error:
         if not isinstance(error.__cause__, FileNotFoundError):
             raise
-        names = built_in_names()
-        near = did_you_mean(source, names) or f", and the built-in sequences are {', '.join(names)}"
-        raise DataError(f"{source}: no such file or directory{near}") from error
+        raise DataError(f"{source}: no such file or directory{_nearest_source(path, source)}") from error
+
+
+def _nearest_source(path: Path, source: str) -> str:
+    """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
+    if path.parent != Path():
+        if not path.parent.is_dir():
+            return f"; there is no folder {path.parent}"
+        beside = [inside.name for inside in path.parent.iterdir()]
+        return did_you_mean(path.name, beside) or f"; {path.parent} has {_some(beside)}"
+    names = built_in_names()
+    return did_you_mean(source, names) or f", and the built-in sequences are {', '.join(names)}"
+
+
+def _some(names: list[str]) -> str:
+    shown = sorted(names)[:_SHOWN]
+    return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"
