@@ -6,6 +6,7 @@ from functools import cached_property
 
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
+from toolkit.audit.parts.one_step import OneStep, one_step
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -67,6 +68,11 @@ class Evidence:
     def camera_motion(self) -> CameraMotion:
         """The camera's own motion over each interval, from the stereo tracks alone."""
         return camera_motion(self.sequence)
+
+    @cached_property
+    def one_step(self) -> OneStep:
+        """What each sighting makes of the next one of its track, by the camera's own motion."""
+        return one_step(self.sequence, self.camera_motion)
 
     @cached_property
     def blind(self) -> Undecided:

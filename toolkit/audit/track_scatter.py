@@ -8,13 +8,10 @@ three degrees of freedom where R is right; the few grossest do not move it. Ever
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, moved_by
+from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.audit.parts.robust import jackknife_error
-from toolkit.geometry import Array, se3_inverse, transform
-from toolkit.models.camera_motion import CameraMotion, usable_pairs
-from toolkit.models.gating import LEAST_DEPTH_M
-from toolkit.models.stereo import project, projection_jacobian, triangulate
-from toolkit.sequence import Sequence
+from toolkit.geometry import Array
+from toolkit.models.gating import mahalanobis_squared
 
 # Standard deviations over the stated ones. 21 sound simulated recordings have 0.98 to 1.00 and real ones, whose noise
 # is assumed, at most 0.62; a tenth of mismatches makes 1.04 to 1.07, three tenths 1.20 to 1.46.
@@ -28,7 +25,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     sequence = evidence.sequence
     if evidence.spoilt_by or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return evidence.blind
-    chi2 = own_one_step_chi2(sequence, evidence.camera_motion)
+    steps = evidence.one_step
+    chi2 = mahalanobis_squared(steps.residual_px, steps.cov_px2)
     scatter, error = _scatter(chi2), jackknife_error(_scatter, chi2)
     if scatter < MOST_SCATTER + SIGMAS * error:
         return None
@@ -44,24 +42,6 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         harmful=False,
         warns=True,
     )
-
-
-def own_one_step_chi2(sequence: Sequence, camera: CameraMotion) -> Array:
-    """Return the squared Mahalanobis distances (P,) of sightings from what the frame before makes of them, in time.
-
-    Points move by the camera's own motion; only intervals in which that is known.
-    """
-    pairs, uv_px, rig = usable_pairs(sequence), sequence.observations.uv_px, sequence.rig
-    pairs = pairs.select(camera.known[pairs.interval])
-    T_after_before = se3_inverse(moved_by(camera, sequence))[pairs.interval]
-    before = triangulate(uv_px[pairs.before], rig)
-    after = transform(T_after_before, before)
-    after[:, 2] = np.maximum(after[:, 2], LEAST_DEPTH_M)
-    residual_px = uv_px[pairs.after] - project(after, rig)
-    d_after_d_before = T_after_before[:, :3, :3] @ np.linalg.inv(projection_jacobian(before, rig))
-    jacobian = projection_jacobian(after, rig) @ d_after_d_before
-    cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
-    return np.asarray((residual_px * np.linalg.solve(cov_px2, residual_px[:, :, None])[..., 0]).sum(axis=1))
 
 
 def _scatter(chi2: Array) -> float:

@@ -1,0 +1,53 @@
+"""Tracks whose errors are not each by itself: the correlation of neighbouring steps is the one that theory gives."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.audit.fault import Evidence
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, simulate, track_faults
+from toolkit.simulation.sensors import with_track_noise
+from toolkit.track_noise import CHANNELS, TrackNoise
+
+
+@pytest.fixture(scope="module")
+def flight() -> Sequence:
+    return simulate(replace(SCENARIOS["flight"], duration_s=4.0), 3)
+
+
+def told(sequence: Sequence) -> list[str]:
+    return [finding.detail for finding in audit(sequence).findings if finding.fault == "correlated-tracks"]
+
+
+@pytest.mark.parametrize("walk_px", [0.0, 1.0, 4.0])
+def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk(
+    flight: Sequence, walk_px: float
+) -> None:
+    from toolkit.audit.correlated_tracks import _correlation, _neighbouring_residuals
+
+    # No walk of the disparity: what that does to the depth, and so to later steps, theory leaves out.
+    walk = TrackNoise(np.zeros(3), walk_px * np.array([1.0, 0.0, 1.0]), np.zeros(3))
+    observations = with_track_noise(flight.observations, walk, np.random.default_rng(3))
+    sequence = replace(flight, observations=observations)
+    to_pixels = np.linalg.inv(CHANNELS)
+    walk_px2 = to_pixels @ np.diag(walk.walk_px**2) @ to_pixels.T  # of (uL, uR, v)
+    expected = -1.0 / (2.0 + np.trace(np.linalg.solve(sequence.rig.cov_uv_px2, walk_px2)) / 3.0)
+    # The camera's motion is fitted to the tracks and takes some of it: 0.04 at most under three seeds.
+    assert _correlation(*_neighbouring_residuals(Evidence(sequence))) == pytest.approx(expected, abs=0.06)
+
+
+def test_tracks_with_a_walk_or_an_offset_of_their_own_are_told_and_white_ones_are_not(flight: Sequence) -> None:
+    drive = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3)
+    assert told(flight) == told(drive) == []
+    assert "each errs by itself" in told(track_faults.track_walk(flight, 4.0, 3))[0]
+    assert "noise.tracks=fitted" in told(track_faults.match_offset(drive, 3.0, 3))[0]
+
+
+def test_tracks_without_errors_and_tracks_whose_noise_is_stated_are_left_alone(flight: Sequence) -> None:
+    noise = SCENARIOS["flight-realistic"].track_noise
+    wandering = track_faults.track_walk(flight, 4.0, 3)
+    assert told(replace(wandering, rig=replace(wandering.rig, track_noise=noise))) == []
+    assert told(simulate(replace(SCENARIOS["flight"], duration_s=4.0, noise_scale=0.0), 3)) == []
