@@ -11,6 +11,7 @@ from toolkit.experiment import Plan
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
+from toolkit.simulation import SCENARIOS, faults, simulate
 
 
 def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
@@ -26,6 +27,14 @@ def test_without_settings_the_noise_is_the_recordings(source: str) -> None:
     cov_uv_px2, noise = told(source)
     np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
     assert noise == recorded.noise
+
+
+def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results() -> None:
+    slipping = faults.disturbed_motion(simulate(replace(SCENARIOS["drive"], duration_s=12.0), 0), 2.0)  # at 5 to 10 s
+    for part, concerned in ((Part(), True), (Part(to_s=4.0), False), (Part(from_s=9.0), True)):
+        (conflict,) = (f for f in prepare(Recording(slipping, part=part)).findings if f.fault == "conflict")
+        assert conflict.warning is concerned
+        assert ("none of it is in the part that is run" in conflict.detail) is not concerned
 
 
 def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion() -> None:

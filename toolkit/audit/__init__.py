@@ -70,7 +70,7 @@ def _finding(fault: Fault, symptom: Symptom, before: Sequence, repaired: bool) -
     if lost > MOST_LOST:
         detail += f"; it takes {lost:.0%} of the sightings, with which the recording is another one"
     blocking = symptom.harmful and (not repaired or lost > MOST_LOST)
-    return Finding(fault.name, symptom.count, repaired, detail, blocking, symptom.warns)
+    return Finding(fault.name, symptom.count, repaired, detail, blocking, symptom.warns, symptom.spans_ns)
 
 
 def _share_lost(before: Sequence, after: Sequence) -> float:

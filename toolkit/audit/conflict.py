@@ -8,6 +8,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.deviations import Deviation, Span, deviations, sustained
+from toolkit.resampling import NS_PER_S
 
 # A mean counts from so many of its standard deviations on; the largest of a sound recording has 3 to 9.
 SIGMAS = 10.0
@@ -36,11 +37,16 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         remedy=None,
         harmful=False,
         warns=True,
+        spans_ns=tuple(_in_ns(span, int(sequence.frames_t_ns[0])) for _, span in found),
     )
 
 
 def _begin(one: tuple[Deviation, Span]) -> float:
     return one[1].begin_s
+
+
+def _in_ns(span: Span, first_ns: int) -> tuple[int, int]:
+    return first_ns + round(span.begin_s * NS_PER_S), first_ns + round(span.end_s * NS_PER_S)
 
 
 def _in_words(deviation: Deviation, span: Span) -> str:

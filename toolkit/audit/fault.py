@@ -17,7 +17,8 @@ class Finding:
 
     ``count`` is in the fault's own unit (rows, frames, stamps, axes), named in ``detail``; ``blocking`` means
     that the fault is harmful and still there, so that a check of the recording has to fail. A ``warning`` has no
-    repair and does not block, but every result has to be read with it in mind.
+    repair and does not block, but every result has to be read with it in mind. ``spans_ns`` are the times at which
+    the fault is there, none for all of them.
     """
 
     fault: str
@@ -26,6 +27,7 @@ class Finding:
     detail: str
     blocking: bool
     warning: bool = False
+    spans_ns: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +36,8 @@ class Symptom:
 
     ``remedy`` is None where there is nothing to repair or no sound way to; ``treatment`` describes what
     the remedy does (or why there is none). A symptom that is not ``harmful`` is information and never blocks. One
-    that ``warns`` does not block either, but may spoil results. One that ``spoils_vision`` and is not repaired leaves
-    nothing to conclude from the tracks.
+    that ``warns`` does not block either, but may spoil results: all of them, or those of its ``spans_ns``. One that
+    ``spoils_vision`` and is not repaired leaves nothing to conclude from the tracks.
     """
 
     count: int
@@ -45,6 +47,7 @@ class Symptom:
     harmful: bool = True
     warns: bool = False
     spoils_vision: bool = False
+    spans_ns: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ def check(evidence: Evidence) -> Symptom | None:
         remedy=None,
         harmful=False,
         warns=True,
+        spans_ns=tuple((int(sequence.frames_t_ns[begin]), int(sequence.frames_t_ns[end])) for begin, end in spans),
     )
 
 

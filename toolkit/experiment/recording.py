@@ -106,7 +106,16 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
         sequence = _within_budget(_cut(whole, recording), recording.tracks.budget)
-        return Prepared(sequence, audited.findings, STARTS[recording.start](sequence), whole, audited.undecided, card)
+        findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
+        return Prepared(sequence, findings, STARTS[recording.start](sequence), whole, audited.undecided, card)
+
+
+def _of_part(finding: Finding, sequence: Sequence) -> Finding:
+    """Return a finding as it concerns the part that is run: a warning of other times is none of its results."""
+    first_ns, last_ns = sequence.frames_t_ns[[0, -1]].tolist()
+    if not finding.spans_ns or any(begin <= last_ns and end >= first_ns for begin, end in finding.spans_ns):
+        return finding
+    return replace(finding, warning=False, detail=f"{finding.detail}; none of it is in the part that is run")
 
 
 def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:
