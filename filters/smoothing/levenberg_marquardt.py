@@ -1,25 +1,40 @@
-"""GTSAM's Levenberg-Marquardt, one iteration at a time, with the ways a solve can go wrong checked.
+"""Levenberg-Marquardt, one iteration at a time, with the ways a solve can go wrong checked.
 
 GTSAM's optimizer returns unchanged values without a message when an error is not a number, so the error is looked at
 first. And it hands a Python factor a copy of all values at each call, which makes a thousand twist factors take ten
 times as long as sixty thousand stereo factors: each takes part by its linearisation at the values of the iteration,
 and its own error at the end of a step says whether the step is taken. The damping is Levenberg's multiple of the
 identity: a tenth of it after a step that lowered the error, ten times as much after one that did not.
+
+Where sightings are beside the graph, their landmarks alone are damped
+(:mod:`filters.smoothing.landmark_steps`); the rest, in Levenberg's way, only where that does not help. Such a solve has
+converged when a step gains little that was neither damped much nor shortened much.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from functools import partial
+from typing import NamedTuple, Protocol, TypeVar
 
 import gtsam
 import numpy as np
 
 from filters.smoothing.cached_linearisation import CachedLinearisation, cached_linearisations, with_linearisations
+from filters.smoothing.indeterminate import variable_named
+from filters.smoothing.landmark_steps import LandmarkSteps
 from toolkit.errors import EstimatorError
+from toolkit.models.factors import kind_of
 from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
 # Half a sum of squares of standard deviations: exact measurements have next to none, of which no share is little.
 _LEAST_DECREASE = 1e-12
+# Shares of landmarks' own information. Beyond the last all else is damped too: by then landmarks are held, nearly.
+_FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
+# A step that keeps less than this of what the linear system promises is shortened.
+_KEPT = 0.5
+# One that gains little under more damping than this, or shortened to less, is not the last.
+_FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,9 @@ class Beside(Protocol):
 
     def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return linear factors about the values."""
+
+    def landmark_steps(self, values: gtsam.Values) -> LandmarkSteps:
+        """Return how its landmarks step from some values."""
 
 
 class Solution(NamedTuple):
@@ -66,43 +84,104 @@ def solve(
     error = graph.error(start) + (0.0 if beside is None else beside.error(start))
     if not np.isfinite(error):
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
-    solver = _Solver(graph, start, beside)
-    here = solver.at(start, error, _FIRST_DAMPING)
+    advance = partial(progress.advance, total=stopping.max_iterations, stage=stage)
+    if beside is None:
+        return _solved(_GraphSolver(graph, start), start, error, stopping, advance)
+    return _solved(_LandmarkSolver(graph, start, beside), start, error, stopping, advance)
+
+
+class _Reached(Protocol):
+    """Where a solve has come to: its error, and whether damping kept its last step short."""
+
+    @property
+    def error(self) -> float: ...
+    @property
+    def held_back(self) -> bool: ...
+    def values(self) -> gtsam.Values: ...
+
+
+Reached = TypeVar("Reached", bound=_Reached)
+
+
+class _Solver(Protocol[Reached]):
+    """Takes the steps of one solve."""
+
+    def started(self, values: gtsam.Values, error: float) -> Reached:
+        """Return where the solve begins."""
+
+    def advanced(self, here: Reached) -> Reached:
+        """Return where the next step that lowers the error leads; the same place, where none does."""
+
+
+def _solved(
+    solver: _Solver[Reached],
+    start: gtsam.Values,
+    error: float,
+    stopping: Stopping,
+    advance: Callable[[int], None],
+) -> Solution:
+    here = solver.started(start, error)
     for iteration in range(1, stopping.max_iterations + 1):
-        progress.advance(iteration - 1, stopping.max_iterations, stage)
+        advance(iteration - 1)
         before, here = here.error, solver.advanced(here)
-        if before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease):
+        little = before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease)
+        if little and not here.held_back:
             return Solution(here.values(), here.error, iteration, converged=True)
     return Solution(here.values(), here.error, stopping.max_iterations, converged=False)
 
 
-class _Reached(NamedTuple):
+class _MixedGraph:
+    """A graph of GTSAM's own factors and of Python's, which are linearised and evaluated one by one."""
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> None:
+        self._graph, self._native = graph, gtsam.NonlinearFactorGraph(graph)
+        self._python = {place: old.factor for place, old in cached_linearisations(graph, start.extract).items()}
+        for place in self._python:
+            self._native.remove(place)
+
+    @property
+    def has_python(self) -> bool:
+        """Say whether there are factors of Python's."""
+        return bool(self._python)
+
+    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
+        """Return the graph, its Python factors linearised about some values."""
+        cached = {place: CachedLinearisation(f, values.extract(f.keys())) for place, f in self._python.items()}
+        return with_linearisations(self._graph, cached) if cached else self._graph
+
+    def error(self, values: gtsam.Values) -> float:
+        """Return half the sum of squares, or of losses."""
+        own = sum(factor.error(values.extract(factor.keys())) for factor in self._python.values())
+        return self._native.error(values) + own
+
+
+class _OfGtsam(NamedTuple):
     """Where a solve has come to: GTSAM's optimizer, which has the values and the damping, and their error."""
 
     optimizer: gtsam.LevenbergMarquardtOptimizer
     error: float
+    held_back: bool = False
 
     def values(self) -> gtsam.Values:
         """Return a copy: GTSAM hands out its own, which do not outlive the next iteration."""
         return gtsam.Values(self.optimizer.values())
 
 
-class _Solver:
-    """Takes the steps of one solve."""
+class _GraphSolver:
+    """Takes the steps of a solve of factors alone, each by GTSAM's optimizer."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, beside: Beside | None) -> None:
-        self._graph, self._native, self._beside = graph, gtsam.NonlinearFactorGraph(graph), beside
-        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(_together(graph, beside, start))
-        self._python = {place: old.factor for place, old in cached_linearisations(graph, start.extract).items()}
-        for place in self._python:
-            self._native.remove(place)
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> None:
+        self._graph = _MixedGraph(graph, start)
+        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
 
-    def at(self, values: gtsam.Values, error: float, damping: float) -> _Reached:
+    def started(self, values: gtsam.Values, error: float) -> _OfGtsam:
+        """Return where the solve begins."""
+        return self._at(values, error, _FIRST_DAMPING)
+
+    def _at(self, values: gtsam.Values, error: float, damping: float) -> _OfGtsam:
         """Return an optimizer that goes on from some values, the Python factors linearised there."""
-        cached = {place: CachedLinearisation(f, values.extract(f.keys())) for place, f in self._python.items()}
-        linearised = with_linearisations(self._graph, cached) if cached else self._graph
-        linearised = _together(linearised, self._beside, values)
-        return _Reached(gtsam.LevenbergMarquardtOptimizer(linearised, values, self._params(damping)), error)
+        linearised = self._graph.linearised(values)
+        return _OfGtsam(gtsam.LevenbergMarquardtOptimizer(linearised, values, self._params(damping)), error)
 
     def _params(self, damping: float) -> gtsam.LevenbergMarquardtParams:
         params = gtsam.LevenbergMarquardtParams()
@@ -114,34 +193,111 @@ class _Solver:
         params.setlambdaFactor(_DAMPING_FACTOR)
         return params
 
-    def advanced(self, here: _Reached) -> _Reached:
+    def advanced(self, here: _OfGtsam) -> _OfGtsam:
         """Return where the next step that lowers the error leads; the same place, where none does."""
-        if not self._python and self._beside is None:
+        if not self._graph.has_python:
             here.optimizer.iterate()
-            return _Reached(here.optimizer, here.optimizer.error())
+            return _OfGtsam(here.optimizer, here.optimizer.error())
         values, tried = here.values(), here.optimizer.lambda_()
         while tried < _MOST_DAMPING:
             here.optimizer.iterate()
             moved = here.values()
-            error = self._error(moved)
+            error = self._graph.error(moved)
             if error <= here.error:
-                return self.at(moved, error, here.optimizer.lambda_())
+                return self._at(moved, error, here.optimizer.lambda_())
             # The linearisations promised more than their factors keep: from here again, in shorter steps.
             tried = _DAMPING_FACTOR * max(tried, _FIRST_DAMPING)
-            here = self.at(values, here.error, tried)
+            here = self._at(values, here.error, tried)
         return here
 
-    def _error(self, values: gtsam.Values) -> float:
-        own = sum(factor.error(values.extract(factor.keys())) for factor in self._python.values())
-        beside = 0.0 if self._beside is None else self._beside.error(values)
-        return self._native.error(values) + own + beside
+
+class _WithLandmarks(NamedTuple):
+    """Where a solve has come to, its error, the share its next step is damped by, and whether the last was short."""
+
+    reached: gtsam.Values
+    error: float
+    share: float
+    held_back: bool
+
+    def values(self) -> gtsam.Values:
+        """Return the values."""
+        return self.reached
 
 
-def _together(
-    graph: gtsam.NonlinearFactorGraph, beside: Beside | None, values: gtsam.Values
-) -> gtsam.NonlinearFactorGraph:
-    if beside is None:
-        return graph
-    whole = gtsam.NonlinearFactorGraph(graph)
-    whole.push_back(beside.linearised(values))
-    return whole
+class _LandmarkSolver:
+    """Takes the steps of a solve with sightings beside the graph, of which the landmarks alone are damped."""
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, beside: Beside) -> None:
+        self._graph, self._beside = _MixedGraph(graph, start), beside
+        self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
+
+    def started(self, values: gtsam.Values, error: float) -> _WithLandmarks:
+        """Return where the solve begins."""
+        return _WithLandmarks(values, error, _FIRST_SHARE, held_back=False)
+
+    def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
+        return _joined(self._graph.linearised(values).linearize(values), steps.sightings)
+
+    def advanced(self, here: _WithLandmarks) -> _WithLandmarks:
+        """Return where the next step that lowers the error leads; the same place, where none does."""
+        steps = self._beside.landmark_steps(here.reached)
+        linear = self._linear(here.reached, steps)
+        share = here.share
+        while share < _MOST_DAMPING:
+            there = self._tried(here, steps, linear, share)
+            if there is not None:
+                return there
+            share *= _DAMPING_FACTOR
+        return here._replace(held_back=False)
+
+    def _tried(
+        self, here: _WithLandmarks, steps: LandmarkSteps, linear: gtsam.GaussianFactorGraph, share: float
+    ) -> _WithLandmarks | None:
+        """Return where a step damped by a share leads, in full or in part; nothing where that has a larger error."""
+        step = self._step(linear, steps, share)
+        if step is None:
+            return None
+        promised = here.error - linear.error(step)
+        there = self._at(steps, step, share)
+        if here.error - there.error < _KEPT * promised:
+            # As long as a parabola says with the slope promised and the error found: far residuals bend the valley.
+            part = promised / (2.0 * promised - (here.error - there.error))
+            shorter = self._at(steps, step.scale(part), share, held_back=part < _LEAST_PART)
+            there = shorter if shorter.error < there.error or np.isnan(there.error) else there
+        return there if there.error <= here.error else None
+
+    def _at(
+        self, steps: LandmarkSteps, step: gtsam.VectorValues, share: float, held_back: bool = False
+    ) -> _WithLandmarks:
+        there = steps.taken(step)
+        error = self._graph.error(there) + self._beside.error(there)
+        next_share = max(share / _DAMPING_FACTOR, _LEAST_SHARE)
+        return _WithLandmarks(there, error, next_share, held_back or share > _FREE_SHARE)
+
+    def _step(self, linear: gtsam.GaussianFactorGraph, steps: LandmarkSteps, share: float) -> gtsam.VectorValues | None:
+        """Return the damped step; none where the linear system does not determine it."""
+        damped = _joined(linear, steps.damping(share))
+        if share > _LANDMARKS_ALONE:
+            damped.push_back(_held(steps.values, share))
+        try:
+            return damped.eliminateSequential(self._ordering).optimize()
+        except RuntimeError as refusal:
+            variable_named(refusal)
+            return None
+
+
+def _joined(one: gtsam.GaussianFactorGraph, other: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
+    both = gtsam.GaussianFactorGraph()
+    both.push_back(one)
+    both.push_back(other)
+    return both
+
+
+def _held(values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
+    """Return factors that hold all but the landmarks where they are."""
+    graph = gtsam.GaussianFactorGraph()
+    for key, size in values.dims().items():
+        if kind_of(key) != "l":
+            unit = gtsam.noiseModel.Unit.Create(size)
+            graph.add(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(size), np.zeros(size), unit))
+    return graph

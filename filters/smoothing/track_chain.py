@@ -7,7 +7,7 @@ of all disparities is a variable of every sighting where the values have one, wh
 sightings that err each by itself are then chains without memory.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain as chain_of
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 
+from filters.smoothing.landmark_steps import LandmarksSeen, LandmarkSteps
 from filters.smoothing.robust_loss import Huber, Loss, Squares
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only, stereo
@@ -229,6 +230,23 @@ class ChainedFactors:
         linear = self.linear(values, jacobians_at)
         return self.factors(linear, values, self.sightings.counted, self._to_scale(values))
 
+    def landmark_steps(self, values: gtsam.Values) -> LandmarkSteps:
+        """Return the innovations that count as they take part in a step from the values, weighed as the loss does."""
+        seen, linear = self.sightings, self.linear(values)
+        _, begins = np.unique(seen.point, return_index=True)
+        landmarks = LandmarksSeen.at(values, seen.track_ids, seen.pose[begins], self.rig)
+        in_image = linear.point @ np.linalg.inv(landmarks.by_point)[seen.point]
+        roots = np.sqrt(self.weights(linear.innovation))
+        linear = linear._replace(point=in_image).scaled(roots)
+        squares = np.square(linear.point).sum(axis=1)
+        information = [np.bincount(seen.point, seen.counted * column, seen.track_ids.size) for column in squares.T]
+        graph = gtsam.GaussianFactorGraph()
+        to_scale = self._to_scale(values)
+        scaled = None if to_scale is None else roots[:, None, None] * to_scale
+        for factor in self._terms(linear, seen.counted, scaled):
+            graph.add(factor)
+        return LandmarkSteps(values, landmarks, graph, np.column_stack(information), self.rig)
+
     def innovations(self, values: gtsam.Values) -> Array:
         """Return what is new in each sighting (N, 3), in sigmas."""
         return self._innovations(self.predicted(values))
@@ -275,10 +293,19 @@ class ChainedFactors:
 
         ``to_scale`` (N, 3, 1) is how they change with a scale of disparities among the values.
         """
-        seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
-        graph = gtsam.NonlinearFactorGraph()
         roots = np.sqrt(self.weights(linear.innovation))
-        innovation, own, before, points = linear.scaled(roots)
+        graph = gtsam.NonlinearFactorGraph()
+        scaled = None if to_scale is None else roots[:, None, None] * to_scale
+        for factor in self._terms(linear.scaled(roots), rows, scaled):
+            graph.add(gtsam.LinearContainerFactor(factor, values))
+        return graph
+
+    def _terms(
+        self, linear: "LinearInnovations", rows: BoolArray, to_scale: Array | None
+    ) -> Iterator[gtsam.JacobianFactor]:
+        """Yield innovations of a mask (N,) as linear factors."""
+        seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
+        innovation, own, before, points = linear
         poses, landmarks = [X(k) for k in seen.pose.tolist()], [L(i) for i in seen.track_ids[seen.point].tolist()]
         previous = seen.chain.before.tolist()
         for row in np.flatnonzero(rows).tolist():
@@ -286,9 +313,8 @@ class ChainedFactors:
             if previous[row] >= 0:
                 terms.insert(0, (poses[previous[row]], before[row]))
             if to_scale is not None:
-                terms.append((SCALE, roots[row] * to_scale[row]))
-            graph.add(gtsam.LinearContainerFactor(_linear(terms, innovation[row], unit), values))
-        return graph
+                terms.append((SCALE, to_scale[row]))
+            yield _linear(terms, innovation[row], unit)
 
 
 class LinearInnovations(NamedTuple):

@@ -1,0 +1,102 @@
+"""Steps of landmarks, damped and taken in the image of the camera that saw each of them first.
+
+A far landmark's depth depends on what is measured in such a curved way that a step in metres overshoots, where its
+disparity is nearly linear (Civera, Davison & Montiel 2008, "Inverse depth parametrization for monocular SLAM"). One
+such landmark has Levenberg's damping grow, and with it all poses held: in the directions that tracks and motion say
+least of, the scale of the world and the way it drifts, a solve then creeps. So landmarks alone are damped, each by a
+share of what the sightings say of its own column, disparity and row (Marquardt 1963, "An algorithm for least-squares
+estimation of nonlinear parameters"), and they move by these.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from toolkit.geometry import Array, IntArray
+from toolkit.models import stereo
+from toolkit.models.correlated_noise import in_channels
+from toolkit.models.factors import L, X
+from toolkit.sequence import StereoRig
+from toolkit.track_noise import CHANNELS
+
+_FROM_CHANNELS = np.linalg.inv(CHANNELS)
+# The logarithm of the depth grows by this much in a step at most: disparities stay positive.
+_MOST_FARTHER = 2.0
+_SMALL_DISPARITY_PX = 1.0
+# px^-2: what is said of a landmark that no sighting says anything of.
+_LEAST_INFORMATION = 1e-6
+
+
+class LandmarksSeen(NamedTuple):
+    """Each of M landmarks L(track id) in the frame (M,) that saw it first.
+
+    ``image`` (M, 3) is its (c, d, v) px there, ``by_pose`` (M, 3, 6) and ``by_point`` (M, 3, 3) how that changes.
+    """
+
+    track_ids: IntArray
+    first: IntArray
+    image: Array
+    by_pose: Array
+    by_point: Array
+
+    @classmethod
+    def at(cls, values: gtsam.Values, track_ids: IntArray, first: IntArray, rig: StereoRig) -> "LandmarksSeen":
+        """Return what the values say of landmarks (M,) and of the frames (M,) that saw them first."""
+        points = np.array([values.atPoint3(L(i)) for i in track_ids.tolist()]).reshape(-1, 3)
+        seen = stereo.predict(points, _poses(values, first), rig)
+        by_pose, by_point = (in_channels(CHANNELS, slope) for slope in (seen.d_uv_d_pose, seen.d_uv_d_point))
+        return cls(track_ids, first, seen.uv_px @ CHANNELS.T, by_pose, by_point)
+
+    def moved(self, values: gtsam.Values, step: gtsam.VectorValues, rig: StereoRig) -> gtsam.Values:
+        """Return the values a step on; what it has for a landmark is the change of (c, d, v) px with the point."""
+        change = np.array([step.at(L(i)) for i in self.track_ids.tolist()]).reshape(-1, 3)
+        of_poses = np.array([step.at(X(k)) for k in self.first.tolist()]).reshape(-1, 6)
+        change = change + np.einsum("mij,mj->mi", self.by_pose, of_poses)
+        image, farther = self.image + change, np.clip(-change[:, 1] / self.image[:, 1], 0.0, _MOST_FARTHER)
+        image[:, 1] = np.where(farther > 0.0, self.image[:, 1] * np.exp(-farther), image[:, 1])
+        there = values.retract(step)
+        points = stereo.triangulate_world(image @ _FROM_CHANNELS.T, _poses(there, self.first), rig)
+        for track_id, point in zip(self.track_ids.tolist(), points, strict=True):
+            there.update(L(track_id), point)
+        return there
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSteps:
+    """How sightings and landmarks take part in one step from some values.
+
+    ``sightings`` are linear in the steps of poses and in the change of each landmark's (c, d, v) px;
+    ``information`` (M, 3) px^-2 is what they say of each of the three, all else being given.
+    """
+
+    values: gtsam.Values
+    seen: LandmarksSeen
+    sightings: gtsam.GaussianFactorGraph
+    information: Array
+    rig: StereoRig
+
+    def damping(self, share: float) -> gtsam.GaussianFactorGraph:
+        """Return factors that hold (c, d, v) of each landmark by a share of the information on each of the three.
+
+        A disparity that is nearly none is held by its size too: of a landmark that should be beyond infinity the linear
+        system promises what no step keeps.
+        """
+        held, disparity_px = share * np.maximum(self.information, _LEAST_INFORMATION), np.abs(self.seen.image[:, 1])
+        held[:, 1] += np.where(disparity_px < _SMALL_DISPARITY_PX, np.square(0.5 / disparity_px), 0.0)
+        roots = np.sqrt(held)[..., None] * np.eye(3)
+        of_pose = roots @ self.seen.by_pose
+        graph, unit = gtsam.GaussianFactorGraph(), gtsam.noiseModel.Unit.Create(3)
+        keys = zip(map(L, self.seen.track_ids.tolist()), map(X, self.seen.first.tolist()), strict=True)
+        for row, (landmark, pose) in enumerate(keys):
+            graph.add(gtsam.JacobianFactor(landmark, roots[row], pose, of_pose[row], np.zeros(3), unit))
+        return graph
+
+    def taken(self, step: gtsam.VectorValues) -> gtsam.Values:
+        """Return the values the step leads to."""
+        return self.seen.moved(self.values, step, self.rig)
+
+
+def _poses(values: gtsam.Values, frames: IntArray) -> Array:
+    return np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()]).reshape(-1, 4, 4)

@@ -1,0 +1,122 @@
+"""Steps of landmarks in the image that saw them first: solves along tracks that crept under Levenberg's damping."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.robust_loss import Squares
+from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
+from toolkit.geometry import Array, transform
+from toolkit.models import stereo
+from toolkit.models.factors import L, X
+from toolkit.sequence import StereoFrame
+from toolkit.simulation import DRIVE
+from toolkit.track_noise import TrackNoise
+
+NOISE = TrackNoise(np.array([0.03, 0.06, 0.03]), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))
+RIG = replace(DRIVE.rig, track_noise=NOISE)
+FRAMES, TRACKS, SEEN, FAR, FAR_M = 40, 20, 6, 2, 150.0
+SEEDS = [0, 2, 4]
+EXACT = Stopping(0.0, 40, decrease=1e-9)
+
+
+def errors_px(rng: np.random.Generator, offset_px: float) -> Array:
+    """Return the errors (SEEN, 3) px of a track in (uL, uR, v): a walk, and an offset of its disparity."""
+    walk_px = rng.normal(0.0, 0.13, (SEEN, 3)).cumsum(axis=0)
+    return walk_px + np.array([0.5 * offset_px, -0.5 * offset_px, 0.0])
+
+
+def drive(seed: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, ChainedFactors]:
+    """Return a drive of 1 m a frame straight ahead, its start 2 % too long: motion, start and sightings.
+
+    Two of twenty landmarks are 150 m away, where disparities are 2.5 px, and those of their tracks are 4 px less.
+    """
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    poses[:, :3, 3] = np.arange(FRAMES)[:, None] * RIG.T_imu_cam[:3, 2]
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    rows: list[list[tuple[int, Array, int]]] = [[] for _ in poses]
+    for i in range(TRACKS):
+        begins, depth_m = rng.integers(0, FRAMES - SEEN), rng.uniform(12.0, 40.0)
+        across_m = rng.uniform(-1.0, 1.0, 2) * [6.0, 2.0]
+        in_camera = np.array([*across_m, depth_m]) * (FAR_M / depth_m if i < FAR else 1.0)
+        point = transform(poses[begins] @ RIG.T_imu_cam, in_camera[None])[0]
+        off_px = errors_px(rng, -4.0 if i < FAR else rng.normal(0.0, 0.7))
+        for age in range(SEEN):
+            seen_px = stereo.predict(point[None], poses[begins + age], RIG).uv_px[0] + off_px[age]
+            rows[begins + age].append((i, seen_px, age))
+        start.insert(L(i), 1.02 * point)
+    graph.add(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    twist = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.05, 0.5], 3))
+    for k, pose in enumerate(poses):
+        start.insert(X(k), gtsam.Pose3(gtsam.Rot3(), 1.02 * pose[:3, 3]))
+        if k:
+            step = gtsam.Pose3(np.linalg.inv(poses[k - 1]) @ pose)
+            graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, twist))
+    frames = [frame_of(k, row) for k, row in enumerate(rows)]
+    return graph, start, ChainedFactors(ChainedSightings.of(frames, RIG), RIG, Squares())
+
+
+def frame_of(k: int, rows: list[tuple[int, Array, int]]) -> StereoFrame:
+    ids, seen_px, ages = zip(*rows, strict=True) if rows else ((), (), ())
+    uvs_px = np.array(seen_px).reshape(-1, 3)
+    return StereoFrame(k, np.array(ids, dtype=np.int64), uvs_px, np.array(ages, dtype=np.int64))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_solve_with_landmarks_beyond_infinity_comes_to_its_end_in_few_iterations(seed):
+    """With all damped alike, in metres, these took 55, 36 and 33, and ended 3, 4 and 15 units higher."""
+    graph, start, sightings = drive(seed)
+    solution = solve(graph, start, Stopping(0.0, 12, decrease=0.01), beside=sightings)
+    assert solution.converged
+    longer = solve(graph, start, EXACT, beside=sightings)
+    # A tenth of a unit of chi-square is nothing to any state.
+    assert solution.error - longer.error < 0.1
+    assert solution.error == pytest.approx(graph.error(solution.values) + sightings.error(solution.values), rel=1e-12)
+
+
+def test_landmarks_measured_beyond_infinity_stay_in_front_of_the_cameras_that_saw_them_first():
+    graph, start, sightings = drive(2)
+    solution = solve(graph, start, EXACT, beside=sightings)
+    predicted = sightings.predicted(solution.values)
+    assert (predicted.depth_m > 0.0).all()
+    assert np.isfinite(predicted.uv_px).all()
+    assert predicted.depth_m.max() > 10.0 * FAR_M
+
+
+def test_the_end_of_a_solve_has_no_gradient():
+    graph, start, sightings = drive(2)
+    end = solve(graph, start, EXACT, beside=sightings).values
+    steepest = []
+    for values in (start, end):
+        whole = gtsam.NonlinearFactorGraph(graph)
+        whole.push_back(sightings.linearised(values))
+        gradient = whole.linearize(values).gradientAtZero()
+        steepest.append(max(np.abs(gradient.at(key)).max() for key in values.keys()))  # noqa: SIM118 - not a mapping
+    # Of the start's. The rest is what a decrease of 1e-9 leaves.
+    assert steepest[1] < 1e-5 * steepest[0]
+
+
+def test_the_values_move_to_first_order_by_the_step_that_is_solved_for():
+    _, start, sightings = drive(2)
+    steps = sightings.landmark_steps(start)
+    rng, step = np.random.default_rng(0), gtsam.VectorValues()
+    for key, size in start.dims().items():
+        step.insert(key, rng.standard_normal(size))
+    slope = steps.sightings.gradientAtZero()
+    seen = [key for key in start.keys() if slope.exists(key)]  # noqa: SIM118 - not a mapping
+    of_sightings = sum(slope.at(key) @ step.at(key) for key in seen)
+    length = 1e-6
+    ahead, behind = (sightings.error(steps.taken(step.scale(sign * length))) for sign in (1.0, -1.0))
+    # The third derivative is what is left of a difference to both sides.
+    assert (ahead - behind) / (2.0 * length) == pytest.approx(of_sightings, rel=1e-5)
+
+
+def test_stopped_before_its_end_it_has_not_converged():
+    graph, start, sightings = drive(2)
+    solution = solve(graph, start, Stopping(0.0, 2, decrease=0.01), beside=sightings)
+    assert not solution.converged
+    assert solution.iterations == 2
