@@ -9,8 +9,8 @@ whose twists are noisy as they are. Each run is one line of the results, and one
 
 The table has, for each estimator and model, the geometric mean over drives of the ATE over that of dead reckoning (the
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
-parameters, or ``correlated:white,walk,offset`` with others, in px; ``+scale`` behind it gives the disparities a scale
-of 1 %, ``+gaps`` bridges what has no track.
+parameters, ``correlated:white,walk,offset`` with others, in px, or ``fitted``; ``+scale`` behind it gives the
+disparities a scale of 1 %, ``+gaps`` bridges what has no track.
 
     python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
 
@@ -88,6 +88,8 @@ def noise_of(model: str) -> Noise:
     given: dict[str, Any] = {"bridge_gaps": "gaps" in switches}
     if "scale" in switches:
         given["disparity_scale"] = SCALE_SIGMA
+    if name == "fitted":
+        given["tracks"] = name
     if name == "correlated":
         stated = [float(figure) for figure in figures.split(",")] if figures else []
         given |= {"tracks": name, **dict(zip(TRACK_SETTINGS, stated, strict=False))}
