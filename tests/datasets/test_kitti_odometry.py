@@ -98,6 +98,16 @@ def test_what_is_not_there_is_assumed_and_said_or_left_out(drive: Path) -> None:
     assert sequence.frames_t_ns.tolist() == [100_000_000 * k for k in range(FRAMES) if k != 3]
 
 
+def test_a_calibration_of_images_half_as_large_is_said(drive: Path) -> None:
+    def said() -> bool:
+        return any("far from the middle" in fact for fact in load_sequence(str(drive)).provenance.facts)
+
+    assert not said()
+    text = (drive / "calib.txt").read_text()
+    (drive / "calib.txt").write_text(text.replace(" 160", " 80").replace(" 100 ", " 50 "))
+    assert said()
+
+
 def edit(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text

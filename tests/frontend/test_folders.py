@@ -221,6 +221,41 @@ def test_a_left_image_without_a_right_one_is_said(asl: Path) -> None:
     assert any("1 left images have no right one" in fact for fact in after.provenance.facts)
 
 
+def test_a_camera_that_stalled_is_said_and_its_frames_left_out(asl: Path) -> None:
+    for camera in (0, 1):
+        for path in images(asl, camera)[4:7]:
+            shutil.copy(images(asl, camera)[3], path)
+    after = load_sequence(str(asl))
+    assert after.frame_count == FRAMES - 3
+    assert any("3 of 10 image pairs" in fact and "those of the pair before" in fact for fact in after.provenance.facts)
+
+
+def test_a_truth_that_turns_otherwise_than_the_gyro_is_said(asl: Path) -> None:
+    def stranger() -> bool:
+        return any("turns otherwise than the gyro" in fact for fact in load_sequence(str(asl)).provenance.facts)
+
+    assert not stranger()
+    rows = [line.split() for line in (asl / "truth.tum").read_text().splitlines()]
+    for row in rows:  # turned about the vertical, to and fro within half a second
+        half_rad = 0.1 * np.sin(4.0 * np.pi * float(row[0]))
+        row[4:] = ["0", "0", f"{np.sin(half_rad):.9f}", f"{np.cos(half_rad):.9f}"]
+    (asl / "truth.tum").write_text("".join(f"{' '.join(row)}\n" for row in rows))
+    assert stranger()
+
+
+def test_images_outside_the_time_of_the_imu_are_said(asl: Path) -> None:
+    imu = asl / "mav0/imu0/data.csv"
+    t_ns = load_sequence(str(asl)).frames_t_ns
+    lines = imu.read_text().splitlines()
+    within = [line for line in lines[1:] if int(line.split(",")[0]) <= t_ns[6]]
+    imu.write_text("\n".join([lines[0], *within]) + "\n")
+    after = load_sequence(str(asl))
+    assert after.frame_count == 7
+    assert f"3 of {FRAMES} image pairs are outside the time of the motion samples and left out" in (
+        after.provenance.facts
+    )
+
+
 YAML = "mav0/cam{}/sensor.yaml"
 REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("folders exchanged", lambda d: exchange(d / "mav0/cam0/data", d / "mav0/cam1/data"), "images are exchanged"),
@@ -241,6 +276,7 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("cut yaml", lambda d: (d / YAML.format(0)).write_text("T_BS:\n  data: [1, 2"), "no YAML, or truncated"),
     ("no yaml", lambda d: (d / YAML.format(0)).write_bytes(b"\x89PNG\r\n\x1a\n\xff"), "not a text file"),
     ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
+    ("all black", lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
     ("all of another size", lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
     ("no left images", lambda d: shutil.rmtree(d / IMAGES.format(0)), "missing or cannot be read"),
     ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam1/sensor.yaml: cannot be read"),

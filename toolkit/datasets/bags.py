@@ -108,13 +108,13 @@ def _read(path: Path, frontend: Frontend, spool: ImageSpool, progress: Progress)
         truth, whose = _truth(source)
         unstamped = _spool_images(bag, chosen, spool, progress)
     listed = pairs_of_asl(spool.folder)
-    pairs = tuple(pair for pair in listed.pairs if motion.t_ns.min() <= pair.t_ns <= motion.t_ns.max())
-    if not pairs:
+    within = listed.within(motion.t_ns)
+    if not within.pairs:
         raise DataError(f"{path}: {_why_no_pairs(chosen, listed, motion)}")
-    check_frame_count(path, len(pairs))
-    camera = _as_filmed(camera, pairs, frontend)
-    remarks = (*listed.remarks, *unstamped, *how_moved, *whose)
-    return _Read(chosen, motion, camera, pairs, truth, remarks)
+    check_frame_count(path, len(within.pairs))
+    camera = _as_filmed(camera, within.pairs, frontend)
+    remarks = (*within.remarks, *unstamped, *how_moved, *whose)
+    return _Read(chosen, motion, camera, within.pairs, truth, remarks)
 
 
 def _held(bag: Bag, chosen: Chosen) -> Held:

@@ -192,15 +192,15 @@ def _filmed(
     if calibration.cameras is None:
         raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
     listed = pairs_of_asl(mav0)
-    within = tuple(p for p in listed.pairs if imu.t_ns.min() <= p.t_ns <= imu.t_ns.max())
-    if listed.pairs and not within:
+    within = listed.within(imu.t_ns)
+    if listed.pairs and not within.pairs:
         spans = [f"{int(t.min())} to {int(t.max())} ns" for t in (np.array([p.t_ns for p in listed.pairs]), imu.t_ns)]
         raise DataError(
             f"{layout.root}: none of the {len(listed.pairs)} image pairs, {spans[0]}, lies in the time of the IMU, "
             f"{spans[1]}; they are of two clocks or two recordings"
         )
-    check_frame_count(layout.root, len(within))
-    return ImageRecording(within, rectified(*calibration.cameras, calibration.T_right_left)), listed.remarks
+    check_frame_count(layout.root, len(within.pairs))
+    return ImageRecording(within.pairs, rectified(*calibration.cameras, calibration.T_right_left)), within.remarks
 
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:

@@ -32,6 +32,8 @@ _FOLDERS = (("image_0", "image_1", 0), ("image_2", "image_3", 2), ("image_l", "i
 _PERIOD_S = 0.1
 # No camera's axis meets its image this near the border: calib.txt is of larger images than these.
 _BORDER = 0.1
+# Few do so far from the middle both ways (shares of width and height); that of images half as large is 0.25 off.
+_ASIDE = 0.15
 # Axes right, down, forward of a camera, from forward, left, up.
 T_FLU_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 
@@ -79,7 +81,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     left = _projections(layout)[0]
     T_cam0_left = se3(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
     truth = _truth(layout, stamps, tracks.t_ns)
-    facts = (NO_MOTION, *facts_of(tracks, len(listed.pairs)), *listed.remarks, *how)
+    facts = (NO_MOTION, *facts_of(tracks, len(listed.pairs)), *listed.remarks, *how, *_aside(pair))
     return Sequence(
         name=layout.root.name,
         rig=rig_of(pair, T_FLU_CAM @ T_cam0_left),
@@ -112,6 +114,20 @@ def _pair(layout: _Layout) -> RectifiedPair:
             f"{size_px[0]}x{size_px[1]} px; where these were scaled or cut, do the same to P0 to P3"
         )
     return already_rectified((fx_px, fy_px, cx_px, cy_px), float(baseline_m), size_px)
+
+
+def _aside(pair: RectifiedPair) -> tuple[str, ...]:
+    """Return a warning where the principal point is far from the middle of the images both ways.
+
+    Images without motion samples have nothing else that would contradict a calibration of images half as large.
+    """
+    centre, size_px = (pair.cx_px, pair.cy_px), pair.size_px
+    if not all(abs(c / size - 0.5) > _ASIDE for c, size in zip(centre, size_px, strict=True)):
+        return ()
+    return (
+        f"the principal point, {centre[0]:g} {centre[1]:g}, is far from the middle of images of "
+        f"{size_px[0]}x{size_px[1]} px: check that calib.txt is of images of this size",
+    )
 
 
 def _listed(layout: _Layout, stamps: IntArray) -> Listed:

@@ -50,12 +50,16 @@ class _Tracks:
     patches: Patches
     right_warps: Array
 
-    def select(self, rows: BoolArray | IntArray) -> "_Tracks":
+    def select(self, rows: BoolArray) -> "_Tracks":
+        if rows.all():  # as most tests leave it; the patches are megabytes
+            return self
         return _Tracks(
             self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows), self.right_warps[rows]
         )
 
     def joined(self, others: "_Tracks") -> "_Tracks":
+        if len(others.ids) == 0:
+            return self
         return _Tracks(
             np.concatenate([self.ids, others.ids]),
             np.concatenate([self.left_px, others.left_px]),

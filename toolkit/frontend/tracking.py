@@ -4,7 +4,7 @@ A pair that cannot be used is named and left out; the tracks go on behind it. Be
 left and right are what they are called, and that the calibration is theirs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ _LOOKED_AT = 5
 # Of the wanted corners a sound pair finds a third or more in the right image; one that is no pair hardly any.
 _LEAST_MATCHED, _MOST_SWAPPED = 0.08, 2.0
 _MISPAIRED = "left and right image are not of the same instant"
+_REPEATED = "it and its partner are those of the pair before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,14 +110,16 @@ def _tracked(
 ) -> ImageTracks:
     tracker, skipped = Tracker(rig, settings), []
     seen: list[tuple[int, Sightings]] = []
-    for i, images in enumerate(read_ahead(pairs, lambda pair: read_pair(pair, rig, bits))):
+    stalled = 0
+    for i, images in enumerate(_without_repeats(read_ahead(pairs, lambda pair: read_pair(pair, rig, bits)), pairs)):
+        stalled += isinstance(images, Unusable) and images.reason == _REPEATED
         sightings = None if isinstance(images, Unusable) else tracker.step(*images)
         if sightings is not None:
             seen.append((pairs[i].t_ns, sightings))
         else:
             skipped.append(str(images if isinstance(images, Unusable) else Unusable(pairs[i].right, _MISPAIRED)))
         progress.advance(i + 1, len(pairs), "tracking")
-    if 2 * len(skipped) >= len(pairs):
+    if 2 * (len(skipped) - stalled) >= len(pairs) or len(seen) < 2 <= len(pairs):
         raise DataError(
             f"{pairs[0].left.parent}: {len(skipped)} of {len(pairs)} image pairs cannot be used, as {skipped[0]}; "
             "copy the images again"
@@ -128,6 +131,25 @@ def _tracked(
         np.concatenate([s.corners_px for _, s in seen]),
         tuple(skipped),
     )
+
+
+def _without_repeats(
+    read: Iterable[tuple[Image, Image] | Unusable], pairs: Sequence[StampedPair]
+) -> Iterator[tuple[Image, Image] | Unusable]:
+    """Yield what was read of each pair; a pair that is the last one once more, to the last grey value, is unusable.
+
+    No sensor is so quiet: the camera stalled, or its files were copied. Tracks that stand still while the camera moves
+    would contradict every other measurement.
+    """
+    last: tuple[Image, Image] | None = None
+    for images, pair in zip(read, pairs, strict=True):
+        if isinstance(images, Unusable):
+            yield images
+        elif last is not None and all(np.array_equal(*both) for both in zip(images, last, strict=True)):
+            yield Unusable(pair.left, _REPEATED)
+        else:
+            last = images
+            yield images
 
 
 class _Matches(NamedTuple):

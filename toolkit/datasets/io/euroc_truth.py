@@ -25,6 +25,13 @@ from toolkit.sequence import Truth
 _STEP_NS = NS_PER_S // 10
 # Poses about a step that are further apart do not tell its rotation.
 _MOST_STEPS = 5
+# Rates of two unrelated motions are apart by at least what the gyro turns; of a noisy motion capture by half of that.
+# Less than the first figure is the noise of a good one at a standstill.
+_MOST_OFF_RADPS, _MOST_OFF = 0.05, 0.7
+_STRANGER = (
+    ": it turns otherwise than the gyro, so it is of another recording, or its quaternions or the gyro are not in the "
+    "order, axes or units they are read in; distrust every figure that rests on it"
+)
 _AXES = "xyz"
 # Position, quaternion, velocity, gyro bias and accelerometer bias, as the data set names them and as vicon2gt does.
 _HEADINGS = (
@@ -73,7 +80,9 @@ def find_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice | None:
         raise DataError(f"{best}: the truth and the IMU share no 0.2 s; check that both are of one recording and clock")
     scatters = "; ".join(f"{path.relative_to(root)} by {radps:.4f} rad/s" for path, radps in ranked)
     among = "" if len(ranked) == 1 else ", the better of what the folder holds"
-    return Choice(found[best], f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters})")
+    stranger = _STRANGER if least > max(_MOST_OFF_RADPS, _MOST_OFF * _turning_radps(found[best], imu)) else ""
+    reason = f"the truth is {best.relative_to(root)}{among} (rates RMS off the gyro's: {scatters}){stranger}"
+    return Choice(found[best], reason)
 
 
 def _tables(root: Path, mav0: Path | None) -> list[Path]:
@@ -132,6 +141,13 @@ def rate_scatter_radps(truth: Truth, imu: ImuSamples) -> float:
     steps = so3_log(np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:])
     off = (steps * (NS_PER_S / _STEP_NS) - _mean_rates(sample_t_ns, gyro_radps, at_ns))[known]
     return float(np.sqrt(((off - np.median(off, axis=0)) ** 2).mean()))
+
+
+def _turning_radps(truth: Truth, imu: ImuSamples) -> float:
+    """Return how much the gyro turns in the time of the truth, RMS about its median (rad/s)."""
+    t_ns, gyro_radps = _usable(imu)
+    shared = gyro_radps[(t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1])]
+    return float(np.sqrt(((shared - np.median(shared, axis=0)) ** 2).mean()))
 
 
 def _without_gap(t_ns: IntArray, at_ns: IntArray) -> BoolArray:

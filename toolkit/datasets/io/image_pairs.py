@@ -1,7 +1,7 @@
 """Which image files belong together: listed in the tables of an ASL folder, or paired by the numbers of their names."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,14 @@ class Listed:
     pairs: tuple[StampedPair, ...]
     stamps: int
     remarks: tuple[str, ...] = ()
+
+    def within(self, motion_t_ns: IntArray) -> "Listed":
+        """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out."""
+        first, last = int(motion_t_ns.min()), int(motion_t_ns.max())
+        pairs = tuple(pair for pair in self.pairs if first <= pair.t_ns <= last)
+        outside = len(self.pairs) - len(pairs)
+        remark = f"{outside} of {len(self.pairs)} image pairs are outside the time of the motion samples and left out"
+        return replace(self, pairs=pairs, remarks=(*self.remarks, remark)) if outside else self
 
 
 def images_only(path: Path, tracks: Tracks) -> bool:
