@@ -37,4 +37,5 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     at_odds: Annotated[float, Meta(description="share of tracks at odds with the motion", ge=0, le=1)]
     scale: Annotated[float | None, Meta(description="translation by vision over the measured one, or null")]
     scale_error: float | None
+    left_out: Annotated[float | None, Meta(description="share of sightings not given to estimators, or null")] = None
     words: Annotated[tuple[str, ...], Meta(description="what that means for filters and smoothers")]
