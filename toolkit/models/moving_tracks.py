@@ -2,7 +2,7 @@
 
 Decided frame by frame from the past alone, before any estimator and for all alike. A private filter of the motion, in
 the state the estimators have, predicts how the body moved since the frame before, and how surely. Every track is put
-there from a sighting of some frames ago; what is left of it, whitened by the noise of both sightings, is linear in the
+there from its last sound sighting; what is left of it, whitened by the noise of both sightings, is linear in the
 motion's error. The motion taken is that of most posterior probability where a track counts by its chi-square, or where
 that is beyond its bound by the bound (truncated least squares), and none the prediction's covariance excludes: so a
 consensus of vehicles cannot pass for the motion where odometry says otherwise, unless nine tracks in ten agree. It is
@@ -10,7 +10,10 @@ looked for from the prediction on, residuals beyond the bound losing their weigh
 "On the unification of line processes, outlier rejection, and robust statistics in early vision") and, where that leaves
 many tracks out, among the motions that three tracks each show (Fischler & Bolles 1981, "Random sample consensus").
 
-A sighting beyond the bound about that motion is left out; a track refused in three frames running stays out for the
+About that motion each track is tested once more from a sighting some frames ago, along the motions found since: there a
+vehicle shows that is too slow, or too far away, to show from one frame to the next.
+
+A sighting beyond the bound in either test is left out; a track refused in three frames running stays out for the
 rest of its life. Where fewer than half of the tracks agree, motion or noise are not as stated: none is refused.
 """
 
@@ -32,11 +35,12 @@ from toolkit.sequence import Packet, Prior, Sequence, StereoRig, is_held_out, is
 PROBABILITY = 0.999
 # A track that is refused in so many frames running stays away: a single bad sighting spoils one.
 REFUSALS = 3
-# A track is put where it should be from a sighting at most so many frames ago.
-MOST_FRAMES_BACK = 1
+# A track is tested from its last sound sighting and from one about so many frames ago, where slow motion shows.
+EARLY_FRAMES = 5
+_MOST_FRAMES_BACK = EARLY_FRAMES + REFUSALS + 1
 # Where more tracks than this disagree with the motion found about the prediction, others are looked for.
 _SEARCHED_BEYOND = 0.1
-_SAMPLES, _SAMPLE = 24, 3
+_SAMPLES, _SAMPLE, _REFINED = 24, 3, 3
 # Residuals, in multiples of the bound, beyond which a track has less than a quarter of its weight, one after another.
 _SOFTENED = (4.0, 1.0)
 # What a linear model may neglect, in standard deviations of a pixel coordinate.
@@ -75,8 +79,8 @@ class MovingTracks:
         self._rig, self._model = sequence.rig, motion_model(sequence.noise, sequence.gravity_world)
         self._belief: Belief = self._model.initial_belief(prior)
         self._rng = np.random.default_rng(0)
-        self._tracks = _Tracks.none()
-        # The pose of each of the last frames, by the motions found; and the covariance of the last of these.
+        self._tracks = _Tracks.begun(np.empty(0, dtype=np.int64), np.empty((0, 3)), -1)
+        # The pose at each of the last frames, by the motions found; and the covariance of the last of these.
         self._path = {-1: np.eye(4)}
         self._step_cov = np.zeros((6, 6))
         self.undecided_frames = 0
@@ -86,16 +90,15 @@ class MovingTracks:
         frame, k = packet.frame, packet.index
         order = np.argsort(frame.track_ids)
         seen = _Tracks.begun(frame.track_ids[order], frame.uvs_px[order], k).continuing(self._tracks)
+        self._path[k] = self._path[k - 1]
         agree = None
         if packet.motion is not None:
             prediction = self._model.integrate(packet.motion, self._belief.bias).predict(self._belief)
-            step = _Step.of(self._belief, prediction)
-            agree = self._take(step, prediction, seen)
-        else:
-            self._path[k] = self._path[k - 1]
-        self._tracks = seen.judged(agree, k)
+            agree = self._take(_Step.of(self._belief, prediction), prediction, seen)
+        self._path.pop(k - _MOST_FRAMES_BACK, None)
+        self._tracks = seen.judged(agree)
         sound = np.empty(order.size, dtype=bool)
-        sound[order] = (self._tracks.refusals == 0) if agree is not None else self._tracks.refusals < REFUSALS
+        sound[order] = self._tracks.refusals < (REFUSALS if agree is None else 1)
         return sound
 
     def _take(self, step: "_Step", prediction: Prediction, seen: "_Tracks") -> BoolArray | None:
@@ -103,76 +106,96 @@ class MovingTracks:
 
         Those that are not put to the test agree.
         """
-        k = int(seen.now)
-        tested = (seen.refusals < REFUSALS) & (seen.begun_at < k) & _deep(seen.begun_px) & _deep(seen.uvs_px)
-        pairs = self._pairs(seen, tested)
-        found = _found(pairs, step, self._rig, self._rng)
+        tested = (seen.refusals < REFUSALS) & seen.recent.can_predict(seen.now) & _deep(seen.uvs_px)
+        found = _found(self._pairs(seen, seen.recent, tested), step, self._rig, self._rng)
         enough = found.agree.sum() >= (1.0 - MOST_MISMATCHED) * found.agree.size
         motion = found if enough else _Found(np.zeros(6), step.cov, found.agree)
-        self.undecided_frames += not enough
-        self._path[k] = self._path[k - 1] @ step.T_start_end @ se3_exp(motion.error)
-        self._path.pop(k - MOST_FRAMES_BACK - REFUSALS - 1, None)
-        self._step_cov = motion.cov
+        T_start_end = step.T_start_end @ se3_exp(motion.error)
+        self._path[seen.now] = self._path[seen.now - 1] @ T_start_end
         self._belief = step.conditioned(self._belief.predicted(prediction), motion)
-        if not enough:
-            return None
-        agree = np.ones(tested.size, dtype=bool)
-        agree[tested] = found.agree
+        if enough:
+            agree = np.ones(tested.size, dtype=bool)
+            agree[tested] = found.agree
+            early = tested & seen.early.can_predict(seen.now) & (seen.early.frames < seen.recent.frames)
+            linear = self._pairs(seen, seen.early, early).linear(T_start_end, self._rig)
+            agree[early] &= linear.chi2(np.zeros(6), motion.cov) < chi2_bound(3, PROBABILITY)
+        else:
+            self.undecided_frames += 1
+            agree = None
+        self._step_cov = motion.cov
         return agree
 
-    def _pairs(self, seen: "_Tracks", tested: BoolArray) -> "_Pairs":
-        """Return the tested tracks as points (N, 3) m of the body at the frame before, with their noise."""
-        k, rig = int(seen.now), self._rig
-        places, row = np.unique(seen.begun_at[tested], return_inverse=True)
-        since = np.array([se3_inverse(self._path[k - 1]) @ self._path[i] for i in places.tolist()]).reshape(-1, 4, 4)
-        points_cam = triangulate(seen.begun_px[tested], rig)
-        points = transform((since @ rig.T_imu_cam)[row], points_cam)
-        d_point_d_uv = (since @ rig.T_imu_cam)[row][:, :3, :3] @ np.linalg.inv(projection_jacobian(points_cam, rig))
-        return _Pairs(points, d_point_d_uv, seen.uvs_px[tested], (k - 1 - places)[row][:, None, None] * self._step_cov)
+    def _pairs(self, seen: "_Tracks", begun: "_Begun", which: BoolArray) -> "_Pairs":
+        """Return some tracks as points (N, 3) m of the body at the frame before, by where they were begun."""
+        before, rig = seen.now - 1, self._rig
+        frames, row = np.unique(begun.frames[which], return_inverse=True)
+        T_before_begun = np.array([se3_inverse(self._path[before]) @ self._path[i] for i in frames.tolist()])
+        T_before_cam = (T_before_begun.reshape(-1, 4, 4) @ rig.T_imu_cam)[row]
+        points_cam = triangulate(begun.uvs_px[which], rig)
+        d_point_d_uv = T_before_cam[:, :3, :3] @ np.linalg.inv(projection_jacobian(points_cam, rig))
+        steps = (before - frames)[row][:, None, None]
+        return _Pairs(transform(T_before_cam, points_cam), d_point_d_uv, seen.uvs_px[which], steps * self._step_cov)
+
+
+class _Begun(NamedTuple):
+    """The sightings (N, 3) px that tracks are predicted from, and their frames (N,)."""
+
+    uvs_px: Array
+    frames: IntArray
+
+    def can_predict(self, now: int) -> BoolArray:
+        """Say which (N,) are of an earlier frame and tell their depth."""
+        return np.asarray((self.frames < now) & _deep(self.uvs_px))
+
+    def with_those(self, others: "_Begun", rows: IntArray, places: IntArray) -> "_Begun":
+        """Return these with rows (M,) of others in some places (M,)."""
+        uvs_px, frames = self.uvs_px.copy(), self.frames.copy()
+        uvs_px[places], frames[places] = others.uvs_px[rows], others.frames[rows]
+        return _Begun(uvs_px, frames)
+
+    def moved_on(self, seen: "_Tracks", sound: BoolArray, most_frames: int) -> "_Begun":
+        """Return these with what is so many frames old moved on to now, if that is sound, and later in any case."""
+        age = seen.now - self.frames
+        late = (sound & (age >= most_frames)) | (age >= most_frames + REFUSALS) | ~_deep(self.uvs_px)
+        return _Begun(np.where(late[:, None], seen.uvs_px, self.uvs_px), np.where(late, seen.now, self.frames))
 
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """The tracks of frame ``now``: ids (N,) ascending, sightings (N, 3) px, and those they are predicted from.
+    """The tracks of frame ``now``: ids (N,) ascending, sightings (N, 3) px, and how often each was refused running.
 
-    The latter are ``begun_px`` (N, 3) in the frames ``begun_at`` (N,); ``refusals`` (N,) counts those running.
+    ``recent`` and ``early`` are what they are predicted from.
     """
 
     now: int
     ids: IntArray
     uvs_px: Array
-    begun_px: Array
-    begun_at: IntArray
+    recent: _Begun
+    early: _Begun
     refusals: IntArray
-
-    @classmethod
-    def none(cls) -> "_Tracks":
-        return cls.begun(np.empty(0, dtype=np.int64), np.empty((0, 3)), -1)
 
     @classmethod
     def begun(cls, ids: IntArray, uvs_px: Array, k: int) -> "_Tracks":
         """Return tracks that begin with frame k."""
-        zeros = np.zeros(ids.size, dtype=np.int64)
-        return cls(k, ids, uvs_px, uvs_px, zeros + k, zeros)
+        here = _Begun(uvs_px, np.full(ids.size, k))
+        return cls(k, ids, uvs_px, here, here, np.zeros(ids.size, dtype=np.int64))
 
     def continuing(self, before: "_Tracks") -> "_Tracks":
         """Return the tracks with what is known of those that were in the frame before."""
         _, old, new = np.intersect1d(before.ids, self.ids, assume_unique=True, return_indices=True)
-        begun_px, begun_at, refusals = self.begun_px.copy(), self.begun_at.copy(), self.refusals.copy()
-        begun_px[new], begun_at[new], refusals[new] = before.begun_px[old], before.begun_at[old], before.refusals[old]
-        return replace(self, begun_px=begun_px, begun_at=begun_at, refusals=refusals)
+        recent, early = self.recent.with_those(before.recent, old, new), self.early.with_those(before.early, old, new)
+        refusals = self.refusals.copy()
+        refusals[new] = before.refusals[old]
+        return replace(self, recent=recent, early=early, refusals=refusals)
 
-    def judged(self, agree: BoolArray | None, k: int) -> "_Tracks":
-        """Return the tracks after it was said which agree; None where nothing can be said."""
-        away = self.refusals >= REFUSALS
+    def judged(self, agree: BoolArray | None) -> "_Tracks":
+        """Return the tracks after it was said which (N,) agree; None where nothing can be said."""
         refusals = self.refusals
         if agree is not None:
-            refusals = np.where(away, REFUSALS, np.where(agree, 0, self.refusals + 1))
-        age = k - self.begun_at
-        renewed = ((refusals == 0) & (age >= MOST_FRAMES_BACK)) | (age >= MOST_FRAMES_BACK + REFUSALS)
-        renewed |= ~_deep(self.begun_px)
-        begun_px = np.where(renewed[:, None], self.uvs_px, self.begun_px)
-        return replace(self, begun_px=begun_px, begun_at=np.where(renewed, k, self.begun_at), refusals=refusals)
+            refusals = np.where((refusals < REFUSALS) & agree, 0, np.minimum(refusals + 1, REFUSALS))
+        sound = refusals == 0
+        recent, early = self.recent.moved_on(self, sound, 1), self.early.moved_on(self, sound, EARLY_FRAMES)
+        return replace(self, recent=recent, early=early, refusals=refusals)
 
 
 def _deep(uvs_px: Array) -> BoolArray:
@@ -295,10 +318,9 @@ class _Problem(NamedTuple):
         predicted = (self.jacobians.reshape(-1, 6) @ errors.T).reshape(-1, 3, len(errors))
         return np.asarray(((self.residuals[..., None] - predicted) ** 2).sum(axis=1).T)
 
-    def misfits(self, errors: Array, bound: float) -> tuple[Array, BoolArray]:
-        """Return the cost (C,) of C errors (C, 6), and the tracks (C, N) that agree with each."""
-        chi2 = self.chi2(errors)
-        return (errors**2).sum(axis=1) + np.minimum(chi2, bound).sum(axis=1), chi2 < bound
+    def costs(self, errors: Array, bound: float) -> Array:
+        """Return the truncated squared residuals (C,) of C errors (C, 6), all tracks and the prediction together."""
+        return np.asarray((errors**2).sum(axis=1) + np.minimum(self.chi2(errors), bound).sum(axis=1))
 
     def solved(self, weights: Array | BoolArray) -> tuple[Array, Array]:
         """Return the most probable error (6,) where tracks (N,) have weights, and its covariance (6, 6)."""
@@ -323,12 +345,8 @@ def _searched(problem: _Problem, best: Array, bound: float, most: float, rng: np
     normal = np.eye(6) + transposed(of_samples) @ of_samples
     told = transposed(of_samples) @ problem.residuals[rows].reshape(_SAMPLES, -1, 1)
     shown = np.asarray(np.linalg.solve(normal, told)[..., 0], dtype=np.float64)
-    refined = [problem.solved(agree)[0] for agree in problem.misfits(shown, bound)[1][_cheapest(problem, shown, bound)]]
+    agree = problem.chi2(shown) < bound
+    refined = [problem.solved(agree[i])[0] for i in problem.costs(shown, bound).argsort()[:_REFINED]]
     errors = np.stack([np.zeros(6), best, *refined])
-    cost = problem.misfits(errors, bound)[0]
-    cost[(errors**2).sum(axis=1) > most] = np.inf
-    return np.asarray(errors[cost.argmin()])
-
-
-def _cheapest(problem: _Problem, errors: Array, bound: float) -> IntArray:
-    return np.asarray(problem.misfits(errors, bound)[0].argsort()[:3])
+    costs = np.where((errors**2).sum(axis=1) < most, problem.costs(errors, bound), np.inf)
+    return np.asarray(errors[costs.argmin()])
