@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from msgspec import UNSET
 
 from toolkit.geometry import Array
 from toolkit.report.messages import sequence_line
@@ -137,7 +138,7 @@ def card_record(card: Card) -> CardRecord:
         at_odds=_short(card.at_odds),
         scale=None if scale is None else _short(scale.value),
         scale_error=None if scale is None else _short(scale.error),
-        left_out=None if card.left_out is None else _short(card.left_out),
+        left_out=UNSET if card.left_out is None else _short(card.left_out),
         words=tuple(card_lines(card)),
     )
 
