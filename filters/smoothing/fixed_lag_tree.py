@@ -7,9 +7,10 @@ root: the last covariance of the one and the first of the other are nearly free,
 the newest comes a variable without a meaning, for the sake of the condition of the cliques (``indeterminate``).
 
 A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
-frame is dropped. A state that does so the first time is a matter of rounding in the normal equations: the window is
-then solved by QR, ten times as long, until vision has been back for as long as it reaches. Either way a new tree is
-built of the factors of the old, with the same estimates.
+frame is dropped, and so are landmarks without a depth in a clique that GTSAM names by another. A state that does so the
+first time is a matter of rounding in the normal equations: the window is then solved by QR, ten times as long, until
+vision has been back for as long as it reaches. Either way a new tree is built of the factors of the old, with the same
+estimates.
 """
 
 from collections.abc import Collection, Iterable
@@ -21,7 +22,9 @@ from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import (
     LAST,
+    MOST_CONDITION,
     Recovery,
+    landmark_conditions,
     ties_of_the_last,
     variable_named,
     weak_hold,
@@ -56,18 +59,18 @@ class FixedLagTree:
 
         Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
         """
-        back = Recovery([], set())
-        if self._by_qr_from_ns is not None and extension.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
-            self._by_qr_from_ns = None
-            back = self.rebuild()
         self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
         self._landmark_stamps_ns |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
         self._oldest_ns = t_ns - self._lag_ns
         if extension.chained is not None:
             self._chained.add(*extension.chained)
         self._newest = {key: extension.values.extract([key]).dim() for key in extension.state_keys}
-        added = self._solved(extension.factors, extension.values)
-        return Recovery(back.log + added.log, back.dropped | added.dropped)
+        added, back = self._solved(extension.factors, extension.values), Recovery([], set())
+        # Only now: a landmark that is dropped on the way back may be among those of the packet.
+        if self._by_qr_from_ns is not None and extension.landmark_ids and t_ns > self._by_qr_from_ns + self._lag_ns:
+            self._by_qr_from_ns = None
+            back = self.rebuild()
+        return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def rebuild(self) -> Recovery:
         """Build the tree anew; its estimates, now and later, are the same but for rounding."""
@@ -106,6 +109,13 @@ class FixedLagTree:
                     self._by_qr_from_ns = self._newest_ns()
                     factors, values = self._emptied()
                     remedy = "to rounding: solved by QR for some frames"
+                elif culprits := self._undetermined(but=key) if kind_of(key) == "l" else []:
+                    # GTSAM names the first variable of a clique, and these are in it.
+                    factors, values = self._emptied()
+                    for culprit in culprits:
+                        factors, values = self._without(culprit, factors, values)
+                        dropped.add(gtsam.Symbol(culprit).index())
+                    key, remedy = culprits[0], f"and was dropped, {len(culprits)} in all"
                 elif key in held and kind_of(key) == "l":
                     factors, values = self._without(key, *self._emptied())
                     dropped.add(gtsam.Symbol(key).index())
@@ -119,6 +129,12 @@ class FixedLagTree:
             else:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+
+    def _undetermined(self, but: int) -> list[int]:
+        """Return the landmarks whose own factors do not determine them; none where a given one is among them."""
+        factors, at = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
+        beyond = [key for key, condition in landmark_conditions(factors, at).items() if condition > MOST_CONDITION]
+        return [] if but in beyond else beyond
 
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())

@@ -22,12 +22,15 @@ import numpy as np
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, BoolArray, se3_inverse, transform
+from toolkit.models.factors import kind_of
 from toolkit.models.motion import MotionModel
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.sequence import StereoRig
 
 # What holds a variable that nothing else determines: m of a landmark; rad, m, m/s of a state.
 WEAK_SIGMA = 1.0
+# The condition of a landmark's information, scaled to a unit diagonal, beyond which GTSAM refuses it.
+MOST_CONDITION = 7e7
 # The variable that is eliminated last.
 LAST = gtsam.symbol("r", 0)
 
@@ -51,6 +54,27 @@ def variable_named(refusal: RuntimeError) -> int:
     if named is None:
         raise refusal
     return int(named.group(1))
+
+
+def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> dict[int, float]:
+    """Return the condition of the information that factors have of each landmark, scaled to a unit diagonal.
+
+    That of one which went thousands of baselines away is beyond what GTSAM allows: its depth is not determined.
+    """
+    linear = factors.linearize(at)
+    keys = sorted(set(linear.keys()))
+    starts = np.cumsum([0, *(at.extract([key]).dim() for key in keys)])
+    rows = [np.arange(start, start + 3) for start in starts.tolist()]
+    landmarks = {key: row for key, row in zip(keys, rows, strict=False) if kind_of(key) == "l"}
+    information, _ = linear.hessian()
+    blocks = (information[np.ix_(row, row)] for row in landmarks.values())
+    return {key: float(np.linalg.cond(_scaled(block))) for key, block in zip(landmarks, blocks, strict=True)}
+
+
+def _scaled(information: Array) -> Array:
+    root = np.sqrt(np.diag(information))
+    root[root == 0.0] = 1.0
+    return np.asarray(information / np.outer(root, root))
 
 
 def weak_hold(key: int, values: gtsam.Values) -> gtsam.NonlinearFactor:

@@ -19,6 +19,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation.track_faults import moving_objects
 
 
 def unchained(lag_ns: int) -> FixedLagTree:
@@ -151,6 +152,37 @@ def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_told
     assert not window._isam.valueExists(L(5))
     exact = start.retract(everything.linearize(start).optimize())
     np.testing.assert_allclose(position_of(window, 4), exact.atPoint3(X(4)), atol=1e-9)
+
+
+def convoy() -> Sequence:
+    """Return a drive among vehicles: of what moves as fast as the camera, the depth grows without end."""
+    return moving_objects(simulate(replace(DRIVE, duration_s=4.5), seed=1), dose=0.6, seed=1)
+
+
+def test_landmarks_without_a_depth_are_dropped_where_gtsam_names_another():
+    """It names the first variable of a clique. Without vehicles no landmark is beyond the condition."""
+    sequence = convoy()
+    estimator = FixedLag(setup_of(sequence), 0.6)
+    answers_there = [estimator.step(packet) for packet in sequence.packets()]
+    log = estimator.finish().log
+    assert any("in all" in line for line in log)
+    truth = sequence.truth
+    assert truth is not None
+    ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
+    # 45 m of odometry that is good to 0.1 m: what vehicles take vision to is not more than a metre off.
+    assert np.linalg.norm(answers_there[-1].T_world_imu[:3, 3] - ends_at) < 1.0
+
+
+def test_the_condition_of_a_landmark_tells_that_its_depth_is_unknown():
+    factors, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for i, sigma_m in ((1, 1.0), (2, 1e5)):
+        at.insert(L(i), np.zeros(3))
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, sigma_m]))
+        turned = gtsam.Rot3.Rx(0.5).matrix()
+        factors.add(gtsam.LinearContainerFactor(gtsam.JacobianFactor(L(i), turned, np.zeros(3), noise)))
+    conditions = indeterminate.landmark_conditions(factors, at)
+    assert conditions[L(1)] < 1.0 + 1e-9
+    assert conditions[L(2)] > indeterminate.MOST_CONDITION
 
 
 class BrokenOff:

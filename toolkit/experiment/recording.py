@@ -15,6 +15,7 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
@@ -105,9 +106,15 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         elif recording.card:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
-        sequence = _within_budget(_cut(whole, recording), recording.tracks.budget)
+        used, budget = _cut(whole, recording), recording.tracks.budget
+        sequence = _within_budget(used, budget)
+        prior = STARTS[recording.start](sequence)
+        if recording.tracks.leave_out_moving:
+            at_rest, left_out = _without_moving_tracks(used, prior)
+            sequence = _within_budget(at_rest, budget)
+            card = None if card is None else replace(card, left_out=left_out)
         findings = tuple(_of_part(finding, sequence) for finding in audited.findings)
-        return Prepared(sequence, findings, STARTS[recording.start](sequence), whole, audited.undecided, card)
+        return Prepared(sequence, findings, prior, whole, audited.undecided, card)
 
 
 def _of_part(finding: Finding, sequence: Sequence) -> Finding:
@@ -207,6 +214,20 @@ def _within_budget(sequence: Sequence, budget: int | None) -> Sequence:
     fact = f"estimators are given at most {budget} tracks a frame (tracks.budget): {given:.0%} of the sightings"
     facts = (*sequence.provenance.facts, fact)
     return replace(thinned, provenance=replace(sequence.provenance, facts=facts))
+
+
+def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, float]:
+    """Return the sequence without the sightings that move against the rest, which the facts tell, and their share."""
+    at_rest, counts = without_moving_tracks(sequence, prior)
+    share = counts.sightings / max(counts.of_sightings, 1)
+    fact = (
+        f"not given to estimators, for it moves against the motion and most other tracks (tracks.leave_out_moving): "
+        f"{share:.1%} of the sightings, of {counts.tracks} of {counts.of_tracks} tracks"
+    )
+    if counts.undecided_frames:
+        fact += f"; in {counts.undecided_frames} of {sequence.frame_count} frames too few tracks agreed to tell"
+    provenance = replace(sequence.provenance, facts=(*sequence.provenance.facts, fact))
+    return replace(at_rest, provenance=provenance), share
 
 
 def _stated_track_noise(asked: Noise) -> TrackNoise:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from msgspec import UNSET
 
 from toolkit.geometry import Array
 from toolkit.report.messages import sequence_line
@@ -36,6 +37,8 @@ def card_lines(card: Card) -> Iterator[str]:
         f"{card.tails:.1%} of the residuals lie beyond four robust standard deviations, and {card.at_odds:.1%} of the "
         f"tracks are at odds with the motion" + (_STRAYS if card.at_odds > _MANY_AT_ODDS else "")
     )
+    if card.left_out is not None:
+        yield f"{card.left_out:.1%} of the sightings move against most others and are given to no estimator"
     if card.blind_intervals > _MANY_BLIND * card.intervals:
         yield (
             f"{card.blind_intervals} of {card.intervals} intervals have no common track: there every estimator rests "
@@ -135,6 +138,7 @@ def card_record(card: Card) -> CardRecord:
         at_odds=_short(card.at_odds),
         scale=None if scale is None else _short(scale.value),
         scale_error=None if scale is None else _short(scale.error),
+        left_out=UNSET if card.left_out is None else _short(card.left_out),
         words=tuple(card_lines(card)),
     )
 

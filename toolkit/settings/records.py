@@ -202,6 +202,10 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
         ]
         | None
     ) = None
+    leave_out_moving: Annotated[
+        bool,
+        Meta(description="give no estimator what moves against the motion and most other tracks: vehicles, mismatches"),
+    ] = False
 
 
 class Metrics(Struct, frozen=True, forbid_unknown_fields=True):

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
 Quantiles = Annotated[tuple[float, float, float], Meta(description="10, 50 and 90 %")]
@@ -37,4 +37,8 @@ class CardRecord(Struct, frozen=True, kw_only=True):
     at_odds: Annotated[float, Meta(description="share of tracks at odds with the motion", ge=0, le=1)]
     scale: Annotated[float | None, Meta(description="translation by vision over the measured one, or null")]
     scale_error: float | None
+    left_out: (
+        Annotated[float, Meta(description="share of sightings not given to estimators, where some are", ge=0, le=1)]
+        | UnsetType
+    ) = UNSET
     words: Annotated[tuple[str, ...], Meta(description="what that means for filters and smoothers")]
