@@ -1,5 +1,6 @@
 """What tests of several packages share: the way to the real recordings, and one line that runs an estimator."""
 
+import gc
 import os
 import re
 import signal
@@ -54,6 +55,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: place for place, name in enumerate(_LONGEST)}
     tests = PROJECT / "tests"
     items.sort(key=lambda item: places.get(item.path.relative_to(tests).parts[0], len(places)))
+
+
+def pytest_collection_finish() -> None:
+    """Have the garbage collector pass over what lives until the end: five thousand tests and the modules they import.
+
+    Each of its full rounds would look through all of that again.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
