@@ -15,7 +15,8 @@ from toolkit.report.run_directory import unique_names
 Vislam = Callable[..., int]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
-DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+# Nobody looks at the figures here: drawing them takes as long as all else.
+DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
 
 
 def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:

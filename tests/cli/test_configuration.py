@@ -20,7 +20,7 @@ Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
 pytestmark = pytest.mark.usefixtures("unrendered", "one_process")
-QUICK = ("--max-frames", "10", "--workers", "1")
+QUICK = ("--max-frames", "10", "--workers", "1", "--figures", "none")
 COST = {metric.key for metric in cost.METRICS}
 
 
