@@ -137,7 +137,7 @@ if recording and truth:
     SOURCE = {"source": str(recording), "truth": truth, "max_frames": 400}
 else:
     print("0027 is not here: this ran on the simulation drive-realistic, 160 frames")
-    SIMULATED = {"seeds": 2, "max_frames": 60}
+    SIMULATED = {"seeds": 2, "max_frames": 40}
     SOURCE = {"source": "drive-realistic", "max_frames": 160}
 
 white = compare(**SOURCE, estimators=CHOSEN)

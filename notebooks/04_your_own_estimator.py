@@ -166,7 +166,7 @@ print("two-view:", find("two-view").summary())
 # estimator states: 1 is honest, more is too sure of itself (see [notebook 3](03_why_the_smoother_wins.ipynb)).
 
 # %%
-over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=6, max_frames=25)
+over = compare("drive", ["dead-reckoning", "ekf", "two-view"], seeds=4, max_frames=25)
 over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
 
 # %%
@@ -186,13 +186,13 @@ print(f"ekf one of which it is {np.sqrt(nees['ekf']):.1f} times as large")
 
 
 # %%
-case = Case("drive", simulated=True, seeds=tuple(range(8)), estimators=("two-view",), duration_s=3.0)
-baseline = new_baseline([case], workers=2, made_by={}, progress_for=silent)
+case = Case("drive", simulated=True, seeds=tuple(range(6)), estimators=("two-view",), duration_s=3.0)
+baseline = new_baseline([case], workers=1, made_by={}, progress_for=silent)
 
 
 def check_again() -> str:
     """Measure everything in the baseline again, and return what the gate says; time is not judged here."""
-    return gate_text(check(baseline, "the baseline", How(workers=2, speed=False), silent))
+    return gate_text(check(baseline, "the baseline", How(workers=1, speed=False), silent))
 
 
 print(check_again())
@@ -202,17 +202,12 @@ print(check_again())
 
 # %%
 file = package / "two_view.py"
-right = file.read_text()
-file.write_text(right.replace("GATE = 7.81", "GATE = np.inf"))
+file.write_text(file.read_text().replace("GATE = 7.81", "GATE = np.inf"))
+importlib.reload(importlib.import_module("my_filters.two_view"))
 print(check_again())
 
 # %% [markdown]
-# The check fails and says what for. `vislam check` would end with status 1, and the change would not be merged. We take
-# it back.
-
-# %%
-file.write_text(right)
-print(check_again().splitlines()[-1])
+# The check fails and says what for. `vislam check` would end with status 1, and the change would not be merged.
 
 # %%
 folder.cleanup()

@@ -50,7 +50,7 @@ def result(audited_once: None) -> Result:
 
 @pytest.fixture(scope="module")
 def over(audited_once: None) -> Result:
-    return toolkit.compare("drive", "dead-reckoning", max_frames=FRAMES, seed=4, seeds=2, workers=1)
+    return toolkit.compare("drive", "dead-reckoning", max_frames=FRAMES, seed=1, seeds=2, workers=1)
 
 
 def ate(result: Result) -> list[float | None]:
@@ -179,7 +179,7 @@ def test_metrics_are_those_of_the_rows_and_of_the_mean_over_seeds(result: Result
 def test_records_are_a_row_of_every_value(result: Result, over: Result) -> None:
     rows = list(over.records())
     assert {(row.sequence, row.seed, row.estimator, row.output) for row in rows} == {
-        ("drive", seed, "dead-reckoning", output) for seed in (4, 5) for output in ("causal", "final")
+        ("drive", seed, "dead-reckoning", output) for seed in (1, 2) for output in ("causal", "final")
     }
     assert len(rows) == 2 * 2 * len(describe())
     by_key = {row[1:5]: row.value for row in result.records()}
@@ -189,7 +189,7 @@ def test_records_are_a_row_of_every_value(result: Result, over: Result) -> None:
 
 
 def test_seeds_are_repeated_from_the_first(over: Result) -> None:
-    assert over.comparison.seeds == (4, 5)
+    assert over.comparison.seeds == (1, 2)
     assert len(set(over.comparison.hashes)) == 2
     assert over.runs == {}
 

@@ -15,7 +15,7 @@ OneLine = Callable[[], str]
 
 @pytest.fixture(scope="module", autouse=True)
 def _audited_once(audited_once: None) -> None:
-    """Most of these tests run ten frames of the same recording."""
+    """Most of these tests run ten frames of the drive, under seeds 0 to 3 where they name one."""
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from toolkit.report.run_directory import unique_names
 Vislam = Callable[..., int]
 pytestmark = pytest.mark.usefixtures("unrendered")
 
-DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+# Nobody looks at the figures here: drawing them takes as long as all else.
+DEAD_RECKONING = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
 
 
 def test_several_sequences_get_a_directory_each(vislam: Vislam) -> None:
@@ -39,10 +40,10 @@ def test_results_go_to_a_new_directory_each_time(vislam: Vislam) -> None:
 
 
 def test_the_command_is_in_the_manifest(vislam: Vislam) -> None:
-    vislam("compare", "drive", *DEAD_RECKONING, "--out", "with space", "--seed", "7")
+    vislam("compare", "drive", *DEAD_RECKONING, "--out", "with space", "--seed", "2")
     manifest = json.loads(Path("with space/manifest.json").read_text())
-    assert manifest["command"].endswith("--out 'with space' --seed 7")
-    assert manifest["seeds"] == {"sequence": 7}
+    assert manifest["command"].endswith("--out 'with space' --seed 2")
+    assert manifest["seeds"] == {"sequence": 2}
 
 
 def test_a_start_from_the_truth_is_labelled(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:

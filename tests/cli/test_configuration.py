@@ -20,7 +20,7 @@ Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 
 pytestmark = pytest.mark.usefixtures("unrendered", "one_process")
-QUICK = ("--max-frames", "10", "--workers", "1")
+QUICK = ("--max-frames", "10", "--workers", "1", "--figures", "none")
 COST = {metric.key for metric in cost.METRICS}
 
 
@@ -166,10 +166,10 @@ def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
 
 def test_a_run_over_seeds_is_repeated_from_its_manifest(vislam: Vislam) -> None:
     words = ("--estimators", "dead-reckoning", *QUICK)
-    assert vislam("compare", "drive", *words, "--seeds", "2", "--seed", "4", "--out", "once") == 0
+    assert vislam("compare", "drive", *words, "--seeds", "2", "--seed", "1", "--out", "once") == 0
     assert vislam("compare", "--config", "once/manifest.json", "--workers", "1", "--out", "again") == 0
     once, again = (json.loads(Path(run, "seeds.json").read_text()) for run in ("once", "again"))
-    assert again["seeds"] == once["seeds"] == [4, 5]
+    assert again["seeds"] == once["seeds"] == [1, 2]
     assert again["hashes"] == once["hashes"]
     for mine, theirs in zip(again["runs"], once["runs"], strict=True):
         for key in mine["metrics"].keys() - COST:

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,47 +41,38 @@ STATUSES = ("0", "1", "2", "3", "4", "5", "70", "71", "130", "141")
 _SLOW = ("numpy", "scipy", "gtsam", "cv2", "matplotlib", "importlib.metadata")
 
 
-def _help(command: str) -> str:
-    words = [*command.split(), "--help"]
-    program = f"import sys; from toolkit.cli import main; sys.exit(main({words!r}))"
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
-    return told.stdout
-
-
-@pytest.fixture(scope="module")
-def helps() -> dict[str, str]:
-    return {command: _help(command) for command in COMMANDS}
+@cache
+def help_of(command: str) -> "subprocess.CompletedProcess[str]":
+    """Return what help prints in a process of its own, and on its stderr which slow packages it imported."""
+    program = (
+        "import sys; from toolkit.cli import main\n"
+        f"try: sys.exit(main({[*command.split(), '--help']!r}))\n"
+        f"finally: print([name for name in {_SLOW!r} if name in sys.modules], file=sys.stderr)"
+    )
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_imports_nothing_slow(command: str) -> None:
     """The 0.3 s that help may take are kept on any machine if nothing slow is imported on the way."""
-    program = (
-        "import sys; from toolkit.cli import main\n"
-        f"try: main({[*command.split(), '--help']!r})\n"
-        f"finally: print([name for name in {_SLOW!r} if name in sys.modules], file=sys.stderr)"
-    )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=300)
-    assert told.stderr.strip() == "[]"
+    assert help_of(command).stderr.strip() == "[]"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_an_example_and_the_exit_statuses(helps: dict[str, str], command: str) -> None:
-    assert re.search(r"^  \$ vislam ", helps[command], flags=re.MULTILINE)
-    told = re.findall(r"^  (\d+) ", helps[command], flags=re.MULTILINE)
+def test_help_has_an_example_and_the_exit_statuses(command: str) -> None:
+    assert re.search(r"^  \$ vislam ", help_of(command).stdout, flags=re.MULTILINE)
+    told = re.findall(r"^  (\d+) ", help_of(command).stdout, flags=re.MULTILINE)
     assert tuple(told) == STATUSES
 
 
 @pytest.mark.usefixtures("one_process", "unrendered", "own_cache")
 @pytest.mark.parametrize("command", COMMANDS)
-def test_examples_in_help_run(
-    helps: dict[str, str], command: str, vislam: Callable[..., int], kitti_drive: Path
-) -> None:
+def test_examples_in_help_run(command: str, vislam: Callable[..., int], kitti_drive: Path) -> None:
     if command == "import":
         write_tables(Path())
     if command == "tracks":
         shutil.copytree(kitti_drive, "kitti/sequences/06")
-    examples = re.findall(r"^  \$ vislam (.*)$", helps[command], flags=re.MULTILINE)
+    examples = re.findall(r"^  \$ vislam (.*)$", help_of(command).stdout, flags=re.MULTILINE)
     assert examples
     for example in examples:
         assert vislam(*shlex.split(example)) == 0, example

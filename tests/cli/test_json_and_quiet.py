@@ -6,7 +6,8 @@ import pytest
 
 from toolkit.cli import main
 
-COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "6", "--workers", "1")
+QUICK = ("--max-frames", "6", "--workers", "1", "--figures", "none")
+COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK)
 
 
 @pytest.mark.usefixtures("audited_once", "unrendered")

@@ -13,7 +13,7 @@ OneLine = Callable[[], str]
 
 pytestmark = pytest.mark.usefixtures("unrendered")
 
-QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
+QUICK = ("--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1", "--figures", "none")
 
 
 def payload_of(page: Path) -> dict[str, Any]:

@@ -19,7 +19,8 @@ from toolkit.report.records import read_manifest
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
 Starts = Callable[[tuple[str, ...], Path, Mapping[str, str]], subprocess.Popen[str]]
-SWEEP = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--max-frames", "10", "--seeds", "3")
+QUICK = ("--max-frames", "10", "--figures", "none")
+SWEEP = ("compare", "drive", "--estimators", "dead-reckoning,ekf", "--seeds", "3", *QUICK)
 PROJECT = str(Path(__file__).parents[2])
 
 pytestmark = pytest.mark.usefixtures("unrendered")

@@ -144,7 +144,8 @@ def test_stamps_are_those_of_the_frames_and_the_end_covers_all_of_them(build: Bu
 
 
 def without_vision(sequence: Sequence, frames: range) -> Sequence:
-    return replace(sequence, observations=sequence.observations.select(~np.isin(sequence.observations.frame, frames)))
+    seen = sequence.observations
+    return replace(sequence, observations=seen.select((seen.frame < frames.start) | (seen.frame >= frames.stop)))
 
 
 @both_kinds
@@ -188,10 +189,11 @@ def test_without_noise_and_a_third_of_the_right_images_it_recovers_the_truth(nam
 def test_a_third_of_the_right_images_costs_less_than_as_much_again(name: str, build: Build) -> None:
     """And gains nothing but by chance: one draw, whose error another choice of what is withheld moves by a tenth."""
     whole = recording("drive")
-    run, other = (run_on(name, build, one) for one in (whole, faults.missing_right(whole, 1.0 / 3.0, SEED)))
-    assert other.status == "ok", other.log
-    assert run.final is not None and other.final is not None
-    assert 0.9 * error_m(run.final, whole) < error_m(other.final, whole) < 2.0 * error_m(run.final, whole)
+    usual_m = error_m(watched(build, "drive").finished.trajectory, whole)
+    run = run_on(name, build, faults.missing_right(whole, 1.0 / 3.0, SEED))
+    assert run.status == "ok", run.log
+    assert run.final is not None
+    assert 0.9 * usual_m < error_m(run.final, whole) < 2.0 * usual_m
 
 
 def with_nan(sequence: Sequence, where: str) -> Sequence:

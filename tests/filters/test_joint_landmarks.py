@@ -1,5 +1,7 @@
 """Which landmarks of a joint belief a frame may correct, whichever way the update is made."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from toolkit.sequence import StereoFrame
 from toolkit.simulation import FLIGHT, simulate
 from toolkit.track_noise import TrackNoise
 
-SEQUENCE = simulate(FLIGHT, 0)
+SEQUENCE = simulate(replace(FLIGHT, duration_s=1.0), 0)
 
 
 def belief_with_a_landmark(depth_m: float) -> JointBelief:

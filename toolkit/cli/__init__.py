@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from types import FrameType
 
 from toolkit.cli import (
@@ -52,6 +53,7 @@ _COMMANDS = (
 )
 
 
+@cache
 def parser() -> Parser:
     """Return the parser of the whole command line; each subcommand puts its function in ``command``."""
     root = Parser(

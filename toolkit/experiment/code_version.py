@@ -41,6 +41,7 @@ def numeric_versions() -> dict[str, str]:
     }
 
 
+@cache
 def installed_version(package: str) -> str | None:
     """Return the version of a distribution, or None where it is not installed."""
     try:

@@ -6,6 +6,8 @@ rows, of which one says nothing, and what works on whole frames needs no second 
 one noise, and three degrees of freedom, where no right image is missing.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -45,7 +47,7 @@ def noise_px2(uvs_px: Array, rig: StereoRig) -> Array:
 
     The row of uR is to be taken with those of :func:`residuals_px` and :func:`seen_rows`, which are zero.
     """
-    return _each(uvs_px, rig.cov_uv_px2, _left_noise_px2(rig))
+    return _each(uvs_px, rig.cov_uv_px2, _left_noise_px2, rig)
 
 
 def whitener(uvs_px: Array, rig: StereoRig) -> Array:
@@ -53,7 +55,7 @@ def whitener(uvs_px: Array, rig: StereoRig) -> Array:
 
     It does not make a row zero that is NaN: residuals are those of :func:`residuals_px`.
     """
-    return _each(uvs_px, rig.whitener, left_whitener(rig))
+    return _each(uvs_px, rig.whitener, left_whitener, rig)
 
 
 def left_whitener(rig: StereoRig) -> Array:
@@ -86,6 +88,7 @@ def _left_noise_px2(rig: StereoRig) -> Array:
     return cov_px2
 
 
-def _each(uvs_px: Array, whole: Array, left: Array) -> Array:
+def _each(uvs_px: Array, whole: Array, left: Callable[[StereoRig], Array], rig: StereoRig) -> Array:
+    """Return ``whole`` where no right image is missing, else one each: what ``left`` gives for the rig where it is."""
     missing: BoolArray = is_left_only(uvs_px)
-    return np.where(missing[..., None, None], left, whole) if missing.any() else whole
+    return np.where(missing[..., None, None], left(rig), whole) if missing.any() else whole
