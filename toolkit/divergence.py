@@ -18,6 +18,7 @@ from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import Sequence
+from toolkit.track_noise import TrackNoise
 
 # A windowed filter corrects by several frames' tracks at once: five times the motion noise of one frame.
 _LUMP_FRAMES = 5
@@ -50,11 +51,13 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     )
 
 
-def gate_collapse(info: Mapping[str, Array]) -> str | None:
+def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = None) -> str | None:
     """Return why an estimator with these diagnostics of N frames has diverged, or None.
 
-    Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error.
+    Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error, or the
+    noise of tracks that it was told is less than theirs.
     """
+    doubt = "" if track_noise is None else ", or its tracks err more than it was told (noise.tracks)"
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])
@@ -63,7 +66,7 @@ def gate_collapse(info: Mapping[str, Array]) -> str | None:
         if count >= _FEWEST_TESTED and passed < LEAST_ACCEPTED * count:
             return (
                 f"{100.0 * passed / count:.0f} % of {words} passed its own gate: its covariance does not cover its "
-                f"error (at least {100.0 * LEAST_ACCEPTED:.0f} % pass in a run that works)"
+                f"error{doubt} (at least {100.0 * LEAST_ACCEPTED:.0f} % pass in a run that works)"
             )
     return None
 

@@ -54,7 +54,7 @@ class ErringBelief(JointBelief):
         self._cov = self._cov[np.ix_(order, order)]
         self.landmark_ids = np.concatenate([self.landmark_ids, started.track_ids])
         self.points = np.concatenate([self.points, started.points])
-        self.first_points = np.concatenate([self.first_points, started.points])
+        self.first_points = np.concatenate([self.first_points, started.first_points])
         self.track_errors_px = np.concatenate([self.track_errors_px, started.track_errors_px])
         self.ages = np.concatenate([self.ages, ages])
 
@@ -127,10 +127,13 @@ class Started(NamedTuple):
     """N landmarks (N, 3) and errors of their tracks (N, 3) px as sightings from a window tell them.
 
     Their errors, six a landmark, are ``jacobian`` (6 N, n) times the state's plus noise of covariance ``cov``.
+    ``first_points`` (N, 3) are those that the sightings were linearised at. Later ones must be as well: between two
+    places of a landmark there is heading that nobody measured, and a noise of a tenth of a pixel makes much of it.
     """
 
     track_ids: IntArray
     points: Array
+    first_points: Array
     track_errors_px: Array
     jacobian: Array
     cov: Array
@@ -170,6 +173,5 @@ def started(joint: ErringBelief, sightings: TrackSightings, points: Array, linea
         [np.concatenate([cov_point, across], 2), np.concatenate([np.swapaxes(across, 1, 2), own], 2)], 1
     )
     cov[np.arange(count), :, np.arange(count), :] = each
-    return Started(
-        sightings.track_ids, points + moves[:, :3], moves[:, 3:], jacobian, cov.reshape(6 * count, 6 * count)
-    )
+    moved, errors_px = points + moves[:, :3], moves[:, 3:]
+    return Started(sightings.track_ids, moved, points, errors_px, jacobian, cov.reshape(6 * count, 6 * count))

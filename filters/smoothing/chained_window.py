@@ -24,6 +24,11 @@ class ChainedWindow:
         self._slots: list[int] = []
 
     @property
+    def is_used(self) -> bool:
+        """Say whether the rig states noise of tracks at all."""
+        return self._rig.track_noise is not None
+
+    @property
     def slots(self) -> list[int]:
         """Return where in the graph the factors are."""
         return self._slots

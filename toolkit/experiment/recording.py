@@ -21,7 +21,7 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
-from toolkit.track_errors import Card, card_of, fit_track_noise, in_words
+from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, in_words
 from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
@@ -103,7 +103,9 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         card = None
         if recording.noise.tracks == "fitted":
             whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
-        elif recording.card:
+        elif recording.noise.tracks == "correlated":
+            whole = _with_doubts(whole, _cut(whole, recording))
+        if recording.card and card is None:
             used = _cut(whole, recording)
             card = card_of(used, fit_track_noise(used))
         used, budget = _cut(whole, recording), recording.tracks.budget
@@ -234,6 +236,15 @@ def _stated_track_noise(asked: Noise) -> TrackNoise:
     """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
     white, walk, offset = asked.track_white_px, asked.track_walk_px, asked.track_offset_px
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
+
+
+def _with_doubts(whole: Sequence, used: Sequence) -> Sequence:
+    """Return the whole recording; a fact tells where the tracks that are used contradict the noise that was stated."""
+    assert used.rig.track_noise is not None
+    doubt = contradicted(used.rig.track_noise, used)
+    if doubt is None:
+        return whole
+    return replace(whole, provenance=replace(whole.provenance, facts=(*whole.provenance.facts, doubt)))
 
 
 def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) -> tuple[Sequence, Card]:

@@ -1,11 +1,12 @@
 """What the errors of real tracks are like, found from a recording's own visible tracks, without truth.
 
 Read ``tracklets`` (the tracks, by length), ``linearised`` (their residuals and derivatives), ``adjustment`` (poses that
-suit all tracks), ``likelihood`` (how probable a noise makes the residuals), ``fit`` (which noise it is), and ``card``
-(what is told of it).
+suit all tracks), ``likelihood`` (how probable a noise makes the residuals), ``fit`` (which noise it is), ``card`` (what
+is told of it), and ``statement`` (whether a noise that is stated can be theirs).
 """
 
 from toolkit.track_errors.card import Card, card_of
 from toolkit.track_errors.fit import Fit, fit_track_noise, in_words
+from toolkit.track_errors.statement import contradicted
 
-__all__ = ["Card", "Fit", "card_of", "fit_track_noise", "in_words"]
+__all__ = ["Card", "Fit", "card_of", "contradicted", "fit_track_noise", "in_words"]

@@ -16,13 +16,15 @@ class OneStep(NamedTuple):
     """P neighbouring sightings of a track, in time: their rows (P,), the second's residual (P, 3) px, and its noise.
 
     A point triangulated from the first, whose noise is R, and projected into the second's frame misses the sighting
-    there by ``cov_px2`` (P, 3, 3) = J R J^T + R if both err by themselves.
+    there by ``cov_px2`` (P, 3, 3) = J R J^T + R if both err by themselves. ``jacobian`` (P, 3, 3) is J, how far the
+    second's prediction moves with the first.
     """
 
     before: IntArray
     after: IntArray
     residual_px: Array
     cov_px2: Array
+    jacobian: Array
 
 
 def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
@@ -36,4 +38,4 @@ def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
     d_after_d_before = T_after_before[:, :3, :3] @ np.linalg.inv(projection_jacobian(before, rig))
     jacobian = projection_jacobian(after, rig) @ d_after_d_before
     cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
-    return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2)
+    return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2, jacobian)
