@@ -166,6 +166,18 @@ def test_the_camera_is_put_where_it_is(clean_recording: Make, planted: PlantIn, 
     np.testing.assert_allclose(repaired.rig.T_imu_cam, clean.rig.T_imu_cam, atol=1e-12)
 
 
+@pytest.mark.parametrize("share", [-0.02, 0.02])
+def test_wheels_that_slip_in_turns_leave_it_open_where_the_camera_is(clean_recording: Make, share: float) -> None:
+    """Velocities of a point behind the IMU, that slip to one side by 2 % in every turn, as those of sound cars do."""
+    clean = clean_recording("drive")
+    w_radps, v_mps = clean.motion.w_radps, clean.motion.v_mps.copy()
+    v_mps[:, 1] += share * v_mps[:, 0] * np.sign(w_radps[:, 2]) * (np.abs(w_radps[:, 2]) > 0.1)
+    v_mps += np.cross(w_radps, [-0.65, 0.0, 0.0])
+    outcome = audit(replace(clean, motion=replace(clean.motion, v_mps=v_mps)))
+    assert "turns so few or wide tell no better" in outcome.undecided["extrinsic-translation"]
+    assert np.array_equal(outcome.sequence.rig.T_imu_cam, clean.rig.T_imu_cam)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_late_twists_give_every_interval_its_clean_motion(clean_recording: Make, planted: PlantIn, seed: int) -> None:
     clean = clean_recording("drive", seed)
