@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
-from toolkit.geometry import Array, so3_exp
+from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence
 
 Make = Callable[..., Sequence]
@@ -157,6 +157,28 @@ def test_any_right_handed_turn_of_the_axes_is_undone(clean_recording: Make, scen
     assert [f.fault for f in outcome.findings] == ["mixed-axes"]
     # Turns are exact; what is left is rounding.
     np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", np.eye(3), ids="xyz")
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_a_camera_turned_in_its_place_is_turned_back_and_stays_there(
+    clean_recording: Make, scenario: str, axis: Array
+) -> None:
+    rig = clean_recording(scenario).rig
+    T_imu_cam = rig.T_imu_cam @ se3(so3_exp(np.pi * axis), np.zeros(3))
+    outcome = audit(replace(clean_recording(scenario), rig=replace(rig, T_imu_cam=T_imu_cam)))
+    assert [f.fault for f in outcome.findings] == ["mixed-axes"]
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+
+
+def test_samples_in_other_axes_beside_a_place_measured_in_the_right_ones_leave_it_where_it_is(
+    clean_recording: Make,
+) -> None:
+    rig = clean_recording("drive").rig
+    T_imu_cam = se3(np.diag([-1.0, -1.0, 1.0]) @ rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3])
+    outcome = audit(replace(clean_recording("drive"), rig=replace(rig, T_imu_cam=T_imu_cam)))
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+    assert outcome.findings[0].fault == "mixed-axes"
 
 
 @pytest.mark.parametrize("seed", range(3))
