@@ -9,8 +9,8 @@ repaired or not; faults that could not be judged do not count. In a sound record
 is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` is a third draw, of stretches
-that neither has, with a recording drawn for every fault.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` is a third draw, of others
+yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
