@@ -95,6 +95,16 @@ def test_a_vehicle_that_brakes_hard_and_stays_slow_leaps_not() -> None:
     assert "implausible" not in told(outcome)
 
 
+def test_mismatches_beneath_a_noise_that_is_stated_too_large_are_told_by_their_size() -> None:
+    clean = faults.wrong_noise(sound("drive"), 2.0)
+    assert "track-scatter" not in told(audit(clean))
+    said = told(audit(faults.exchanged_tracks(clean, 0.1, 1)))["track-scatter"]
+    found = re.search(r"frame ([\d.]+)% \+- ([\d.]+)% of the sightings miss", said)
+    assert found is not None
+    # An exchanged sighting spoils the step to it and the one from it: nearly twice the share, less those lost as pairs.
+    assert 10.0 < float(found[1]) < 20.0
+
+
 def test_samples_that_are_rarer_than_frames_are_told() -> None:
     assert "every 1 s and frames every 0.1 s" in told(audit(faults.thinned_motion(sound("drive"))))["sparse-motion"]
     assert "sparse-motion" not in told(audit(faults.thinned_motion(sound("drive"), 3.0)))
