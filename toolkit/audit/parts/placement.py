@@ -12,8 +12,9 @@ from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import Array, skew
 from toolkit.sequence import Sequence
 
-# Logarithm of the odds from which the other place is taken: a thousand to one.
-LOG_ODDS = float(np.log(1000.0))
+# Logarithms of the odds from which the other place is taken, a thousand to one, and from which it is not thought of any
+# more, twenty to one against it: what a file says is right more often than not.
+LOG_ODDS, LOG_ODDS_AGAINST = float(np.log(1000.0)), float(np.log(20.0))
 # Standard deviations from which on the measured place is not the other one.
 MOST_SIGMAS = 4.0
 # What sound odometry has, chosen with the recordings at hand in view: velocities of another point along the way of
@@ -33,13 +34,18 @@ def way_gone(sequence: Sequence, intervals: Intervals, found: Alignment, way_m: 
 
 
 def is_there(share: Scalar) -> bool:
-    """Say whether the camera is at the way's end, by the odds of normal errors, and not elsewhere."""
-    return not is_excluded(share) and (share.value - 0.5) / share.error**2 > LOG_ODDS
+    """Say whether the camera is at the way's end, and not elsewhere."""
+    return not is_excluded(share) and _log_odds(share) > LOG_ODDS
 
 
 def is_excluded(share: Scalar) -> bool:
-    """Say whether the camera cannot be at the way's end."""
-    return abs(share.value - 1.0) > MOST_SIGMAS * share.error
+    """Say whether the camera is not at the way's end."""
+    return abs(share.value - 1.0) > MOST_SIGMAS * share.error or _log_odds(share) < -LOG_ODDS_AGAINST
+
+
+def _log_odds(share: Scalar) -> float:
+    """Return the logarithm of the odds of the way's end against its begin, of normal errors."""
+    return (share.value - 0.5) / share.error**2
 
 
 def metres(position: Array) -> str:
