@@ -48,7 +48,7 @@ def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[.
 
 
 def test_every_fault_has_a_summary_of_one_line() -> None:
-    assert len(faults()) == 31
+    assert len(faults()) == 35
     assert all(summary and "\n" not in summary for summary in faults().values())
 
 

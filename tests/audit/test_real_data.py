@@ -2,6 +2,7 @@
 
 import os
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
+from toolkit.audit.parts.subsets import keep_frames, keep_samples
 from toolkit.datasets import load_sequence
+from toolkit.geometry import se3
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.camera_motion import camera_motion
 
@@ -90,6 +93,21 @@ def test_kitti00_raises_no_finding_but_that_its_tracks_errors_go_together() -> N
 def test_the_camera_moves_to_where_kitti_mounts_it(name: str) -> None:
     position = audited(name).sequence.rig.T_imu_cam[:3, 3]
     assert position == pytest.approx([1.1, -0.31, 0.73], abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["ucsd/03.npz", "ucsd/0022.npz", "ucsd/0027.npz"])
+@pytest.mark.parametrize("first", [0, 250, 500])
+def test_no_25_s_of_a_drive_put_a_camera_elsewhere_that_is_where_it_should_be(name: str, first: int) -> None:
+    """Turns that are few or wide leave it open; to the wrong place it goes from neither, nor from the inverse's."""
+    whole = audited(name).sequence
+    right = whole.rig.T_imu_cam
+    part = keep_frames(whole, np.arange(first, first + 250))
+    in_time = (part.motion.t_ns >= part.frames_t_ns[0]) & (part.motion.t_ns <= part.frames_t_ns[-1])
+    part = keep_samples(part, in_time)
+    np.testing.assert_allclose(audit(part).sequence.rig.T_imu_cam, right, atol=1e-12)
+    inverse = se3(right[:3, :3], -right[:3, :3] @ right[:3, 3])
+    position = audit(replace(part, rig=replace(part.rig, T_imu_cam=inverse))).sequence.rig.T_imu_cam[:3, 3]
+    assert min(np.linalg.norm(position - place) for place in (right[:3, 3], inverse[:3, 3])) < 1e-9
 
 
 def test_the_kitti_twists_describe_the_interval_before_their_stamp() -> None:

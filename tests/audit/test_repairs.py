@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
-from toolkit.geometry import Array, so3_exp
+from toolkit.audit.fault import Evidence
+from toolkit.audit.parts.alignment import Alignment
+from toolkit.audit.parts.placement import is_excluded, is_there, way_gone
+from toolkit.audit.parts.robust import Scalar
+from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence
 
 Make = Callable[..., Sequence]
@@ -159,11 +163,53 @@ def test_any_right_handed_turn_of_the_axes_is_undone(clean_recording: Make, scen
     np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
 
 
+@pytest.mark.parametrize("axis", np.eye(3), ids="xyz")
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_a_camera_turned_in_its_place_is_turned_back_and_stays_there(
+    clean_recording: Make, scenario: str, axis: Array
+) -> None:
+    rig = clean_recording(scenario).rig
+    T_imu_cam = rig.T_imu_cam @ se3(so3_exp(np.pi * axis), np.zeros(3))
+    outcome = audit(replace(clean_recording(scenario), rig=replace(rig, T_imu_cam=T_imu_cam)))
+    assert [f.fault for f in outcome.findings] == ["mixed-axes"]
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+
+
+def test_samples_in_other_axes_beside_a_place_measured_in_the_right_ones_leave_it_where_it_is(
+    clean_recording: Make,
+) -> None:
+    rig = clean_recording("drive").rig
+    T_imu_cam = se3(np.diag([-1.0, -1.0, 1.0]) @ rig.T_imu_cam[:3, :3], rig.T_imu_cam[:3, 3])
+    outcome = audit(replace(clean_recording("drive"), rig=replace(rig, T_imu_cam=T_imu_cam)))
+    np.testing.assert_allclose(outcome.sequence.rig.T_imu_cam, rig.T_imu_cam, atol=1e-12)
+    assert outcome.findings[0].fault == "mixed-axes"
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_camera_is_put_where_it_is(clean_recording: Make, planted: PlantIn, seed: int) -> None:
     clean = clean_recording("drive", seed)
     repaired = audit(planted("extrinsic-translation", clean)).sequence
     np.testing.assert_allclose(repaired.rig.T_imu_cam, clean.rig.T_imu_cam, atol=1e-12)
+
+
+def test_a_place_is_taken_excluded_or_left_open_by_its_odds() -> None:
+    """Odds of a normal error about the way's end and its begin: a thousand to one for it, twenty to one against it."""
+    assert is_there(Scalar(1.0, 0.26)) and not is_there(Scalar(1.0, 0.28))
+    assert is_excluded(Scalar(0.0, 0.4)) and not is_excluded(Scalar(0.0, 0.42))
+    assert is_excluded(Scalar(2.0, 0.2)) and not is_there(Scalar(2.0, 0.2))  # beyond it, where neither is
+
+
+def test_what_slip_could_feign_is_no_place_of_the_camera(clean_recording: Make) -> None:
+    """However little the tracks scatter, 0.65 m along the way of travel and 2 % of a turn's radius stay open."""
+    clean = clean_recording("drive")
+    evidence = Evidence(clean)
+    assert evidence.intervals is not None
+    exact = Alignment(Scalar(0.0, 0.0), np.zeros(3), 1e-12 * np.eye(3))
+    ahead, aside = (way_gone(clean, evidence.intervals, exact, way) for way in np.eye(3)[:2])
+    assert ahead.error > 0.64  # the way of travel is not quite the x axis
+    turning = np.abs(clean.motion.w_radps[:, 2]) > 0.3
+    radii_m = np.linalg.norm(clean.motion.v_mps[turning], axis=1) / np.abs(clean.motion.w_radps[turning, 2])
+    assert 0.02 * radii_m.min() < aside.error < 0.02 * radii_m.max()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,7 +9,8 @@ repaired or not; faults that could not be judged do not count. In a sound record
 is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` is a third draw, of others
+yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -82,7 +83,7 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score")
+HALVES = ("fit", "score", "fresh")
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
@@ -113,9 +114,10 @@ def scenarios(half: str) -> list[Scenario]:
     Sound stretches come first: all cheap estimators run on them, and of the dear ones those that meet a fault there.
     """
     first_seed, faulty = 1000 * (1 + HALVES.index(half)), list[Scenario]()
+    drawn = np.random.default_rng(first_seed).integers(len(LENGTH_S), size=len(FAULTS))
     for i, fault in enumerate(FAULTS):
         for j, recording in enumerate(LENGTH_S):
-            if (i + j) % 2 == HALVES.index(half):
+            if (j == drawn[i]) if half == "fresh" else (i + j) % 2 == HALVES.index(half):
                 count = len(faulty)
                 cheap = (CHEAP[(2 * count + k) % len(CHEAP)] for k in range(2))
                 dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 else ()

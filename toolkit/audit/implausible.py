@@ -1,16 +1,26 @@
-"""Single values no sensor gives: a flipped bit or a failed parse, of which one ruins a whole run."""
+"""Single values no sensor gives: a flipped bit or a failed parse, of which one ruins a whole run.
+
+Odometry has a vehicle behind it: one sample that leaves both its neighbours, and comes back, faster than any vehicle
+can is none of its motion, however plausible the value is. An accelerometer that is knocked does just that.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.robust import MAD_TO_SIGMA
 from toolkit.audit.parts.subsets import keep_samples
 from toolkit.geometry import Array, BoolArray
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 # Beyond any image (px), vehicle (m/s), accelerometer (m/s^2) and gyro (rad/s).
 MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
+# Beyond what any vehicle's velocity and rate of rotation change by (m/s^2, rad/s^2): ten times gravity, and as much.
+MOST_CHANGE = 100.0
+# Noise may step further where samples come fast: single ones are beyond this many standard deviations of such steps.
+BEYOND_STEPS = 20.0
 # A unit makes all samples too large; single ones are beyond this many times the median.
 BEYOND_MEDIAN = 1e3
 
@@ -47,7 +57,20 @@ def _implausible_samples(sequence: Sequence) -> BoolArray:
         largest = columns.max(axis=1, initial=0.0)
         if largest.size:
             beyond |= (largest > most) & (largest > BEYOND_MEDIAN * np.median(largest))
-    return beyond
+    return beyond | _leaps(sequence)
+
+
+def _leaps(sequence: Sequence) -> BoolArray:
+    """Say which twists (S,) leave their neighbours on both sides, the same way, faster than a vehicle can."""
+    values, t_s = sequence.motion.values, sequence.motion.t_ns / NS_PER_S
+    leaps = np.zeros(len(values), dtype=bool)
+    if sequence.motion_kind != "twist" or len(values) < 3:
+        return leaps
+    step, step_s = np.diff(values, axis=0), np.diff(t_s)[:, None]
+    usual = MAD_TO_SIGMA * np.median(np.abs(step), axis=0)
+    far = np.abs(step) > np.maximum(MOST_CHANGE * step_s, BEYOND_STEPS * usual)
+    leaps[1:-1] = (far[1:] & far[:-1] & (step[1:] * step[:-1] < 0.0)).any(axis=1)
+    return leaps
 
 
 def _largest(sequence: Sequence, sightings: BoolArray, samples: BoolArray) -> float:
@@ -59,5 +82,5 @@ FAULT = Fault(
     "implausible",
     "single sightings or motion samples beyond anything a sensor gives",
     check,
-    after=("not-finite",),
+    after=("not-finite", "time-order"),
 )

@@ -1,9 +1,10 @@
-"""Motion samples and extrinsic that follow different conventions for the axes of the body, or for its direction.
+"""Motion samples and extrinsic that follow different conventions for axes, or for the direction of the extrinsic.
 
-The camera's own motion, taken through the extrinsic, must be the measured motion. Of the 24 right-handed ways
-to name three axes, and the inverse of the extrinsic, the one that explains the samples best is found; if it is not
-the recording's own, and the difference is beyond doubt, the extrinsic is turned to it, or inverted. A gyro bias does
-not matter here: the median is off.
+The camera's own motion, taken through the extrinsic, must be the measured motion. Either the body's axes are named
+otherwise, and the extrinsic turns as a whole, or the camera's are, and it turns in its place: 24 right-handed ways to
+name three axes each, and the inverse of the extrinsic. The one that explains the samples best is found; if it is not
+the recording's own, and the difference is beyond doubt, it is taken. Which of the two places the camera has, turns of
+the vehicle tell, or it is said that they do not. A gyro bias does not matter here: the median is off.
 
 The rotations alone must not speak against it, over all ways to exchange and negate three channels: where they do, some
 channels are wrong and not the extrinsic, and nothing is repaired. Velocities alone decide nothing: cars slip sideways,
@@ -13,11 +14,15 @@ against the signs of the small components.
 import itertools
 import math
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.intervals import Intervals, median_one_step_px
+from toolkit.audit.parts.placement import is_excluded, is_there, metres, way_gone
 from toolkit.audit.parts.robust import spread
 from toolkit.geometry import Array, se3, se3_inverse
 
@@ -28,43 +33,133 @@ AGAINST_SECOND = 4.0
 # What the camera's own rotation (rad/s) and velocity (m/s) of one interval are good for.
 LEAST_SPREAD_W = 0.003
 LEAST_SPREAD_V = 0.05
+# Cameras that look the same way to this angle: a turn of the body's axes and one of the camera's.
+SAME_WAY_RAD = 0.2
+# Places that are no further apart are one.
+NEAR_M = 0.01
 _OWN = "x, y, z"
+
+
+class Reading(NamedTuple):
+    """An extrinsic (4, 4) that another convention makes of the given one.
+
+    ``name`` says which, ``cause`` what is wrong with the given one, and ``done`` what is done to it. ``other_m`` (3,)
+    is where else the camera may be: a turn of the body's axes moves its place as well, unless that was measured by hand
+    in the right ones, and one of the camera's does not.
+    """
+
+    T_imu_cam: Array
+    name: str
+    cause: str
+    done: str
+    other_m: Array
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Find the extrinsic with which samples and camera agree; take it where it is not the given one."""
     if evidence.intervals is None:
         return evidence.blind
-    given, turns = evidence.sequence.rig.T_imu_cam, _right_handed_axes()
-    candidates = np.concatenate([se3(turns, np.zeros(3)) @ given, se3_inverse(given)[None]])  # the first is the given
-    costs = _costs(evidence.intervals, candidates)  # (25, M)
-    first, second = np.argsort(costs.mean(axis=1))[:2]
-    if _of_rotations(evidence.intervals, candidates[first]) != _OWN:
-        alone = _of_rotations(evidence.intervals, given)
-        return Symptom(
-            count=1,
-            detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
-            treatment="channels of the samples are exchanged or have the wrong sign, and not all alike: set them right",
-            remedy=None,
-        )
+    given = evidence.sequence.rig.T_imu_cam
+    readings = _readings(given)  # the first is the given
+    costs = _costs(evidence.intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
+    first, second = _best_two(readings, costs)
+    better, alone = _sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
+    at_odds = _of_rotations(evidence.intervals, readings[first].T_imu_cam) != _OWN
+    if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
+        return _exchanged(alone)
     if first == 0 and (certainty := _sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
         return Undecided(
-            f"{_named(turns, second)} explains the motion as well as what is given ({certainty:.1f} sigma)"
+            f"{readings[second].name} explains the motion as well as what is given ({certainty:.1f} sigma)"
         )
     if first == 0:
         return None
-    if (certainty := _sigmas(costs[0] - costs[first])) < AGAINST_GIVEN:
-        return Undecided(
-            f"{_named(turns, first)} explains the motion better than what is given, by {certainty:.1f} sigma"
-        )
+    if better < AGAINST_GIVEN:
+        return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
     certain = _sigmas(costs[second] - costs[first]) > AGAINST_SECOND
-    remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=candidates[first]))
+    taken, doubt = _settled(evidence, evidence.intervals, [readings[k] for k in _twins(readings, first)])
+    remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
         count=1,
-        detail=f"{_explained(turns, first)}: {_residuals(evidence, candidates[first])} {_done(turns, first)}",
-        treatment=_treatment(turns, first) if certain else f"{_named(turns, second)} explains it as well: choose one",
+        detail=f"{taken.cause}: {_residuals(evidence, taken.T_imu_cam)} then{doubt}",
+        treatment=taken.done if certain else f"{readings[second].name} explains it as well: choose one",
         remedy=remedy if certain else None,
     )
+
+
+def _exchanged(alone: str) -> Symptom:
+    return Symptom(
+        count=1,
+        detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
+        treatment="channels of the samples are exchanged or have the wrong sign, and not all alike: set them right",
+        remedy=None,
+    )
+
+
+def _readings(given: Array) -> tuple[Reading, ...]:
+    """Return the extrinsic in all conventions: as given, the body's axes named otherwise, the camera's, inverted."""
+    place_m, turns = given[:3, 3], [se3(turn, np.zeros(3)) for turn in _right_handed_axes()[1:]]
+    as_given = Reading(given, _OWN, "", "", place_m)
+    return (as_given, *map(partial(_of_body, given), turns), *map(partial(_of_camera, given), turns), _inverse(given))
+
+
+def _of_body(given: Array, turn: Array) -> Reading:
+    axes = _axes_named(turn[:3, :3])
+    cause = f"the motion samples' axes are the extrinsic's {axes}"
+    return Reading(turn @ given, axes, cause, "the extrinsic is turned to the samples' axes", given[:3, 3])
+
+
+def _of_camera(given: Array, turn: Array) -> Reading:
+    axes = _axes_named(turn[:3, :3].T)
+    cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
+    done = "the camera is turned in its place"
+    return Reading(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
+
+
+def _inverse(given: Array) -> Reading:
+    T_imu_cam, cause = se3_inverse(given), "T_imu_cam is inverted, from the IMU to the camera"
+    return Reading(T_imu_cam, "the inverse of the extrinsic", cause, "the extrinsic is inverted", T_imu_cam[:3, 3])
+
+
+def _best_two(readings: tuple[Reading, ...], costs: Array) -> tuple[int, int]:
+    """Return the best reading and the best that looks another way."""
+    order = [int(k) for k in np.argsort(costs.mean(axis=1))]
+    twins = _twins(readings, order[0])
+    return order[0], next(k for k in order if k not in twins)
+
+
+def _twins(readings: tuple[Reading, ...], one: int) -> list[int]:
+    """Return the readings that look as one does, itself among them: the camera's axes turned, or the body's.
+
+    What is given and its inverse are nobody's twins.
+    """
+    R_imu_cam = np.stack([reading.T_imu_cam[:3, :3] for reading in readings])
+    apart_rad = np.linalg.norm(R_imu_cam - R_imu_cam[one], axis=(1, 2)) / np.sqrt(2.0)  # of small angles
+    alone = (0, len(readings) - 1)
+    return [k for k in range(len(readings)) if k == one or (apart_rad[k] < SAME_WAY_RAD and not {k, one} & {*alone})]
+
+
+def _settled(evidence: Evidence, intervals: Intervals, twins: list[Reading]) -> tuple[Reading, str]:
+    """Return the best of readings that look the same way, at the place that turns tell, and the doubt in words."""
+    costs = _costs(intervals, np.stack([one.T_imu_cam for one in twins])).mean(axis=1)
+    place_m, doubt = _placed(evidence, intervals, twins[int(np.argmin(costs))])
+    placed = [one._replace(T_imu_cam=se3(one.T_imu_cam[:3, :3], place_m)) for one in twins]
+    costs = _costs(intervals, np.stack([one.T_imu_cam for one in placed])).mean(axis=1)
+    return placed[int(np.argmin(costs))], doubt
+
+
+def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple[Array, str]:
+    """Return the place (3,) m of a reading's camera, or its other one where turns have it there."""
+    here, other = reading.T_imu_cam[:3, 3], reading.other_m
+    turned = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=reading.T_imu_cam))
+    found = alignment(turned, evidence.camera_motion, intervals)
+    if found is None or np.linalg.norm(other - here) < NEAR_M:
+        return here, ""
+    share = way_gone(turned, intervals, found, other - here)
+    if is_there(share):
+        return other, f"; turns put the camera at {metres(other)} and not at {metres(here)}"
+    if is_excluded(share):
+        return here, ""
+    return here, f"; whether the camera is at {metres(here)}, as taken, or at {metres(other)}, turns do not tell"
 
 
 def _right_handed_axes() -> Array:
@@ -118,31 +213,9 @@ def _sigmas(difference: Array) -> float:
     return float(np.mean(difference)) / max(error, 1e-12)
 
 
-def _named(turns: Array, candidate: int) -> str:
-    """Name a candidate: the axes that the new x, y and z are, for example "x, -y, -z", or the inverse."""
-    if candidate == len(turns):
-        return "the inverse of the extrinsic"
-    return _axes_named(turns[candidate])
-
-
 def _axes_named(turn: Array) -> str:
     largest = np.argmax(np.abs(turn), axis=1)
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
-
-
-def _explained(turns: Array, candidate: int) -> str:
-    if candidate == len(turns):
-        return "T_imu_cam is inverted, from the IMU to the camera"
-    return f"the motion samples' axes are the extrinsic's {_named(turns, candidate)}"
-
-
-def _treatment(turns: Array, candidate: int) -> str:
-    done = f"the extrinsic is {_done(turns, candidate)}"
-    return done if candidate == len(turns) else f"{done} to the samples' axes"
-
-
-def _done(turns: Array, candidate: int) -> str:
-    return "inverted" if candidate == len(turns) else "turned"
 
 
 def _residuals(evidence: Evidence, T_imu_cam: Array) -> str:

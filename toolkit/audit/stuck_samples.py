@@ -1,7 +1,7 @@
-"""An accelerometer or a gyro that repeats one value: a driver that hangs, a sensor that is not connected.
+"""An accelerometer, a gyro or odometry that repeats one value: a driver that hangs, a sensor that is not connected.
 
-Real samples carry noise, and three axes of it are never equal again and again. Odometry may well repeat itself (a wheel
-that stands still gives zeros), so only an IMU is judged.
+Real samples carry noise, and three axes of it are never equal again and again. Odometry may well repeat itself, for a
+wheel that stands still gives zeros and one that rolls straight ahead whole counts; it counts where it moves and turns.
 """
 
 import numpy as np
@@ -15,18 +15,22 @@ from toolkit.resampling import NS_PER_S
 LEAST_RUN, LEAST_S = 10, 0.1
 # Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
 MOST_REPEATED = 0.2
-SENSORS = {"accelerometer": np.s_[:, :3], "gyro": np.s_[:, 3:]}
+IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
 
 def check(evidence: Evidence) -> Symptom | None:
     """Count the samples that repeat the one before in a long run; drop them."""
     sequence = evidence.sequence
-    if sequence.motion_kind != "imu":
+    if sequence.motion_kind == "none":
         return None
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
     step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
     least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
-    repeated = {name: _in_long_runs(values[columns], least) for name, columns in SENSORS.items()}
+    if sequence.motion_kind == "twist":
+        moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
+        repeated = {"odometry": _in_long_runs(values, least) & moves_and_turns}
+    else:
+        repeated = {name: _in_long_runs(values[:, columns], least) for name, columns in IMU_SENSORS.items()}
     stuck = np.logical_or.reduce(list(repeated.values()))
     if not stuck.any():
         return None
@@ -46,7 +50,7 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _in_long_runs(values: Array, least: int) -> BoolArray:
-    """Say which samples (S, 3) repeat the one before, within a run of at least so many equal ones."""
+    """Say which samples (S, d) repeat the one before, within a run of at least so many equal ones."""
     if not len(values):
         return np.zeros(0, dtype=bool)
     same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
@@ -60,7 +64,7 @@ def _in_long_runs(values: Array, least: int) -> BoolArray:
 
 FAULT = Fault(
     "stuck-samples",
-    "an accelerometer or a gyro that repeats one value",
+    "an accelerometer, a gyro or odometry that repeats one value",
     check,
     after=("not-finite", "time-order"),
 )

@@ -48,7 +48,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if intervals is None:
         return evidence.blind
     w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
-    found = _offset(sequence, intervals, w_imu)
+    found = camera_offset(sequence, intervals, w_imu)
     largest_s = LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
     if found is None or found.error > largest_s:
         error = "unknown" if found is None else f"known to {1e3 * found.error:.0f} ms"
@@ -86,7 +86,7 @@ def _stamped_at_frames(sequence: Sequence) -> bool:
     return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
 
 
-def _offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
+def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
     """Estimate how much later than its stamps (s) the camera's rotation is, or None where nothing tells."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     candidates = np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s)

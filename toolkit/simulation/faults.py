@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, se3, se3_inverse, so3_exp
+from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation.spans import frames_s, ns, samples_s, span_s
@@ -139,6 +139,22 @@ def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -
     return _with_pixels(sequence, uv_px)
 
 
+def jumped_image(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
+    """Shift every image of the second half by so many pixels: a camera that is knocked, a crop that changes."""
+    later = sequence.observations.frame >= sequence.frame_count // 2
+    return _with_pixels(sequence, sequence.observations.uv_px + dose * later[:, None])
+
+
+def exchanged_tracks(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
+    """Exchange the ids of a share of the sightings with others of their frame: a matcher that takes the wrong point."""
+    rng, seen = np.random.default_rng(seed), sequence.observations
+    track_id, struck = seen.track_id.copy(), rng.uniform(size=len(seen)) < dose
+    for begin, end in pairwise(np.searchsorted(seen.frame, np.arange(sequence.frame_count + 1)).tolist()):
+        rows = begin + np.flatnonzero(struck[begin:end])
+        track_id[rows] = track_id[rng.permutation(rows)]
+    return replace(sequence, observations=Observations.sorted(seen.frame, track_id, seen.uv_px))
+
+
 # The motion samples -------------------------------------------------------------------------------------------------
 
 
@@ -195,6 +211,18 @@ def linear_unit(sequence: Sequence, dose: float = 3.6, seed: int = 0) -> Sequenc
     return _with_values(sequence, sequence.motion.values * np.repeat([dose, 1.0], 3))
 
 
+def changed_speed(sequence: Sequence, dose: float = 1.08, seed: int = 0) -> Sequence:
+    """Multiply the velocities, or accelerations, of the second half by the dose: a tyre that loses air."""
+    later = sequence.motion.t_ns > sequence.frames_t_ns[sequence.frame_count // 2]
+    factor = np.where(later[:, None], np.repeat([dose, 1.0], 3), 1.0)
+    return _with_values(sequence, factor * sequence.motion.values)
+
+
+def thinned_motion(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
+    """Keep every so many-th motion sample: a log that was thinned out, a bus that is busy."""
+    return _with_samples(sequence, np.arange(sequence.motion.t_ns.size) % int(dose) == 0)
+
+
 def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0) -> Sequence:
     """Multiply angular velocities by the dose: 57.3 for degrees."""
     return _with_values(sequence, sequence.motion.values * np.repeat([1.0, dose], 3))
@@ -221,10 +249,19 @@ def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Seque
 
     Frames that leave the time of the motion samples are cut off. The truth stays on the motion's clock.
     """
-    late = replace(sequence, frames_t_ns=sequence.frames_t_ns + ns(dose))
-    motion_t_ns = sequence.motion.t_ns
-    inside = (late.frames_t_ns >= motion_t_ns[0]) & (late.frames_t_ns <= motion_t_ns[-1])
-    return late if inside.all() else _with_first_frames_cut(late, inside)
+    return _with_frames_at(sequence, sequence.frames_t_ns + ns(dose))
+
+
+def camera_clock_step(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
+    """Stamp the frames of the second half so many seconds late: the camera's clock alone is set on the way."""
+    later = np.arange(sequence.frame_count) >= sequence.frame_count // 2
+    return _with_frames_at(sequence, sequence.frames_t_ns + np.where(later, ns(dose), 0))
+
+
+def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
+    """Let the camera's clock run fast by a share of the time: a cheap quartz, frames counted and not stamped."""
+    since_ns = sequence.frames_t_ns - sequence.frames_t_ns[0]
+    return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(dose * since_ns).astype(np.int64))
 
 
 def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
@@ -328,6 +365,13 @@ def _with_values(sequence: Sequence, values: Array) -> Sequence:
 def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
     arrays: dict[str, Any] = {k: x[kept] for k, x in vars(sequence.motion).items() if isinstance(x, np.ndarray)}
     return replace(sequence, motion=replace(sequence.motion, **arrays))
+
+
+def _with_frames_at(sequence: Sequence, frames_t_ns: IntArray) -> Sequence:
+    """Return the sequence with other stamps of its frames (K,), without those outside the motion samples."""
+    moved, motion_t_ns = replace(sequence, frames_t_ns=frames_t_ns), sequence.motion.t_ns
+    inside = (frames_t_ns >= motion_t_ns[0]) & (frames_t_ns <= motion_t_ns[-1])
+    return moved if inside.all() else _with_first_frames_cut(moved, inside)
 
 
 def _with_first_frames_cut(sequence: Sequence, inside: BoolArray) -> Sequence:

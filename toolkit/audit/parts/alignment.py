@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by
-from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, jackknife_error, spread
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, jackknife_cov, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
 from toolkit.models.camera_motion import CameraMotion, camera_motion
@@ -31,11 +31,19 @@ _LEVER, _COMMON = slice(1, 4), 13
 
 
 class Alignment(NamedTuple):
-    """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m."""
+    """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m.
+
+    ``lever_cov_m2`` (3, 3) is the covariance of the latter.
+    """
 
     scale: Scalar
     lever_m: Array
-    lever_error_m: Array
+    lever_cov_m2: Array
+
+    @property
+    def lever_error_m(self) -> Array:
+        """The standard errors (3,) of the camera's position along the axes of the IMU."""
+        return np.sqrt(np.diag(self.lever_cov_m2))
 
 
 def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
@@ -56,10 +64,11 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> Al
     measured = v_mps + np.cross(w_radps, p_imu_cam)
     jacobian = np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
     found = _robust(measured - seen, jacobian)
-    errors = [jackknife_error(lambda y, j, k=k: float(_robust(y, j)[k]), measured - seen, jacobian) for k in range(4)]
+    cov = jackknife_cov(_robust, measured - seen, jacobian)
     one, other = 1.0 / (1.0 - float(found[0])) - 1.0, float(_robust(seen - measured, measured[:, :, None])[0])
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
-    return Alignment(Scalar(scale, errors[0] * (1.0 + scale) ** 2), found[_LEVER], np.array(errors[1:]))
+    error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
+    return Alignment(Scalar(scale, error), found[_LEVER], cov[_LEVER, _LEVER])
 
 
 def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
@@ -86,8 +95,8 @@ def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Int
         row = here.stop
     prior = np.repeat([0.0, 1.0 / ACCEL_BIAS**2, 1.0 / GYRO_BIAS**2, 0.0], [7, 3, 3, 6 * windows])
     block = np.arange(len(response)) * STRIDE_S // 1.0
-    found, error = _robust_with_error(response, jacobian, prior, block.astype(int))
-    return Alignment(Scalar(float(found[0]), float(error[0])), found[_LEVER], error[_LEVER])
+    found, cov = _robust_with_cov(response, jacobian, prior, block.astype(int))
+    return Alignment(Scalar(float(found[0]), float(np.sqrt(cov[0, 0]))), found[_LEVER], cov[_LEVER, _LEVER])
 
 
 def _strides(sequence: Sequence, camera: CameraMotion, kept: IntArray) -> CameraMotion:
@@ -174,8 +183,8 @@ def _robust(response: Array, jacobian: Array) -> Array:
     return _weighted(response, jacobian, np.zeros(jacobian.shape[2]))[0]
 
 
-def _robust_with_error(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:
-    """Solve the same with the information (m,) of a prior about zero; errors (m,) robust to scatter that lasts a block.
+def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:
+    """Solve the same with the information (m,) of a prior about zero; covariance robust to scatter that lasts a block.
 
     Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
     """
@@ -184,7 +193,8 @@ def _robust_with_error(response: Array, jacobian: Array, prior: Array, block: In
     np.add.at(of_block, block, score)
     inverse = np.asarray(np.linalg.inv(information))
     cov = inverse @ (of_block.T @ of_block + np.diag(prior)) @ inverse
-    return found, np.sqrt(np.maximum(np.diag(cov), np.diag(inverse)))
+    lacking = np.maximum(np.diag(inverse) - np.diag(cov), 0.0)  # few blocks can look too calm
+    return found, np.asarray(cov + np.diag(lacking))
 
 
 def _weighted(response: Array, jacobian: Array, prior: Array) -> tuple[Array, Array, Array]:

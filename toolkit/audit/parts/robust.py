@@ -41,9 +41,15 @@ def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
 
     Source: Shao & Tu, "The Jackknife and Bootstrap" (1995), section 2.3: the delete-d jackknife of dependent data.
     """
+    return float(np.sqrt(jackknife_cov(lambda *some: np.array([estimate(*some)]), *rows)[0, 0]))
+
+
+def jackknife_cov(estimate: Callable[..., Array], *rows: Array) -> Array:
+    """Return the covariance (m, m) of an estimate (m,) of the same kind."""
     stretch = np.arange(len(rows[0])) * STRETCHES // len(rows[0])
-    without = [estimate(*(one[stretch != k] for one in rows)) for k in range(STRETCHES)]
-    return float(np.sqrt((STRETCHES - 1) * np.var(without)))
+    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(STRETCHES)])
+    off_mean = without - without.mean(axis=0)
+    return np.asarray((STRETCHES - 1) / STRETCHES * off_mean.T @ off_mean)
 
 
 def slope(instrument: Array, regressor: Array, response: Array) -> Scalar:

@@ -1,0 +1,110 @@
+"""What changes during a recording, and samples that hang, leap or are too few: told where planted, and nowhere else."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Audit, audit
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+LENGTH_S = {"drive": 12.0, "drive-imu": 12.0, "flight": 6.0}
+
+
+@cache
+def sound(scenario: str) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=LENGTH_S[scenario]), 1)
+
+
+def told(outcome: Audit) -> dict[str, str]:
+    return {finding.fault: finding.detail for finding in outcome.findings}
+
+
+def test_odometry_that_is_faster_from_the_middle_on_is_told_with_its_error() -> None:
+    said = told(audit(faults.changed_speed(sound("drive"), 1.08)))["scale-change"]
+    found = re.search(r"from about (\d+) s on the odometry is ([\d.]+) \+- ([\d.]+) % faster", said)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(6.0, abs=1.2)  # a tenth of the recording
+    assert float(found[2]) == pytest.approx(8.0, abs=3.0 * float(found[3]))
+
+
+def test_odometry_that_is_a_little_faster_is_within_what_sound_drives_have() -> None:
+    assert "scale-change" not in told(audit(faults.changed_speed(sound("drive"), 1.04)))
+
+
+@pytest.mark.parametrize("scenario", LENGTH_S)
+def test_an_image_that_jumps_and_stays_is_told_at_its_time(scenario: str) -> None:
+    faulty = faults.jumped_image(sound(scenario), 15.0)
+    angle_rad = np.sqrt(2.0) * 15.0 / faulty.rig.fx_px
+    found = re.search(r"at ([\d.]+) s \(by ([\d.]+) rad\)", told(audit(faulty))["image-jump"])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(LENGTH_S[scenario] / 2.0, abs=0.2)
+    # A shift is a rotation in the middle of the image only, and close points take some of it for a translation.
+    assert float(found[2]) == pytest.approx(angle_rad, rel=0.35)
+
+
+def test_a_rotation_that_is_over_at_once_is_no_jump_that_stays() -> None:
+    clean = sound("drive")
+    values = clean.motion.values.copy()
+    values[60, 5] += 0.4
+    outcome = audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values)))
+    assert "image-jump" not in told(outcome)
+
+
+@pytest.mark.parametrize("scenario", ["drive-imu", "flight"])
+def test_a_camera_clock_that_is_set_on_the_way_is_told(scenario: str) -> None:
+    said = told(audit(faults.camera_clock_step(sound(scenario), 0.08)))["clock-change"]
+    found = re.search(r"part by (-?\d+) \+- (\d+) ms", said)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(-80.0, abs=3.0 * float(found[2]))
+
+
+def test_a_camera_clock_that_drifts_is_told() -> None:
+    assert "clock-change" in told(audit(faults.camera_clock_drift(sound("drive-imu"), 0.02)))
+
+
+def test_clocks_that_cannot_be_compared_are_not_blessed() -> None:
+    assert "would not show" in audit(sound("drive")).undecided["clock-change"]
+
+
+def test_odometry_that_hangs_is_told_and_wheels_that_stand_or_roll_straight_do_not_hang() -> None:
+    clean = sound("drive")
+    assert "for 1.5 s" in told(audit(faults.stuck_motion(clean, 1.5, 1)))["stuck-samples"]
+    for still in (np.zeros(6), np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])):
+        values = clean.motion.values.copy()
+        values[40:60] = still
+        counted = replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))
+        assert "stuck-samples" not in told(audit(counted))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_twist_that_leaps_where_no_vehicle_can_is_dropped(seed: int) -> None:
+    outcome = audit(faults.spike(sound("drive"), 50.0, seed))
+    assert [(f.fault, f.count, f.repaired) for f in outcome.findings] == [("implausible", 1, True)]
+    assert np.abs(outcome.sequence.motion.values).max() < 20.0
+
+
+def test_a_vehicle_that_brakes_hard_and_stays_slow_leaps_not() -> None:
+    clean = sound("drive")
+    values = clean.motion.values.copy()
+    values[60:, :3] *= 0.02
+    outcome = audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values)))
+    assert "implausible" not in told(outcome)
+
+
+def test_mismatches_beneath_a_noise_that_is_stated_too_large_are_told_by_their_size() -> None:
+    clean = faults.wrong_noise(sound("drive"), 2.0)
+    assert "track-scatter" not in told(audit(clean))
+    said = told(audit(faults.exchanged_tracks(clean, 0.1, 1)))["track-scatter"]
+    found = re.search(r"frame ([\d.]+)% \+- ([\d.]+)% of the sightings miss", said)
+    assert found is not None
+    # An exchanged sighting spoils the step to it and the one from it: nearly twice the share, less those lost as pairs.
+    assert 10.0 < float(found[1]) < 20.0
+
+
+def test_samples_that_are_rarer_than_frames_are_told() -> None:
+    assert "every 1 s and frames every 0.1 s" in told(audit(faults.thinned_motion(sound("drive"))))["sparse-motion"]
+    assert "sparse-motion" not in told(audit(faults.thinned_motion(sound("drive"), 3.0)))
