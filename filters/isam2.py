@@ -3,9 +3,9 @@
 What it approximates, frame by frame: a variable is relinearised once it has moved by a threshold, not at every
 iteration; what none of the last 30 frames has factors on is not relinearised at all, and after 60 its marginal stands
 in the tree for it; and each frame makes one Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and
-mapping using the Bayes tree"). Its causal answer is the newest state. For its final answer everything is linearised anew until the error stalls: that is the
-optimum of all it took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by
-more sightings than made it, where these agree, is dropped and the log says so.
+mapping using the Bayes tree"). Its causal answer is the newest state. For its final answer everything is linearised
+anew until the error stalls: that is the optimum of all it took in. A landmark that falls behind the camera, makes the
+system indeterminate, or is refused by more sightings than made it, where these agree, is dropped and the log says so.
 
 Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
 landmark (``filters/smoothing/chained_past.py``).
@@ -21,7 +21,7 @@ from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
-from filters.smoothing.linearisation_error import strayed
+from filters.smoothing.linearisation_error import linearised_badly
 from filters.smoothing.robust import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -85,7 +85,7 @@ class Isam2:
         """Mark the landmarks in view, refused or not, that are no longer where they are linearised."""
         in_view = [key for key in map(L, packet.frame.track_ids.tolist()) if self._tree.has(key)]
         now, before = self._tree.points(in_view), self._tree.linearised_at(in_view)
-        rows = np.flatnonzero(strayed(now, before, estimate.T_world_imu, self._rig))
+        rows = np.flatnonzero(linearised_badly(now, before, estimate.T_world_imu, self._rig))
         self._tree.relinearise(in_view[row] for row in rows)
 
     def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:

@@ -74,7 +74,7 @@ class Isam2Tree:
         self._tie_slots: list[int] = []
         self._retired, self._retires = RetiredVariables(), True
         # The landmarks in the tree, and those of them that the next frame linearises anew.
-        self._landmarks, self._strayed = set[int](), set[int]()
+        self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
         self,
@@ -198,7 +198,7 @@ class Isam2Tree:
 
     def relinearise(self, landmarks: Iterable[int]) -> None:
         """Have the next frame linearise landmarks anew, unless they are frozen; the others stay as they are."""
-        self._strayed = set(landmarks)
+        self._to_relinearise = set(landmarks)
 
     def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
         """Return values of states and landmarks: the new, and the latest of what is in the tree."""
@@ -238,7 +238,7 @@ class Isam2Tree:
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
                     self._landmarks.add(key)
         self._slot_count += factors.size()
-        leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._strayed)])
+        leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._to_relinearise)])
         order, anew = (self._order(factors), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
             self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)

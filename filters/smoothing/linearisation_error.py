@@ -1,4 +1,4 @@
-"""How far a landmark may stray from where it is linearised: until its linear image is off by a share of the noise.
+"""How far a landmark may move from where it is linearised: until its linear image is off by a share of the noise.
 
 What a metre changes in an image goes with the square of the depth. A threshold in metres that keeps near landmarks
 sound has far ones, whose depth a disparity of some pixels tells to a metre, linearised anew in every frame.
@@ -14,8 +14,8 @@ from toolkit.sequence import StereoRig
 LANDMARK_BEYOND_SIGMA = 0.1
 
 
-def strayed(now: Array, linearised_at: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
-    """Say of which points (N, 3) m in the world an image linear about other points (N, 3) is off in a pose (4, 4).
+def linearised_badly(now: Array, linearised_at: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:
+    """Say of which points (N, 3) m in the world the image in a pose (4, 4), linear about others (N, 3), is off too far.
 
     With image h, depth z and a point moved by dp, ``h(p) + h'(p) dp - h(p + dp)`` is ``(h(p + dp) - h(p)) dz / z``.
     """

@@ -308,7 +308,7 @@ def test_a_track_that_returns_has_the_tree_whole_again(monkeypatch):
     assert ours._tree.has(L(int(seen_first_and_late[0])))
 
 
-def test_a_landmark_has_strayed_where_its_linear_image_is_off_by_a_share_of_the_noise():
+def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
     rng = np.random.default_rng(0)
     sequence = simulate(replace(FLIGHT, duration_s=0.5), 0)
     pose, rig = sequence.prior.T_world_imu, sequence.rig
@@ -318,9 +318,9 @@ def test_a_landmark_has_strayed_where_its_linear_image_is_off_by_a_share_of_the_
     linear, there = stereo.predict(before, pose, rig), stereo.predict(now, pose, rig)
     said_px = linear.uv_px + (linear.d_uv_d_point @ (now - before)[..., None])[..., 0]
     off = np.linalg.norm((said_px - there.uv_px) @ rig.whitener.T, axis=1)
-    has_strayed = linearisation_error.strayed(now, before, pose, rig)
-    np.testing.assert_array_equal(has_strayed, off > linearisation_error.LANDMARK_BEYOND_SIGMA)
-    assert 20 < has_strayed.sum() < 180
+    badly = linearisation_error.linearised_badly(now, before, pose, rig)
+    np.testing.assert_array_equal(badly, off > linearisation_error.LANDMARK_BEYOND_SIGMA)
+    assert 20 < badly.sum() < 180
 
 
 def isam2_of(sequence: Sequence) -> Isam2:
