@@ -1,11 +1,11 @@
 """Incremental full smoother: every state and landmark kept, re-solved only where new factors reach (iSAM2, GTSAM).
 
 What it approximates, frame by frame: a variable is relinearised once it has moved by a threshold, not at every
-iteration; what none of the last 30 frames has factors on is not relinearised at all; and each frame makes one
-Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal
-answer is the newest state. For its final answer everything is linearised anew until the error stalls: that is the
-optimum of all it took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by
-more sightings than made it, where these agree, is dropped and the log says so.
+iteration; what none of the last 30 frames has factors on is not relinearised at all, and after 60 its marginal stands
+in the tree for it; and each frame makes one Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and
+mapping using the Bayes tree"). Its causal answer is the newest state. For its final answer everything is linearised
+anew until the error stalls: that is the optimum of all it took in. A landmark that falls behind the camera, makes the
+system indeterminate, or is refused by more sightings than made it, where these agree, is dropped and the log says so.
 
 Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
 landmark (``filters/smoothing/chained_past.py``).
@@ -21,6 +21,7 @@ from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.linearisation_error import linearised_badly
 from filters.smoothing.robust import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -54,6 +55,7 @@ class Isam2:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
+        self._note(packet, self._tree.see([L(i) for i in packet.frame.track_ids.tolist()]))
         extension = self._builder.extend(packet)
         self._stamps_ns.append(packet.frame.t_ns)
         recovery = self._tree.add(extension.factors, extension.values, extension.state_keys, extension.chained)
@@ -61,6 +63,7 @@ class Isam2:
         estimate = self._newest(extension, packet)
         seen = [i for i in extension.landmark_ids if self._tree.has(L(i))]
         points = self._tree.points(map(L, seen))
+        self._relinearise(packet, estimate)
         self._builder.update(estimate, dict(zip(seen, points, strict=True)))
         self._drop_landmarks(seen, points, estimate, packet)
         return estimate
@@ -77,6 +80,13 @@ class Isam2:
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), motion)
         return Finished(trajectory, Landmarks.of(points), converged, (*self._log, *log))
+
+    def _relinearise(self, packet: Packet, estimate: Estimate) -> None:
+        """Mark the landmarks in view, refused or not, that are no longer where they are linearised."""
+        in_view = [key for key in map(L, packet.frame.track_ids.tolist()) if self._tree.has(key)]
+        now, before = self._tree.points(in_view), self._tree.linearised_at(in_view)
+        rows = np.flatnonzero(linearised_badly(now, before, estimate.T_world_imu, self._rig))
+        self._tree.relinearise(in_view[row] for row in rows)
 
     def _newest(self, extension: GraphExtension, packet: Packet) -> Estimate:
         values = self._tree.read(extension.state_keys)

@@ -21,6 +21,7 @@ from filters.smoothing.cached_linearisation import (
     with_linearisations,
 )
 from filters.smoothing.chained_past import ChainedPast
+from filters.smoothing.frozen_variables import FrozenVariables
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
@@ -29,6 +30,7 @@ from filters.smoothing.indeterminate import (
     weak_hold,
     without_gaps,
 )
+from filters.smoothing.retired_variables import RetiredVariables, key_list
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import L, kind_of
@@ -41,13 +43,18 @@ RECENT_FRAMES, LONG_LIVED_SIGHTINGS = 100, 10
 # What none of the last so many frames has factors on stays linearised where it is, Python factors included: a heading
 # that turns a little moves the whole past, and a frame would cost as much as the run is long.
 FROZEN_AFTER_FRAMES = 30
+# What none of so many frames has factors on leaves the tree, every so many frames: each walks the whole of it. What is
+# tied to it later than that stays linearised where it is, too.
+RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
-# How far variables may move from where they are linearised: rad, m/s, the biases' units; and for positions and
-# landmarks multiples of the baseline, the length that sets the scale of what stereo sees. Coarser thresholds mix
-# linearisation points: with five times these a flight of two minutes was five times less accurate.
-ROTATION_THRESHOLD_RAD, OTHER_THRESHOLDS = 0.01, {"v": 0.01, "b": 0.01}
-POSITION_THRESHOLD_BASELINES, LANDMARK_THRESHOLD_BASELINES = 0.1, 0.5
+# How far states may move from where they are linearised: rad; m/s, or the unit of a rate; m/s^2 and rad/s of a bias;
+# and multiples of the baseline, the length that sets the scale of what stereo sees: the image of a point 20 baselines
+# away is then off by a tenth of a pixel. A velocity and a bias of the accelerometer that all states share change no
+# residual but by the turn between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1
+# baselines and 0.01 of the rest made a flight of two minutes five times less accurate.
+ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
+POSITION_THRESHOLD_BASELINES = 0.3
 MOST_RECOVERIES = 20
 
 
@@ -65,6 +72,9 @@ class Isam2Tree:
         self._sightings: dict[int, list[int]] = {}
         # Where the factors are that tie the last variable to the newest state.
         self._tie_slots: list[int] = []
+        self._retired, self._retires = RetiredVariables(), True
+        # The landmarks in the tree, and those of them that the next frame linearises anew.
+        self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
         self,
@@ -83,7 +93,11 @@ class Isam2Tree:
         self._recent.append(state_keys)
         self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
         cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
-        watched = [(slot, factor) for slot, factor in self._cached.items() if not self._frozen.contain_all(factor.keys)]
+        watched = [
+            (slot, factor)
+            for slot, factor in self._cached.items()
+            if slot not in self._retired.slots and not self._frozen.contain_all(factor.keys)
+        ]
         moved = renewed(watched, self.read)
         factors, stale = with_linearisations(factors, cached), list[int]()
         if seen is not None and self._chained is not None:
@@ -111,7 +125,7 @@ class Isam2Tree:
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return all factors but chained sightings, of the Python ones themselves and not their linearisations."""
-        factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
+        factors = self._retired.with_factors_of(self.isam)
         for slot, cached in self._cached.items():
             factors.replace(slot, cached.factor)
         for slot in [*self._tie_slots, *(self._chained.slots() if self._chained else ())]:
@@ -120,14 +134,44 @@ class Isam2Tree:
 
     def values(self) -> gtsam.Values:
         """Return the latest values of all that means something."""
-        values = self.isam.calculateBestEstimate()
+        values = self._retired.with_values(self.isam.calculateBestEstimate())
         values.erase(LAST)
         return values
 
+    def see(self, landmarks: list[int]) -> Recovery:
+        """Keep landmarks that the next frame has in view; take back what left the tree if any of them did.
+
+        From then on nothing leaves: where one track returns others will, and to build the tree anew for each would
+        cost more than it saves.
+        """
+        self._frozen.see(landmarks)
+        if self._retired.keys.isdisjoint(landmarks):
+            return Recovery([], set())
+        self._retires = False
+        return self._restored()
+
+    def _restored(self) -> Recovery:
+        """Take back all that left the tree; return what had to be recovered."""
+        points = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
+        try:
+            self._rebuild(self._retired.with_factors_of(self.isam), points)
+        except RuntimeError as refusal:
+            return self._recovered(refusal)
+        return Recovery([], set())
+
     def drop(self, landmarks: Iterable[int]) -> Recovery:
-        """Take landmarks out, with all their sightings; return what had to be recovered."""
+        """Take landmarks out, with all their sightings; return what had to be recovered.
+
+        Of one that some sightings had left the tree of, a marginal holds what they said: the tree is built anew.
+        """
         landmarks = list(landmarks)
+        if any(not self._retired.slots.isdisjoint(self._sightings[key]) for key in landmarks):
+            recovery = self._restored()
+            kept = [key for key in landmarks if self.has(key)]
+            again = self.drop(kept) if kept else Recovery([], set())
+            return Recovery(recovery.log + again.log, recovery.dropped | again.dropped)
         self._unchain(landmarks)
+        self._landmarks.difference_update(landmarks)
         slots = [slot for key in landmarks for slot in self._sightings.pop(key)]
         return self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, {}, slots)
 
@@ -146,6 +190,15 @@ class Isam2Tree:
     def points(self, landmarks: Iterable[int]) -> Array:
         """Return the latest points (N, 3) of landmarks in the world."""
         return np.array([self.isam.calculateEstimatePoint3(key) for key in landmarks]).reshape(-1, 3)
+
+    def linearised_at(self, landmarks: Iterable[int]) -> Array:
+        """Return the points (N, 3) in the world that landmarks are linearised at."""
+        values = self.isam.getLinearizationPoint()
+        return np.array([values.atPoint3(key) for key in landmarks]).reshape(-1, 3)
+
+    def relinearise(self, landmarks: Iterable[int]) -> None:
+        """Have the next frame linearise landmarks anew, unless they are frozen; the others stay as they are."""
+        self._to_relinearise = set(landmarks)
 
     def _first_values(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
         """Return values of states and landmarks: the new, and the latest of what is in the tree."""
@@ -183,13 +236,45 @@ class Isam2Tree:
             for key in keys:
                 if kind_of(key) == "l":
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
+                    self._landmarks.add(key)
         self._slot_count += factors.size()
+        leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._to_relinearise)])
+        order, anew = (self._order(factors), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
-            self.isam.update(factors, values, [*moved, *dropped_slots], self._order(factors), self._frozen.keys)
+            self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)
             self._solve_back()
         except RuntimeError as refusal:
             return self._recovered(refusal)
+        if leaving:
+            self._retire(leaving)
         return Recovery([], set())
+
+    def _leaving(self) -> list[int]:
+        """Return the variables to be retired now: none in most frames, and none while it is solved by QR."""
+        if not self._retires or self._factorization == "QR" or self._frozen.count % RETIRING_EVERY_FRAMES:
+            return []
+        return [key for key in self._frozen.unused_for(RETIRED_AFTER_FRAMES) if self.has(key)]
+
+    def _retire(self, leaving: list[int]) -> None:
+        still_there = [key for key in leaving if self.has(key)]
+        self._retired.take(self.isam, still_there)
+        self._slot_count = self.isam.getFactorsUnsafe().size()
+        self._frozen.leave(self._retired.keys)
+        self._landmarks -= self._retired.keys
+        while self._recent[0][0] in self._retired.keys:
+            self._recent.popleft()
+
+    def _order_before_retiring(self, new: gtsam.Values, leaving: list[int]) -> tuple[gtsam.KeyGroupMap, gtsam.KeyList]:
+        """Return the places of all variables, those to leave first, and the list of all, to be eliminated anew."""
+        gone = self._retired.keys.union(leaving)
+        landmarks = [key for key in self._landmarks.difference(leaving) if self.has(key) or new.exists(key)]
+        states = [keys for keys in self._recent if keys[0] not in gone]
+        groups = gtsam.KeyGroupMap()
+        for place, keys in enumerate([landmarks, *states, [LAST]], start=1):
+            for key in keys:
+                groups.insert2(key, place)
+        everything = [*leaving, *landmarks, *(key for keys in states for key in keys), LAST]
+        return groups, key_list(key for key in everything if not new.exists(key))
 
     def _solve_back(self) -> None:
         """Read a variable, for which GTSAM solves for all: only here does QR refuse what it has eliminated."""
@@ -215,8 +300,8 @@ class Isam2Tree:
         log, dropped = [], set()
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
-            factors = gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe())
-            values = self.isam.getLinearizationPoint()
+            factors = self._retired.with_factors_of(self.isam)
+            values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
             if kind_of(key) == "l":
                 dropped.add(gtsam.Symbol(key).index())
                 log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
@@ -244,11 +329,11 @@ class Isam2Tree:
         self._frames_by_qr += sees
         if self._frames_by_qr <= QR_FRAMES:
             return
-        values = self.isam.calculateBestEstimate()
+        values = self._retired.with_values(self.isam.calculateBestEstimate())
         for factorization in ("CHOLESKY", "QR"):
             self._factorization, self._frames_by_qr = factorization, 0
             try:
-                self._rebuild(gtsam.NonlinearFactorGraph(self.isam.getFactorsUnsafe()), values)
+                self._rebuild(self._retired.with_factors_of(self.isam), values)
             except RuntimeError:
                 if factorization == "QR":
                     raise
@@ -256,6 +341,7 @@ class Isam2Tree:
                 return
 
     def _rebuild(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """Build the tree anew of all factors, those of what had left it among them."""
         kept = [slot for slot in range(factors.size()) if factors.exists(slot)]
         compact, slot_of = gtsam.NonlinearFactorGraph(), {old: new for new, old in enumerate(kept)}
         for slot in kept:
@@ -266,6 +352,8 @@ class Isam2Tree:
         self._tie_slots = [slot_of[old] for old in self._tie_slots]
         if self._chained is not None:
             self._chained.move(slot_of)
+        self._frozen.come_back(self._retired.keys)
+        self._retired, self._landmarks = RetiredVariables(), set(self._sightings)
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(compact))
         self._solve_back()
@@ -273,43 +361,13 @@ class Isam2Tree:
     def _empty_tree(self) -> gtsam.ISAM2:
         params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
         pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * self._baseline_m], 3)
+        at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
         for kind, size in self._motion.variable_sizes.items():
-            thresholds.insert((kind, pose if kind == "x" else np.full(size, OTHER_THRESHOLDS[kind])))
+            thresholds.insert((kind, at_most[kind][-size:]))
         thresholds.insert((kind_of(LAST), np.ones(1)))
-        thresholds.insert(("l", np.full(3, LANDMARK_THRESHOLD_BASELINES * self._baseline_m)))
+        # Which landmarks are linearised anew is told by key.
+        thresholds.insert(("l", np.zeros(3)))
         params.setRelinearizeThreshold(thresholds)
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)
         return gtsam.ISAM2(params)
-
-
-class FrozenVariables:
-    """Which variables no recent frame has factors on, to be left where they are linearised.
-
-    One that is seen again later stays frozen: its new factors are linearised where it was.
-    """
-
-    def __init__(self, frames: int) -> None:
-        self._frames = frames
-        self._recent: deque[set[int]] = deque()
-        self._last_frame: dict[int, int] = {}
-        self._count = 0
-        self._frozen: set[int] = set()
-        self.keys = gtsam.KeyList()
-
-    def contain_all(self, keys: Iterable[int]) -> bool:
-        """Say whether all of some variables are frozen."""
-        return self._frozen.issuperset(keys)
-
-    def add_frame(self, keys: Iterable[int]) -> None:
-        """Count a frame whose factors are on some variables; freeze those of none of the last frames."""
-        frame = set(keys)
-        self._recent.append(frame)
-        self._last_frame |= dict.fromkeys(frame, self._count)
-        if len(self._recent) > self._frames:
-            oldest = self._count - self._frames
-            for key in sorted(self._recent.popleft()):
-                if self._last_frame[key] == oldest:
-                    self.keys.push_back(key)
-                    self._frozen.add(key)
-        self._count += 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from filters.isam2 import Isam2
-from filters.smoothing import cached_linearisation, isam2_tree
+from filters.smoothing import cached_linearisation, isam2_tree, linearisation_error
 from filters.smoothing.cached_linearisation import (
     RENEW_BEYOND,
     CachedLinearisation,
@@ -16,13 +16,15 @@ from filters.smoothing.cached_linearisation import (
     renewed,
     with_linearisations,
 )
-from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, QR_FRAMES, FrozenVariables, Isam2Tree
+from filters.smoothing.frozen_variables import FrozenVariables
+from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, MOST_RECOVERIES, QR_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from toolkit.errors import EstimatorError
+from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import se3_inverse, se3_log
+from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measured_motion import TwistMotion
-from toolkit.models import twist
+from toolkit.models import stereo, twist
 from toolkit.models.factors import B, L, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
@@ -202,8 +204,9 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
 
     With thresholds that any motion passes: what is not frozen is linearised anew in every frame.
     """
-    for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "LANDMARK_THRESHOLD_BASELINES"):
+    for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES"):
         monkeypatch.setattr(isam2_tree, name, 1e-9)
+    monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
     estimator, points = isam2_of(sequence), []
     for packet in sequence.packets():
@@ -232,6 +235,92 @@ def test_a_python_factor_whose_states_are_frozen_is_renewed_no_more(monkeypatch)
         assert kept == {keys for keys in before if estimator._tree._frozen.contain_all(keys)}
         before = now
     assert kept
+
+
+@pytest.fixture
+def nothing_linearised_anew(monkeypatch):
+    """Then what leaves the tree is linearised as what stays, and answers may differ by rounding alone."""
+    for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "VELOCITY_THRESHOLD"):
+        monkeypatch.setattr(isam2_tree, name, 1e9)
+    monkeypatch.setattr(isam2_tree, "BIAS_THRESHOLD", (1e9, 1e9))
+    monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", np.inf)
+
+
+def stepped(sequence: Sequence, monkeypatch, retired_after: int) -> tuple[Isam2, list[Estimate]]:
+    monkeypatch.setattr(isam2_tree, "FROZEN_AFTER_FRAMES", 5)
+    monkeypatch.setattr(isam2_tree, "RETIRED_AFTER_FRAMES", retired_after)
+    monkeypatch.setattr(isam2_tree, "RETIRING_EVERY_FRAMES", 4)
+    estimator = isam2_of(sequence)
+    return estimator, [estimator.step(packet) for packet in sequence.packets()]
+
+
+def without_returns(sequence: Sequence) -> Sequence:
+    """Return the sequence without sightings of tracks that were not seen in the frame before, but for their first."""
+    rows, seen, before = sequence.observations, set[int](), set[int]()
+    kept = np.zeros(rows.frame.size, dtype=bool)
+    for k in range(sequence.frame_count):
+        here = np.flatnonzero(rows.frame == k)
+        kept[here] = [i in before or i not in seen for i in rows.track_id[here].tolist()]
+        before = set(rows.track_id[here[kept[here]]].tolist())
+        seen |= before
+    return replace(sequence, observations=rows.select(kept))
+
+
+def assert_same_answers(ours: list[Estimate], theirs: list[Estimate]) -> None:
+    """Poses to a hundred thousandth of a sigma: a marginal is solved for in another order."""
+    for one, other in zip(ours, theirs, strict=True):
+        off = se3_log(se3_inverse(other.T_world_imu) @ one.T_world_imu)
+        assert (np.abs(off) < 1e-5 * np.sqrt(np.diagonal(other.cov)[:6])).all()
+        np.testing.assert_allclose(np.diagonal(one.cov), np.diagonal(other.cov), rtol=1e-5)
+
+
+@pytest.mark.usefixtures("nothing_linearised_anew")
+@pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU], ids=lambda s: s.name)
+def test_what_leaves_the_tree_changes_no_later_answer_and_is_in_the_final_one(scenario, monkeypatch):
+    few_tracks = replace(scenario, duration_s=2.5, camera=replace(scenario.camera, max_tracks=30))
+    sequence = without_returns(simulate(few_tracks, 1))
+    whole, expected = stepped(sequence, monkeypatch, retired_after=1000)
+    ours, estimates = stepped(sequence, monkeypatch, retired_after=8)
+    assert_same_answers(estimates, expected)
+    assert not ours._tree.has(X(3))
+    assert whole._tree.has(X(3))
+    assert ours._tree.isam.getLinearizationPoint().size() < 0.6 * whole._tree.isam.getLinearizationPoint().size()
+    assert ours._tree.graph().size() == whole._tree.graph().size()
+    assert set(ours._tree.values().keys()) == set(whole._tree.values().keys())
+    finals = [estimator.finish().trajectory.T_world_imu for estimator in (ours, whole)]
+    # Both stop where the error stalls, of which a hundredth of a sigma is the slack.
+    np.testing.assert_allclose(finals[0], finals[1], atol=2e-3)
+
+
+@pytest.mark.usefixtures("nothing_linearised_anew")
+def test_a_track_that_returns_has_the_tree_whole_again(monkeypatch):
+    few_tracks = replace(DRIVE_IMU, duration_s=2.5, camera=replace(DRIVE_IMU.camera, max_tracks=50))
+    sequence = without_returns(simulate(few_tracks, 1))
+    rows = sequence.observations
+    seen_first_and_late = np.intersect1d(rows.track_id[rows.frame < 4], rows.track_id[rows.frame >= 20])
+    assert seen_first_and_late.size
+    returning = np.isin(rows.track_id, seen_first_and_late) & (rows.frame >= 4) & (rows.frame < 20)
+    sequence = replace(sequence, observations=rows.select(~returning))
+    _, expected = stepped(sequence, monkeypatch, retired_after=1000)
+    ours, estimates = stepped(sequence, monkeypatch, retired_after=8)
+    assert_same_answers(estimates, expected)
+    assert ours._tree.has(X(0))
+    assert ours._tree.has(L(int(seen_first_and_late[0])))
+
+
+def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
+    rng = np.random.default_rng(0)
+    sequence = simulate(replace(FLIGHT, duration_s=0.5), 0)
+    pose, rig = sequence.prior.T_world_imu, sequence.rig
+    camera = np.column_stack([rng.uniform(-1.0, 1.0, (200, 2)), rng.uniform(1.0, 20.0, 200)])
+    before = transform(pose @ rig.T_imu_cam, camera)
+    now = transform(pose @ rig.T_imu_cam, camera * np.exp(rng.normal(0.0, 0.1, (200, 1))) + rng.normal(0.0, 0.01, 3))
+    linear, there = stereo.predict(before, pose, rig), stereo.predict(now, pose, rig)
+    said_px = linear.uv_px + (linear.d_uv_d_point @ (now - before)[..., None])[..., 0]
+    off = np.linalg.norm((said_px - there.uv_px) @ rig.whitener.T, axis=1)
+    badly = linearisation_error.linearised_badly(now, before, pose, rig)
+    np.testing.assert_array_equal(badly, off > linearisation_error.LANDMARK_BEYOND_SIGMA)
+    assert 20 < badly.sum() < 180
 
 
 def isam2_of(sequence: Sequence) -> Isam2:
