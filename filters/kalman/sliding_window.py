@@ -14,13 +14,13 @@ anew at its age, and the error it has come to by then is taken for drawn anew.
 
 import numpy as np
 
-from filters.kalman import erring_landmarks, joint_landmarks, multiview
-from filters.kalman.erring_landmarks import ErringBelief
+from filters.kalman import joint_landmarks, multiview, track_error_states
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
+from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
 from filters.kalman.tracks_in_view import TracksInView, tell
 from toolkit.arrays import is_among
@@ -75,9 +75,9 @@ class SlidingWindowFilter:
         return self._memory.landmarks()
 
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
-        if isinstance(self._joint, ErringBelief):
-            erring_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
-            joint_landmarks.forget(self._joint, erring_landmarks.strayed(self._joint, gate), self._memory)
+        if isinstance(self._joint, TrackErrorBelief):
+            track_error_states.correct(self._joint, frame, self._at, self._rig, gate)
+            joint_landmarks.forget(self._joint, track_error_states.implausible_errors(self._joint, gate), self._memory)
         else:
             joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
 
@@ -115,8 +115,8 @@ class SlidingWindowFilter:
         joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
 
     def _add_landmarks(self, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
-        if isinstance(self._joint, ErringBelief):
-            erring_landmarks.add_tracks(self._joint, sightings, points, linearised)
+        if isinstance(self._joint, TrackErrorBelief):
+            track_error_states.add_tracks(self._joint, sightings, points, linearised)
         else:
             joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, linearised)
 
@@ -179,7 +179,7 @@ class WindowTracks:
 
 
 def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
-    return JointBelief(core) if noise is None else ErringBelief(core, noise)
+    return JointBelief(core) if noise is None else TrackErrorBelief(core, noise)
 
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from filters.kalman import iterated, joint_landmarks
-from filters.kalman.erring_landmarks import ErringBelief, strayed
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.track_error_states import TrackErrorBelief, implausible_errors
 from toolkit.geometry import Array, transform
 from toolkit.models import stereo
 from toolkit.models.motion import motion_model
@@ -49,13 +49,13 @@ def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residua
     assert np.array_equal(joint.points, point) == (not accepted)
 
 
-def test_a_track_that_errs_beyond_its_walk_and_offset_has_strayed() -> None:
+def test_a_track_that_errs_beyond_its_walk_and_offset_is_implausible() -> None:
     """Errors of 1.9 and 2.9 standard deviations in each channel, squared 10.8 and 25.2: the bound is between."""
     noise = TrackNoise(np.full(3, 0.1), np.full(3, 0.2), np.array([0.0, 0.7, 0.0]))
     assert SEQUENCE.prior is not None
-    joint = ErringBelief(motion_model(SEQUENCE.noise, SEQUENCE.gravity_world).initial_belief(SEQUENCE.prior), noise)
+    joint = TrackErrorBelief(motion_model(SEQUENCE.noise, SEQUENCE.gravity_world).initial_belief(SEQUENCE.prior), noise)
     ages = np.array([9, 9, 36])
     spread_px = np.sqrt(0.04 * ages[:, None] + np.array([0.0, 0.49, 0.0]))
     joint.track_errors_px, joint.ages = np.array([[1.9], [2.9], [1.9]]) * spread_px, ages
-    assert strayed(joint, FrameGate(0.999)).tolist() == [False, True, False]
-    assert not strayed(joint, FrameGate(None)).any()
+    assert implausible_errors(joint, FrameGate(0.999)).tolist() == [False, True, False]
+    assert not implausible_errors(joint, FrameGate(None)).any()

@@ -22,7 +22,7 @@ from toolkit.sequence import StereoFrame, StereoRig
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 
-class ErringBelief(JointBelief):
+class TrackErrorBelief(JointBelief):
     """A joint belief with the errors of its landmarks' tracks behind the landmarks, three a track.
 
     ``track_errors_px`` (L, 3) are their estimates, ``ages`` (L,) the ages of the tracks at their last sighting.
@@ -45,7 +45,7 @@ class ErringBelief(JointBelief):
         """Return where the errors of the tracks stand in the error state."""
         return slice(self.landmark_columns.stop, self.cov.shape[0])
 
-    def add_erring_landmarks(self, started: "Started", ages: IntArray) -> None:
+    def add_landmarks_with_errors(self, started: "Started", ages: IntArray) -> None:
         """Add landmarks with the errors of their tracks, whose last sightings have these ages (N,)."""
         landmarks, before = self.landmark_columns, self.cov.shape[0]
         self._add_rows(started.jacobian, started.cov)
@@ -80,7 +80,7 @@ class ErringBelief(JointBelief):
         super()._displace(delta)
 
 
-def correct(joint: ErringBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
+def correct(joint: TrackErrorBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     count = len(joint.landmark_ids)
     if not count:
@@ -107,7 +107,7 @@ def correct(joint: ErringBelief, frame: StereoFrame, at: Linearisation, rig: Ste
         joint.update(H.reshape(3 * used.size, -1), (roots[:, None] * residuals[used]).ravel(), slice(first, None))
 
 
-def strayed(joint: ErringBelief, gate: FrameGate) -> BoolArray:
+def implausible_errors(joint: TrackErrorBelief, gate: FrameGate) -> BoolArray:
     """Say which tracks (L,) have come to an error that the walk and the offset do not explain, by the gate's measure.
 
     What moves slowly by itself passes the gate at every frame, and its track's error takes up all of it.
@@ -116,7 +116,7 @@ def strayed(joint: ErringBelief, gate: FrameGate) -> BoolArray:
     return np.asarray((np.square(joint.track_errors_px) / variance_px2).sum(axis=1) > gate.bound(3))
 
 
-def _columns_each(joint: ErringBelief) -> IntArray:
+def _columns_each(joint: TrackErrorBelief) -> IntArray:
     """Return the columns (L, 12) of the newest clone, of each landmark and of the error of its track."""
     newest = np.arange(joint.clone_columns.stop - 6, joint.clone_columns.stop)
     own = np.arange(joint.landmark_columns.start, joint.cov.shape[0]).reshape(2, -1, 3)
@@ -139,12 +139,12 @@ class Started(NamedTuple):
     cov: Array
 
 
-def add_tracks(joint: ErringBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
+def add_tracks(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
     """Put N tracks seen from the clones, the newest among them, into the state with the errors they have by now."""
-    joint.add_erring_landmarks(started(joint, sightings, points, linearised), sightings.ages[:, -1])
+    joint.add_landmarks_with_errors(started(joint, sightings, points, linearised), sightings.ages[:, -1])
 
 
-def started(joint: ErringBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> Started:
+def started(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> Started:
     """Return what the window's sightings say of N landmarks and of the errors of their tracks at the newest pose.
 
     With residuals, Jacobians and noise e decorrelated, ``r = H_x x + H p + e``, the best point errs by
