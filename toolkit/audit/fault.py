@@ -108,11 +108,12 @@ class Evidence:
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
     def after(self, remedy: Sequence) -> "Evidence":
-        """Return the evidence after a repair; the camera's motion is kept where the repair left it as it was."""
+        """Return the evidence after a repair; what tracks alone show is kept where it left them as they were."""
         now, before = Evidence(remedy, self.spoilt_by), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
-        if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m and "camera_motion" in self.__dict__:
-            now.__dict__["camera_motion"] = self.camera_motion
+        if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
+            known = ("camera_motion", "one_step")
+            now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, interval_means
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
 from toolkit.audit.parts.robust import Scalar, jackknife_error, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
@@ -89,9 +89,10 @@ def _stamped_at_frames(sequence: Sequence) -> bool:
 def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
     """Estimate how much later than its stamps (s) the camera's rotation is, or None where nothing tells."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
     candidates = np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s)
-    at_zero = _unexplained(w_imu, *_gyro_at(sequence, intervals, 0.0))
-    costs = [_unexplained(w_imu, *_gyro_at(sequence, intervals, offset_s)) for offset_s in candidates]
+    at_zero = _unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, 0.0))
+    costs = [_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, offset_s)) for offset_s in candidates]
     if not np.isfinite(costs).any():
         return None
     best = int(np.nanargmin(costs))
@@ -99,9 +100,9 @@ def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Sca
     found = Scalar(offset_s, np.inf)
     seen, known = _change_seen(sequence, intervals, w_imu)
     for _ in range(REFINEMENTS):
-        mean, inside = _gyro_at(sequence, intervals, found.value)
-        after, after_inside = _gyro_at(sequence, intervals, found.value + 0.1 * step_s)
-        before, before_inside = _gyro_at(sequence, intervals, found.value - 0.1 * step_s)
+        mean, inside = _gyro_at(gyro, sequence, intervals, found.value)
+        after, after_inside = _gyro_at(gyro, sequence, intervals, found.value + 0.1 * step_s)
+        before, before_inside = _gyro_at(gyro, sequence, intervals, found.value - 0.1 * step_s)
         rows = known & inside & after_inside & before_inside
         if rows.sum() < LEAST_INTERVALS:
             return None
@@ -134,13 +135,12 @@ def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tupl
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
 
 
-def _gyro_at(sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
+def _gyro_at(gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
     """Return the mean rates (M, 3) of the gyro over the intervals, shifted, and which of them it reaches (M,)."""
-    motion = sequence.motion
     frames_t_ns = sequence.frames_t_ns + round(offset_s * NS_PER_S)
     begin, end = frames_t_ns[intervals.interval], frames_t_ns[intervals.interval + 1]
-    inside = (begin >= motion.t_ns[0]) & (end <= motion.t_ns[-1])
-    return interval_means(motion.t_ns, motion.values[:, 3:], frames_t_ns)[intervals.interval], np.asarray(inside)
+    inside = (begin >= gyro.t_ns[0]) & (end <= gyro.t_ns[-1])
+    return gyro.means(frames_t_ns)[intervals.interval], np.asarray(inside)
 
 
 def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:

@@ -55,16 +55,39 @@ def is_comparable(sequence: Sequence) -> bool:
     return True
 
 
+class Integral(NamedTuple):
+    """Samples (S, d) at stamps (S,), joined by straight lines and level beyond the ends, and their integral up to each.
+
+    Made once, it has the means over any intervals at the cost of these alone.
+    """
+
+    t_ns: IntArray
+    values: Array
+    up_to: Array
+
+    @classmethod
+    def of(cls, t_ns: IntArray, values: Array) -> "Integral":
+        """Return the integral of samples in the order of time."""
+        pieces = 0.5 * (values[1:] + values[:-1]) * (np.diff(t_ns) / NS_PER_S)[:, None]
+        return cls(t_ns, values, np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)]))
+
+    def means(self, frames_t_ns: IntArray) -> Array:
+        """Return the mean (K - 1, d) over each interval between stamps (K,)."""
+        return np.asarray(np.diff(self._at(frames_t_ns), axis=0) / (np.diff(frames_t_ns) / NS_PER_S)[:, None])
+
+    def _at(self, t_ns: IntArray) -> Array:
+        """Return the integral (K, d) from the first sample to stamps (K,)."""
+        row = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, len(self.t_ns) - 1)
+        following = np.minimum(row + 1, len(self.t_ns) - 1)
+        since_s = ((t_ns - self.t_ns[row]) / NS_PER_S)[:, None]
+        step_s = np.maximum(self.t_ns[following] - self.t_ns[row], 1)[:, None] / NS_PER_S
+        slope = np.where(since_s > 0.0, (self.values[following] - self.values[row]) / step_s, 0.0)
+        return np.asarray(self.up_to[row] + since_s * (self.values[row] + 0.5 * since_s * slope))
+
+
 def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Array:
     """Return the mean (K - 1, d) over each interval between frames of samples (S, d) joined by straight lines."""
-    sample_s, frame_s = (t_ns - frames_t_ns[0]) / NS_PER_S, (frames_t_ns - frames_t_ns[0]) / NS_PER_S
-    knots_s = np.union1d(sample_s, frame_s)
-    at_knots = np.stack([np.interp(knots_s, sample_s, column) for column in values.T], axis=1)
-    pieces = 0.5 * (at_knots[1:] + at_knots[:-1]) * np.diff(knots_s)[:, None]
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(pieces, axis=0)])
-    at_frames = integral[np.searchsorted(knots_s, frame_s)]
-    means: Array = np.diff(at_frames, axis=0) / np.diff(frame_s)[:, None]
-    return means
+    return Integral.of(t_ns, values).means(frames_t_ns)
 
 
 def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> float:
