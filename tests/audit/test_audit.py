@@ -1,5 +1,7 @@
 """The audit as a whole: clean recordings pass, each planted fault is found, counted, and repaired or kept."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +47,13 @@ def test_a_kept_fault_is_found_blocks_and_is_left_alone(plant: Any) -> None:
 def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[..., Sequence]) -> None:
     with pytest.raises(VislamError, match="no fault is called rust; there are time-order"):
         audit(clean_recording(), keep=frozenset({"rust"}))
+
+
+def test_the_audit_imports_nothing_that_takes_as_long_as_an_audit() -> None:
+    """Every process that runs an estimator audits first: scipy.stats alone takes a second to import."""
+    program = "import sys; from toolkit.audit import faults; faults(); print(*sys.modules)"
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"scipy.stats", "scipy.optimize", "matplotlib", "cv2"}.intersection(told)
 
 
 def test_every_fault_has_a_summary_of_one_line() -> None:

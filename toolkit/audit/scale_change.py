@@ -5,7 +5,7 @@ any two of them counts that the scatter within either part does not explain.
 """
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
@@ -35,7 +35,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     ratio = np.sum(measured * seen, axis=1)[fast] / speed_mps[fast] ** 2
     after, step = _largest_step(ratio)
     level = LEVEL / (STRETCHES + 1 - 2 * LEAST_STRETCHES)
-    sigmas = float(student.isf(0.5 * level, STRETCHES - 2))
+    sigmas = float(stdtrit(STRETCHES - 2, 1.0 - 0.5 * level))
     if abs(step.value) < max(SYSTEMATIC, sigmas * step.error):
         return None
     frame = intervals.interval[fast][np.argmax(np.arange(len(ratio)) * STRETCHES // len(ratio) == after)]
