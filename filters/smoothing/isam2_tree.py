@@ -238,8 +238,9 @@ class Isam2Tree:
                     self._sightings.setdefault(key, []).append(self._slot_count + place)
                     self._landmarks.add(key)
         self._slot_count += factors.size()
+        new = list(factors.keys())
         leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._to_relinearise)])
-        order, anew = (self._order(factors), None) if not leaving else self._order_before_retiring(values, leaving)
+        order, anew = (self._order(new, new), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
             self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)
             self._solve_back()
@@ -280,15 +281,16 @@ class Isam2Tree:
         """Read a variable, for which GTSAM solves for all: only here does QR refuse what it has eliminated."""
         self.read(self._recent[-1][:1])
 
-    def _order(self, factors: gtsam.NonlinearFactorGraph) -> gtsam.KeyGroupMap:
-        """Return the place of each recent state, and each long-lived landmark it sees, in the elimination.
+    def _order(self, new: list[int], in_view: Iterable[int]) -> gtsam.KeyGroupMap:
+        """Return the place of each recent state, and each long-lived landmark in view, in the elimination.
 
-        All else comes first. CCOLAMD takes no place beyond the number of variables it orders, of which the new factors'
-        are the least; where some are only taken out, two at least are ordered, of which one is the last variable.
+        All else comes first: the long-lived landmarks of a whole run behind its states would leave a dense system of
+        them. ``new`` are the keys of the factors that an update adds: CCOLAMD takes no place beyond the number of
+        variables it orders, of which these are the least; where some are only taken out, two at least are ordered, of
+        which one is the last variable.
         """
-        groups, new = gtsam.KeyGroupMap(), list(factors.keys())
-        states = list(self._recent)
-        long_lived = [key for key in new if len(self._sightings.get(key, ())) > LONG_LIVED_SIGHTINGS]
+        groups, states = gtsam.KeyGroupMap(), list(self._recent)
+        long_lived = [key for key in in_view if len(self._sightings.get(key, ())) > LONG_LIVED_SIGHTINGS]
         last = [*states[:-1], long_lived, *states[-1:], [LAST]]
         for place, keys in enumerate(last[-max(len(new) - 1, 1) :], start=1):
             for key in keys:
@@ -355,7 +357,7 @@ class Isam2Tree:
         self._frozen.come_back(self._retired.keys)
         self._retired, self._landmarks = RetiredVariables(), set(self._sightings)
         self.isam = self._empty_tree()
-        self.isam.update(compact, values, [], self._order(compact))
+        self.isam.update(compact, values, [], self._order(list(compact.keys()), in_view=()))
         self._solve_back()
 
     def _empty_tree(self) -> gtsam.ISAM2:
