@@ -179,6 +179,27 @@ def test_after_a_refusal_for_rounding_it_solves_by_qr_and_returns_to_cholesky_wi
     assert estimator._log == ["frame 3: x2 was indeterminate to rounding: solved by QR for some frames"]
 
 
+def test_a_tree_built_anew_has_all_landmarks_before_its_states_however_long_they_were_seen(monkeypatch):
+    """Behind the states of a whole run they are one dense system: 24 GB for 1100 frames of a real drive."""
+    monkeypatch.setattr(isam2_tree, "LONG_LIVED_SIGHTINGS", 0)
+    placed = dict[str, gtsam.KeyGroupMap]()
+    order = Isam2Tree._order
+
+    def watched(tree: Isam2Tree, new: list[int], in_view: list[int]) -> gtsam.KeyGroupMap:
+        return placed.setdefault("anew" if not in_view else "grown", order(tree, new, in_view))
+
+    monkeypatch.setattr(Isam2Tree, "_order", watched)
+    sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
+    estimator = isam2_of(sequence)
+    for packet in sequence.packets():
+        estimator.step(packet)
+    tree = estimator._tree
+    states = sum(map(len, tree._recent)) + 1  # and the last variable
+    assert placed["grown"].size() > states
+    tree._rebuild(gtsam.NonlinearFactorGraph(tree.isam.getFactorsUnsafe()), tree.isam.getLinearizationPoint())
+    assert placed["anew"].size() == states
+
+
 def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
     """Two states of neighbouring frames in one clique would be beyond the condition that GTSAM allows."""
     sequence = simulate(replace(FLIGHT, duration_s=3.0), 1)
