@@ -106,6 +106,17 @@ def test_a_path_that_is_not_there_is_answered_with_what_is(tmp_path: Path) -> No
         load_sequence(tmp_path / "recordings" / "drive.npz")
 
 
+def test_a_path_that_is_not_there_in_a_folder_that_cannot_be_listed_is_told_plainly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_folder: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    with pytest.raises(DataError, match=r"no such file or directory; check the path$"):
+        load_sequence(tmp_path / "drive.npz")
+
+
 @pytest.mark.parametrize("content", [b"", b"P", b"PK\x03\x04", b"hello world", bytes(1000)])
 def test_unknown_content_names_the_formats(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "03.npz"

@@ -11,6 +11,7 @@ A package of another distribution is found where it is announced under the entry
 
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
@@ -29,6 +30,8 @@ from toolkit.settings import DEFAULTS, Frontend, Tracks
 
 # So many names of a folder are shown to somebody who asked for one that is not in it.
 _SHOWN = 8
+# And so many are compared with what was asked for: a folder of images has a hundred thousand.
+_COMPARED = 1000
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -263,7 +266,10 @@ def _nearest_source(path: Path, source: str) -> str:
     if path.parent != Path():
         if not path.parent.is_dir():
             return f"; there is no folder {path.parent}"
-        beside = [inside.name for inside in path.parent.iterdir()]
+        try:
+            beside = [inside.name for inside in islice(path.parent.iterdir(), _COMPARED)]
+        except OSError:  # a folder that may be entered and not listed
+            return "; check the path"
         return did_you_mean(path.name, beside) or f"; {path.parent} has {_some(beside)}"
     names = built_in_names()
     return did_you_mean(source, names) or f", and the built-in sequences are {', '.join(names)}"
