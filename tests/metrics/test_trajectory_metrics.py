@@ -69,6 +69,17 @@ def test_worlds_that_disagree_on_a_measured_vertical_are_remarked(
     assert "ate_se3_m" not in notes
 
 
+@pytest.mark.parametrize(("tilt_rad", "remarked"), [(0.01, True), (0.0, False)])
+def test_a_tilt_that_no_sensor_measured_is_remarked_where_it_is_most_of_the_error_with_the_vertical_kept(
+    make_sequence, drive, perturb, score, tilt_rad, remarked
+):
+    sequence = make_sequence(drive(400), track_count=3, motion="twist")
+    estimate = perturb(sequence.truth.T_world_imu, 1e-3, seed=1)
+    notes = score(sequence, se3_exp(np.array([0.0, tilt_rad, 0.0, 0.0, 0.0, 0.0])) @ estimate).notes
+    assert ("no sensor measured the vertical" in notes.get("ate_yaw_m", "")) == remarked
+    assert "ate_none_m" not in notes and "ate_se3_m" not in notes
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_heading_fit_is_the_least_squares_one(seed):
     rng = np.random.default_rng(seed)
