@@ -62,8 +62,8 @@ _DISAGREE = (
     "end_drift_percent too; if the truth's world is not level, compare ate_se3_m"
 )
 _UNMEASURED = (
-    "no sensor measured the vertical, and how far the first frame, where an estimator's world begins, is tilted in the "
-    "truth's is most of this error; compare ate_se3_m"
+    "without a measured vertical the tilt of an estimator's world, its first frame, in the truth's depends on where it "
+    "begins, and is most of this error; compare ate_se3_m"
 )
 _ON_A_LINE = "the positions lie on a line, so the rotation about it is not determined"
 
