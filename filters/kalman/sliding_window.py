@@ -38,14 +38,18 @@ from toolkit.track_noise import TrackNoise
 class SlidingWindowFilter:
     """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
 
-    ``landmarks`` is how many long-lived landmarks the state may have.
+    ``landmarks`` is how many long-lived landmarks the state may have, ``window_s`` how far back the window reaches,
+    in seconds, if not as far as the settings say.
     """
 
-    def __init__(self, setup: Setup, linearisation: Linearisation, landmarks: int = 0) -> None:
+    def __init__(
+        self, setup: Setup, linearisation: Linearisation, landmarks: int = 0, window_s: float | None = None
+    ) -> None:
         self._rig, self._at = setup.rig, linearisation
         self._outliers = setup.settings.outliers
         self._motion = motion_model(setup.noise, setup.gravity_world)
-        window_s = setup.settings.window.seconds(setup.motion_kind)
+        if window_s is None:
+            window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
