@@ -108,7 +108,7 @@ def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam
         (("--set", "window.most_states=1"), "window.most_states"),
         (("--config", "wrong.toml"), "wrong.toml: there is no setting outliers.gate; did you mean"),
         (("--config", "asked.toml"), "asked.toml: there is no compare.estimator; did you mean estimators?"),
-        (("--config", "typed.toml"), "typed.toml: compare: "),
+        (("--config", "typed.toml"), "typed.toml: compare.max_frames: expected integer >= 2"),
         (("--config", "broken.toml"), "broken.toml: is not TOML"),
         (("--config", "absent.toml"), "absent.toml: cannot be read"),
         (("--config", "absent.json"), "absent.json: cannot be read"),

@@ -50,6 +50,29 @@ def test_plain_text_is_the_same_in_markdown(text: str) -> None:
     assert in_markdown(text) == text
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("drive", "--estimators", "ekf", "batch", "iekf"), "give names with commas: --estimators ekf,batch,iekf (see"),
+        (("drive", "--max-frames", "9", "batch"), "unexpected argument batch (see"),
+        (("drive", "--estimtors=ekf"), "there is no option --estimtors; did you mean --estimators? (see"),
+    ],
+)
+def test_an_argument_that_is_left_over_is_answered_by_its_command(
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], told: str
+) -> None:
+    assert vislam("compare", *words) == 2
+    assert f"{told} vislam compare --help)" in one_line()
+
+
+def test_a_run_directory_given_as_a_recording_is_told_from_one(vislam: Vislam, one_line: OneLine) -> None:
+    Path("run").mkdir()
+    for name in ("manifest.json", "metrics.json"):
+        (Path("run") / name).write_text("{}")
+    assert vislam("compare", "run") == 3
+    assert "is a run directory and no recording: vislam report shows it, and --config run/manifest.json" in one_line()
+
+
 @pytest.mark.parametrize("seconds", ["1e9", "3601", "1e-9"])
 def test_a_simulation_of_no_sensible_length_is_refused_before_memory_is_asked_for(
     vislam: Vislam, one_line: OneLine, seconds: str

@@ -5,10 +5,11 @@ import math
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
-from toolkit.errors import VislamError, no_such, printable
+from toolkit.errors import VislamError, did_you_mean, no_such, printable
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -62,6 +63,25 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False,
             **options,
         )
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """Parse; what is left over is an error of the command it was given to, which knows its options."""
+        given = list(sys.argv[1:] if args is None else args)
+        options, left = super().parse_known_args(given, namespace)
+        if left:
+            self.error(self._why_left(left[0], given))
+        return options, left
+
+    def _why_left(self, word: str, given: list[str]) -> str:
+        if word.startswith("-"):
+            option = word.partition("=")[0]
+            return f"there is no option {option}{did_you_mean(option, self._option_string_actions)}"
+        options = [i for i in range(given.index(word)) if given[i] in self._option_string_actions]
+        if not options or self._option_string_actions[given[options[-1]]].type is not names:
+            return f"unexpected argument {word}"
+        option, *values = given[options[-1] :]
+        listed = ",".join(takewhile(lambda value: not value.startswith("-"), values))
+        return f"unexpected argument {word}; give names with commas: {option} {listed}"
 
     def error(self, message: str) -> NoReturn:
         """Leave with status 2 and one line on stderr."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
+from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean
 from toolkit.inputs import read_text_input
 from toolkit.settings import Settings, SettingsError, as_values, read_toml, settings_of
@@ -59,7 +60,7 @@ def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place
     try:
         asked = msgspec.convert(dict(request), Request)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {COMPARE}: {error}") from error
+        raise SettingsError(f"{place}: {COMPARE}.{in_words(error, dict(request), Request)}") from error
     return Configuration(asked, settings_of(settings, place))
 
 

@@ -3,11 +3,12 @@
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import msgspec
 from msgspec import Struct
 
+from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean, no_such
 from toolkit.inputs import read_text_input
 from toolkit.settings.described import describe
@@ -23,10 +24,22 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     or out of range; ``place`` says where the values come from.
     """
     _check_keys(given, Settings, "", place)
+    values = _with_policy(_with_none(given, Settings), place)
     try:
-        return msgspec.convert(_with_policy(given, place), Settings)
+        return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {_in_words(str(error))}") from error
+        raise SettingsError(f"{place}: {in_words(error, values, Settings)}") from error
+
+
+def _with_none(given: Mapping[str, Any], record: type[Struct]) -> dict[str, Any]:
+    """Return nested values with None for the word "none" where a setting may be none: TOML has no value for it."""
+    hints, values = get_type_hints(record), dict(given)
+    for key, value in given.items():
+        if isinstance(value, Mapping) and isinstance(hints[key], type) and issubclass(hints[key], Struct):
+            values[key] = _with_none(value, hints[key])
+        elif value == "none" and type(None) in get_args(hints[key]):
+            values[key] = None
+    return values
 
 
 def _with_policy(given: Mapping[str, Any], place: str) -> dict[str, Any]:
@@ -81,13 +94,8 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
     hints = get_type_hints(record)
     for key, value in given.items():
         if key not in hints:
-            known = [described.key for described in describe()] + ["estimators"]
+            keys = [described.key for described in describe()]
+            known = [*keys, *{section.partition(".")[0] for section in keys}, "estimators"]
             raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
-
-
-def _in_words(message: str) -> str:
-    """Return what msgspec says of a value, the setting by its own name first."""
-    what, _, where = message.partition(" - at `$.")
-    return f"{where.rstrip('`')}: {what[0].lower()}{what[1:]}" if where else what

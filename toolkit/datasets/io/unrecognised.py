@@ -1,4 +1,4 @@
-"""What is told of a path that is of no format: an archive, a trajectory, a folder that recordings are in."""
+"""What is told of a path that is of no format: an archive, a trajectory, a run directory, a folder of recordings."""
 
 from collections.abc import Callable
 from itertools import islice
@@ -24,6 +24,11 @@ _LOOKED_AT, _NAMED = 50, 3
 def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
     """Return what a path of no format is, and what to do; ``recognised`` says whether a path is a recording."""
     if path.is_dir():
+        if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
+            return (
+                "is a run directory and no recording: vislam report shows it, and --config "
+                f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
+            )
         inside = [entry.name for entry in islice(sorted(path.iterdir()), _LOOKED_AT) if recognised(entry)][:_NAMED]
         if inside:
             return f"is no recording, and holds some: name {printable(' or '.join(inside))} in it"
