@@ -22,6 +22,7 @@ from toolkit.experiment import Comparison
 from toolkit.metrics import describe
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.table import comparison_table
+from toolkit.settings import SettingsError
 
 pytestmark = pytest.mark.usefixtures("audited_once")
 
@@ -223,6 +224,27 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         VislamError, match=r"there is no setting noise.pixel_sigma; did you mean noise.pixel_sigma_px\?"
     ):
         toolkit.compare("drive", settings={"noise": {"pixel_sigma": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ({"max_frames": 1}, "max_frames is 1"),
+        ({"workers": 0}, "workers is 0"),
+        ({"every": 0}, "every is 0"),
+        ({"from_s": -1.0}, "from -1 s to the end"),
+        ({"from_s": 5.0, "to_s": 2.0}, "from 5 s to 2 s"),
+        ({"to_s": float("nan")}, "from 0 s to nan s"),
+        ({"settings": "window"}, "settings is a str"),
+        ({"estimators": []}, "nothing is to be compared"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_before_anything_runs(
+    asked: dict[str, object], why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(toolkit.api, "run_plan", None)
+    with pytest.raises(SettingsError, match=why):
+        toolkit.compare("drive", **{"estimators": "ekf", **asked})
 
 
 def test_a_result_is_saved_as_a_run_directory(tmp_path: Path, over: Result, unrendered: None) -> None:

@@ -26,7 +26,7 @@ from toolkit.experiment.recording import Part
 from toolkit.progress import silent
 from toolkit.report.table import Table, as_markdown, as_text, columns_asked, comparison_table
 from toolkit.sequence import Sequence
-from toolkit.settings import DEFAULTS, Settings, as_values, settings_of
+from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,6 +88,8 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
 
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
+    if not isinstance(settings, Settings | Mapping):
+        raise SettingsError(f"settings is a {type(settings).__name__}; give nested values, as {{'seeds': 3}}")
     values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
     given = {"first_seed": seed, "seeds": seeds}
     return settings_of(values | {key: value for key, value in given.items() if value is not None}, "settings")

@@ -92,3 +92,9 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(clusters, "_CONNECT_S", 0.3)
     with pytest.raises(ClusterError, match=r"no scheduler can be reached at tcp://127\.0\.0\.1:9 "):
         Cluster("tcp://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("address", ["head-node", "tcp://head-node", "tcp://:8786 "])
+def test_what_is_no_address_is_told_before_anything_connects(address: str) -> None:
+    with pytest.raises(ClusterError, match="is no address of a scheduler; give one like tcp://host:8786"):
+        Cluster(address)

@@ -5,6 +5,7 @@ A worker that dies loses the unit it was busy with; the scheduler gives it to an
 whenever it joins: one that runs another would compute something else.
 """
 
+import re
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from typing import Any, ClassVar, Self, TypeVar
@@ -18,6 +19,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 Version = tuple[str, dict[str, str]]
 
+_ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d+")
 _CONNECT_S = 10.0
 _INSTALL = "pip install 'vislam-toolkit[cluster]'"
 
@@ -106,6 +108,8 @@ def _connected(address: str) -> Any:
         from distributed import Client
     except ModuleNotFoundError as error:
         raise ClusterError(f"a cluster needs the package {error.name}: {_INSTALL}") from error
+    if not _ADDRESS.fullmatch(address):  # Dask would leave a connection behind that cannot be closed
+        raise ClusterError(f"{address} is no address of a scheduler; give one like tcp://host:8786")
     try:
         return Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:

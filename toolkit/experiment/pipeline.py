@@ -22,7 +22,7 @@ from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
 from toolkit.measured_motion import MotionKind
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
-from toolkit.settings import DEFAULTS, Noise, Settings
+from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,8 @@ class Plan:
     are files of other systems by name, both for a single source. ``keep`` names the faults that the audit reports but
     leaves as they are. ``workers`` is the number of processes, one a processor where it is None. ``keep_trajectories``
     writes those of every seed; of a single one they always are. ``scheduler`` is the address of a Dask cluster that
-    does the work instead. ``part`` is what is used of each source, ``max_frames`` the first frames of that.
+    does the work instead. ``part`` is what is used of each source, ``max_frames`` the first frames of that. Raises
+    SettingsError where nothing would be compared, or with nothing.
     """
 
     sources: tuple[str | Recorded, ...]
@@ -49,6 +50,14 @@ class Plan:
     keep_trajectories: bool = False
     scheduler: str | None = None
     part: Part = WHOLE
+
+    def __post_init__(self) -> None:
+        if not (self.estimators or self.own or self.trajectories):
+            raise SettingsError("nothing is to be compared: name an estimator, or a trajectory of another system")
+        if self.max_frames is not None and not self.max_frames >= 2:
+            raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
+        if self.workers is not None and self.workers < 1:
+            raise SettingsError(f"workers is {self.workers}; it is a number of processes, 1 or more")
 
     @property
     def seeds(self) -> tuple[int, ...]:

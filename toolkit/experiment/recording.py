@@ -1,5 +1,6 @@
 """From a source to what every estimator reads: loaded, audited, cut, with its noise and a state to start from."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -35,12 +36,19 @@ STARTS: dict[Start, Callable[[Sequence], Prior]] = {
 class Part:
     """Which frames of a recording are used: seconds after its first frame, ends included, and one frame in so many.
 
-    Motion samples and truth stay whole.
+    Motion samples and truth stay whole. Raises SettingsError for a time or a step that is no part of anything.
     """
 
     from_s: float = 0.0
     to_s: float | None = None
     every: int = 1
+
+    def __post_init__(self) -> None:
+        to_s = math.inf if self.to_s is None else self.to_s
+        if not 0.0 <= self.from_s < to_s:
+            raise SettingsError(f"{self}: a part begins and ends at seconds after the first frame, and ends last")
+        if self.every < 1:
+            raise SettingsError(f"every is {self.every}; one frame in so many is used, 1 or more")
 
     def __str__(self) -> str:
         end = "the end" if self.to_s is None else f"{self.to_s:g} s"
