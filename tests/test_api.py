@@ -107,7 +107,7 @@ def test_faults_that_are_kept_are_not_repaired() -> None:
     uv_px[::97, 1] = uv_px[::97, 0]  # no disparity
     faulty = replace(drive, observations=replace(drive.observations, uv_px=uv_px))
     found = [
-        toolkit.compare(faulty, [], keep=keep, max_frames=FRAMES, workers=1).comparison.findings
+        toolkit.compare(faulty, "dead-reckoning", keep=keep, max_frames=FRAMES, workers=1).comparison.findings
         for keep in ((), faults())
     ]
     assert [[finding.repaired for finding in findings] for findings in found] == [[True], [False]]
