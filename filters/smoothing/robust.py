@@ -165,7 +165,7 @@ def _with_sightings(
 def _only_seen(values: gtsam.Values, frames: list[StereoFrame]) -> gtsam.Values:
     """Return the values of all states and of the landmarks that some frame sees."""
     landmarks = {L(i) for i in seen_ids(frames)}
-    return values.extract([key for key in values.keys() if kind_of(key) != "l" or key in landmarks])  # noqa: SIM118 - not a mapping
+    return values.extract([key for key in values.keys() if key in landmarks or kind_of(key) != "l"])  # noqa: SIM118 - not a mapping
 
 
 def _residuals(
@@ -193,4 +193,6 @@ def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
 def _without_those_behind(frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig) -> list[StereoFrame]:
     behind = [frame.track_ids[depth_m <= 0.0] for frame, _, depth_m in _residuals(frames, values, rig)]
     dropped = np.concatenate(behind)
+    if not dropped.size:
+        return frames
     return [frame.select(~np.isin(frame.track_ids, dropped)) for frame in frames]

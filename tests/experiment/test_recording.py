@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from toolkit.audit import Audit
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
-from toolkit.experiment import Plan
+from toolkit.experiment import Plan, recording
 from toolkit.experiment.recording import Part, Recording, prepare
 from toolkit.measured_motion import ImuNoise, MotionNoise, TwistMotion, TwistNoise
+from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
 from toolkit.simulation.track_faults import moving_objects
@@ -75,6 +77,34 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     seconds = prepare(Recording(whole, duration_s=1.0))
     t_ns = seconds.sequence.frames_t_ns
     assert t_ns[-1] - t_ns[0] <= 10**9 < whole.frames_t_ns[t_ns.size] - t_ns[0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "undecided", "audited_s"),
+    [
+        (Recording("drive", max_frames=7), {}, [30]),
+        (Recording("flight", max_frames=7), {}, [20]),
+        (Recording("drive", part=Part(30.0, 40.0)), {}, [40]),
+        (Recording("drive"), {}, [60]),
+        (Recording("drive", max_frames=7), {"lever-arm": "too little rotation"}, [30, 60]),
+        (Recording("drive-realistic", max_frames=7), {}, [60]),  # its tracks err otherwise than it states
+    ],
+)
+def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_that_tells_too_little(
+    asked: Recording, undecided: dict[str, str], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lengths_s: list[float] = []
+
+    def told(sequence: Sequence, _keep: frozenset[str]) -> Audit:
+        lengths_s.append(sequence.duration_s)
+        return Audit(sequence, (), undecided)
+
+    monkeypatch.setattr(recording, "audit", told)
+    prepared = prepare(asked)
+    assert lengths_s == audited_s
+    assert (prepared.whole.duration_s, prepared.undecided) == (60.0, undecided)
+    prepare(replace(asked, source=prepared.whole))  # as a recording of somebody's own
+    assert lengths_s[-1] == 60.0
 
 
 def test_a_part_is_what_lies_between_its_times_thinned_and_is_told() -> None:

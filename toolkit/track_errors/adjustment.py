@@ -8,7 +8,6 @@ of the poses are banded (Triggs et al., "Bundle adjustment", 2000, section 8.2);
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from toolkit.audit.parts.intervals import interval_means
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log
@@ -80,6 +79,8 @@ def _measured(sequence: Sequence, camera: CameraMotion) -> Array:
 
 def adjusted(start: Adjusted, model: Tailed, sequence: Sequence, iterations: int) -> Adjusted:
     """Return the poses and landmarks after Gauss-Newton steps from where they are."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded  # every process would import it, and most do without
+
     poses, tracks, freedom = start.T_world_middle, start.tracks, start.freedom
     tie = _Tie(se3_inverse(poses[:-1]) @ poses[1:], _TIE * np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S)
     for _ in range(iterations):
@@ -103,6 +104,8 @@ def _used_up(factor: tuple[Array, bool], tie: Array) -> float:
 
     ``tie`` (K - 1, 6, 12) are the rows R of the ties, A is the whole normal matrix.
     """
+    from scipy.linalg import cho_solve_banded
+
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(*tie.shape[:2], _PROBES))
     by_pose = np.swapaxes(tie, 1, 2) @ signs
     right = np.zeros((len(tie) + 1, 6, _PROBES))

@@ -7,7 +7,7 @@ means scatter by in the rest of the recording, which holds noise, slip and what 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter, minimum_filter
+from numpy.lib.stride_tricks import sliding_window_view
 
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
@@ -161,9 +161,9 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     half = so3_exp(0.5 * h_s * (mean[:, 3:] - bias_radps))
     R_first_imu = chained(half @ half)
     v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
-    smooth = np.asarray(median_filter(v_first, size=(_MEDIAN_OF, 1), mode="nearest"))
+    smooth = np.asarray(np.median(_neighbours(v_first), axis=-1))
     force = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1)
-    sound = minimum_filter(camera.known, size=_MEDIAN_OF, mode="nearest")
+    sound = _neighbours(camera.known.astype(float)).min(axis=-1) > 0.0
     rows = np.flatnonzero(sound[1:] & sound[:-1])
     t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
     value = (np.diff(smooth, axis=0) / h_s - force)[rows]
@@ -171,6 +171,13 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
+
+
+def _neighbours(values: Array) -> Array:
+    """Return each value (n, ...) with those beside it, _MEDIAN_OF in all (n, ..., _MEDIAN_OF); the ends repeat."""
+    reach = _MEDIAN_OF // 2
+    padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
+    return np.asarray(sliding_window_view(padded, _MEDIAN_OF, axis=0))
 
 
 def _around(t_s: Array, value: Array) -> Array:
