@@ -20,7 +20,7 @@ from filters.smoothing.cached_linearisation import (
     renewed,
     with_linearisations,
 )
-from filters.smoothing.chained_past import ChainedPast
+from filters.smoothing.chained_past import ChainedPast, Places
 from filters.smoothing.frozen_variables import FrozenVariables
 from filters.smoothing.indeterminate import (
     LAST,
@@ -30,6 +30,7 @@ from filters.smoothing.indeterminate import (
     weak_hold,
     without_gaps,
 )
+from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
 from filters.smoothing.retired_variables import RetiredVariables, key_list
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
@@ -48,13 +49,6 @@ FROZEN_AFTER_FRAMES = 30
 RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
-# How far states may move from where they are linearised: rad; m/s, or the unit of a rate; m/s^2 and rad/s of a bias;
-# and multiples of the baseline, the length that sets the scale of what stereo sees: the image of a point 20 baselines
-# away is then off by a tenth of a pixel. A velocity and a bias of the accelerometer that all states share change no
-# residual but by the turn between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1
-# baselines and 0.01 of the rest made a flight of two minutes five times less accurate.
-ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
-POSITION_THRESHOLD_BASELINES = 0.3
 MOST_RECOVERIES = 20
 
 
@@ -62,7 +56,8 @@ class Isam2Tree:
     """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
 
     def __init__(self, motion: MotionModel, baseline_m: float, chained: ChainedPast | None = None) -> None:
-        self._motion, self._baseline_m, self._chained = motion, baseline_m, chained
+        self._motion, self._chained = motion, chained
+        self._at_most = state_thresholds(motion, baseline_m)
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
         self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
@@ -73,7 +68,7 @@ class Isam2Tree:
         # Where the factors are that tie the last variable to the newest state.
         self._tie_slots: list[int] = []
         self._retired, self._retires = RetiredVariables(), True
-        # The landmarks in the tree, and those of them that the next frame linearises anew.
+        # The landmarks in the tree, and what of them, and beside chained sightings of all, is linearised anew next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
@@ -101,8 +96,9 @@ class Isam2Tree:
         moved = renewed(watched, self.read)
         factors, stale = with_linearisations(factors, cached), list[int]()
         if seen is not None and self._chained is not None:
-            first_slot = self._slot_count + factors.size()
-            renewal = self._chained.renewal(*seen, lambda keys: self._first_values(keys, values), first_slot)
+            self._chained.add(*seen)
+            self._to_relinearise = self._moved_beside_chains()
+            renewal = self._chained.renewal(lambda keys: self._places(keys, values), self._slot_count + factors.size())
             factors.push_back(renewal.factors)
             for slot, landmark in renewal.replaced.items():
                 self._sightings[landmark].remove(slot)
@@ -210,6 +206,27 @@ class Isam2Tree:
         values.insert(new.extract([key for key in keys if new.exists(key)]))
         return values
 
+    def _moved_beside_chains(self) -> set[int]:
+        """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
+        assert self._chained is not None
+        stay = {*self._frozen.keys, *self.isam.getFixedVariables(), *self._chained.settled}
+        states = [key for keys in self._recent for key in keys if key not in stay and self.has(key)]
+        at = self.isam.getLinearizationPoint().extract(states)
+        landmarks = {key for key in self._to_relinearise - stay if self.has(key)}
+        return landmarks.union(states if any_moved_beyond(self._at_most, self.read(states), at) else [])
+
+    def _places(self, keys: list[int], new: gtsam.Values) -> Places:
+        """Return values of states and landmarks, and where the tree linearises them from this frame on."""
+        stay = [key for key in keys if not new.exists(key) and key not in self._to_relinearise]
+        estimates, at = self._first_values(keys, new), self.isam.getLinearizationPoint().extract(stay)
+        at.insert(estimates.extract([key for key in keys if not at.exists(key)]))
+        return Places(estimates, at)
+
+    def _held(self) -> gtsam.KeyList:
+        """Return what GTSAM is not to linearise anew; beside chained sightings every state that they do not expect."""
+        states = [key for keys in self._recent for key in keys] if self._chained is not None else []
+        return key_list([*self._frozen.keys, *(self._landmarks.union(states) - self._to_relinearise)])
+
     def _unchain(self, landmarks: list[int]) -> None:
         if self._chained is not None:
             self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
@@ -239,7 +256,7 @@ class Isam2Tree:
                     self._landmarks.add(key)
         self._slot_count += factors.size()
         new = list(factors.keys())
-        leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._to_relinearise)])
+        leaving, held = self._leaving(), self._held()
         order, anew = (self._order(new, new), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
             self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)
@@ -362,10 +379,9 @@ class Isam2Tree:
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
-        pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * self._baseline_m], 3)
-        at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
-        for kind, size in self._motion.variable_sizes.items():
-            thresholds.insert((kind, at_most[kind][-size:]))
+        for kind, at_most in self._at_most.items():
+            # Beside chained sightings, as for landmarks, what is linearised anew is told by key.
+            thresholds.insert((kind, at_most if self._chained is None else np.zeros(at_most.size)))
         thresholds.insert((kind_of(LAST), np.ones(1)))
         # Which landmarks are linearised anew is told by key.
         thresholds.insert(("l", np.zeros(3)))

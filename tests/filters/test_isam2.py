@@ -226,7 +226,7 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     With thresholds that any motion passes: what is not frozen is linearised anew in every frame.
     """
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES"):
-        monkeypatch.setattr(isam2_tree, name, 1e-9)
+        monkeypatch.setattr(linearisation_error, name, 1e-9)
     monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
     estimator, points = isam2_of(sequence), []
@@ -262,8 +262,8 @@ def test_a_python_factor_whose_states_are_frozen_is_renewed_no_more(monkeypatch)
 def nothing_linearised_anew(monkeypatch):
     """Then what leaves the tree is linearised as what stays, and answers may differ by rounding alone."""
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "VELOCITY_THRESHOLD"):
-        monkeypatch.setattr(isam2_tree, name, 1e9)
-    monkeypatch.setattr(isam2_tree, "BIAS_THRESHOLD", (1e9, 1e9))
+        monkeypatch.setattr(linearisation_error, name, 1e9)
+    monkeypatch.setattr(linearisation_error, "BIAS_THRESHOLD", (1e9, 1e9))
     monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", np.inf)
 
 
