@@ -27,10 +27,9 @@ from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import (
     LAST,
-    MOST_CONDITION,
     Recovery,
-    landmark_conditions,
     ties_of_the_last,
+    undetermined,
     variable_named,
     weak_hold,
     without_gaps,
@@ -116,8 +115,9 @@ class FixedLagTree:
                     self._by_qr_from_ns = self._newest_ns()
                     factors, values = self._emptied()
                     remedy = "to rounding: solved by QR for some frames"
-                elif culprits := self._undetermined(but=key) if kind_of(key) == "l" else []:
-                    # GTSAM names the first variable of a clique, and these are in it.
+                elif culprits := undetermined(
+                    without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint(), key
+                ):
                     factors, values = self._emptied()
                     for culprit in culprits:
                         factors, values = self._without(culprit, factors, values)
@@ -136,12 +136,6 @@ class FixedLagTree:
             else:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
-
-    def _undetermined(self, but: int) -> list[int]:
-        """Return the landmarks whose own factors do not determine them; none where a given one is among them."""
-        factors, at = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
-        beyond = [key for key, condition in landmark_conditions(factors, at).items() if condition > MOST_CONDITION]
-        return [] if but in beyond else beyond
 
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())

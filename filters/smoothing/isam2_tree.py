@@ -26,6 +26,7 @@ from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
     ties_of_the_last,
+    undetermined,
     variable_named,
     weak_hold,
     without_gaps,
@@ -83,8 +84,7 @@ class Isam2Tree:
         ``seen`` are its sightings and its number where the tree is to chain them. Raises EstimatorError where the
         system stays indeterminate whatever is dropped.
         """
-        if self._factorization == "QR":
-            self._return_to_cholesky(values)
+        sees = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
         self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
         cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
@@ -104,7 +104,10 @@ class Isam2Tree:
                 self._sightings[landmark].remove(slot)
             stale = list(renewal.replaced)
         factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
-        return self._update(factors, values, cached, moved, [*stale, *old_ties])
+        added = self._update(factors, values, cached, moved, [*stale, *old_ties])
+        # Only now: a landmark that is dropped on the way back may be among those of the frame.
+        back = self._back_to_cholesky(sees)
+        return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def _with_the_last_tied(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: list[int]
@@ -147,7 +150,7 @@ class Isam2Tree:
         return self._restored()
 
     def _restored(self) -> Recovery:
-        """Take back all that left the tree; return what had to be recovered."""
+        """Build the tree anew, with all that left it; return what had to be recovered."""
         points = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
         try:
             self._rebuild(self._retired.with_factors_of(self.isam), points)
@@ -322,12 +325,14 @@ class Isam2Tree:
             factors = self._retired.with_factors_of(self.isam)
             values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
             if kind_of(key) == "l":
-                dropped.add(gtsam.Symbol(key).index())
-                log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
-                self._unchain([key])
-                for slot in self._sightings.pop(key):
-                    factors.remove(slot)
-                values.erase(key)
+                for culprit in undetermined(without_gaps(factors), values, key) or [key]:
+                    dropped.add(gtsam.Symbol(culprit).index())
+                    log.append(
+                        f"landmark {gtsam.Symbol(culprit).index()} made the system indeterminate and was dropped"
+                    )
+                    self._unchain([culprit])
+                    for slot in self._sightings.pop(culprit):
+                        factors.remove(slot)
             elif self._factorization == "CHOLESKY":
                 log.append(f"{gtsam.Symbol(key).string()} was indeterminate to rounding: solved by QR for some frames")
                 self._factorization, self._frames_by_qr = "QR", 0
@@ -342,29 +347,25 @@ class Isam2Tree:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
-    def _return_to_cholesky(self, new: gtsam.Values) -> None:
+    def _back_to_cholesky(self, sees: bool) -> Recovery:
         """Go back from QR, ten times dearer, once vision has been back for some frames."""
-        sees = any(kind_of(key) == "l" for key in list(new.keys()))
         self._frames_by_qr += sees
-        if self._frames_by_qr <= QR_FRAMES:
-            return
-        values = self._retired.with_values(self.isam.calculateBestEstimate())
-        for factorization in ("CHOLESKY", "QR"):
-            self._factorization, self._frames_by_qr = factorization, 0
-            try:
-                self._rebuild(self._retired.with_factors_of(self.isam), values)
-            except RuntimeError:
-                if factorization == "QR":
-                    raise
-            else:
-                return
+        if self._factorization == "CHOLESKY" or self._frames_by_qr <= QR_FRAMES:
+            return Recovery([], set())
+        self._factorization = "CHOLESKY"
+        return self._restored()
 
     def _rebuild(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Build the tree anew of all factors, those of what had left it among them."""
+        """Build the tree anew of all factors, those of what had left it among them, and of the values they are on.
+
+        A landmark that was dropped with all its factors would be a variable without a place in it, and could not begin
+        anew.
+        """
         kept = [slot for slot in range(factors.size()) if factors.exists(slot)]
         compact, slot_of = gtsam.NonlinearFactorGraph(), {old: new for new, old in enumerate(kept)}
         for slot in kept:
             compact.add(factors.at(slot))
+        values = values.extract(compact.keyVector())
         self._slot_count = len(kept)
         self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}

@@ -30,6 +30,7 @@ from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation.track_faults import moving_objects
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
@@ -384,3 +385,18 @@ def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recordin
     run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 2, 30.0))
     assert run.status == "ok", run.log
     assert any("indeterminate and was dropped" in line for line in run.log)
+
+
+def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew():
+    """Their depths grow without end. One of which nothing was left but its value could not begin anew: it failed."""
+    sequence = moving_objects(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)
+    estimator = isam2_of(sequence)
+    newest = [estimator.step(packet) for packet in sequence.packets()][-1]
+    log, tree = estimator.finish().log, estimator._tree
+    assert any("indeterminate and was dropped" in line for line in log)
+    assert set(tree.isam.getLinearizationPoint().keys()) == {*tree.isam.getFactorsUnsafe().keyVector()}
+    truth = sequence.truth
+    assert truth is not None
+    ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
+    # 20 m of odometry that is good to 0.1 m.
+    assert np.linalg.norm(newest.T_world_imu[:3, 3] - ends_at) < 0.5
