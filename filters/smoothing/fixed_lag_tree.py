@@ -115,9 +115,7 @@ class FixedLagTree:
                     self._by_qr_from_ns = self._newest_ns()
                     factors, values = self._emptied()
                     remedy = "to rounding: solved by QR for some frames"
-                elif culprits := undetermined(
-                    without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint(), key
-                ):
+                elif culprits := self._undetermined(but=key) if kind_of(key) == "l" else []:
                     factors, values = self._emptied()
                     for culprit in culprits:
                         factors, values = self._without(culprit, factors, values)
@@ -136,6 +134,11 @@ class FixedLagTree:
             else:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
+
+    def _undetermined(self, but: int) -> list[int]:
+        """Return the landmarks whose own factors do not determine them; none where a given one is among them."""
+        beyond = undetermined(without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint())
+        return [] if but in beyond else beyond
 
     def _newest_ns(self) -> int:
         return max(self._state_stamps_ns.values())

@@ -56,14 +56,13 @@ def variable_named(refusal: RuntimeError) -> int:
     return int(named.group(1))
 
 
-def undetermined(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values, named: int) -> list[int]:
-    """Return the landmarks whose factors do not determine them where GTSAM names another; none where it names one.
+def undetermined(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> list[int]:
+    """Return the landmarks whose factors do not determine them, of a graph without empty slots.
 
-    GTSAM names the first variable of a clique, which need not be the one that makes it indeterminate. The graph has no
-    empty slots.
+    GTSAM names the first variable of a clique, which need not be the one that makes it indeterminate, and of many one
+    at a time.
     """
-    beyond = [key for key, condition in landmark_conditions(factors, at).items() if condition > MOST_CONDITION]
-    return [] if named in beyond or kind_of(named) != "l" else beyond
+    return [key for key, condition in landmark_conditions(factors, at).items() if not condition <= MOST_CONDITION]
 
 
 def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> dict[int, float]:

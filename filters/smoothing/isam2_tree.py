@@ -318,14 +318,14 @@ class Isam2Tree:
         return groups
 
     def _recovered(self, refusal: RuntimeError) -> Recovery:
-        """Build the tree anew without the landmarks GTSAM names, or with a weak hold on the states it names."""
+        """Build the tree anew without undetermined landmarks, or the one named, or with a hold on the state named."""
         log, dropped = [], set()
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
             factors = self._retired.with_factors_of(self.isam)
             values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
             if kind_of(key) == "l":
-                for culprit in undetermined(without_gaps(factors), values, key) or [key]:
+                for culprit in undetermined(without_gaps(factors), values) or [key]:
                     dropped.add(gtsam.Symbol(culprit).index())
                     log.append(
                         f"landmark {gtsam.Symbol(culprit).index()} made the system indeterminate and was dropped"

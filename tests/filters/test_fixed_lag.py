@@ -183,8 +183,7 @@ def test_the_condition_of_a_landmark_tells_that_its_depth_is_unknown():
     conditions = indeterminate.landmark_conditions(factors, at)
     assert conditions[L(1)] < 1.0 + 1e-9
     assert conditions[L(2)] > indeterminate.MOST_CONDITION
-    for named, culprits in ((L(1), [L(2)]), (L(2), []), (X(0), [])):
-        assert indeterminate.undetermined(factors, at, named) == culprits
+    assert indeterminate.undetermined(factors, at) == [L(2)]
 
 
 class BrokenOff:

@@ -145,9 +145,23 @@ def test_a_state_that_nothing_holds_is_cached_weakly_and_named():
 
 
 def test_a_system_beyond_recovery_ends_with_an_error_and_not_with_an_answer():
+    """Of pairs of states that nothing holds, one is held in each recovery."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pairs = range(0, 2 * MOST_RECOVERIES, 2)
+    for k in pairs:
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
+        values.insert(X(k), gtsam.Pose3())
+        values.insert(X(k + 1), gtsam.Pose3())
     with pytest.raises(EstimatorError, match="stays indeterminate"):
-        tree = Isam2Tree(MOTION, baseline_m=0.1)
-        tree.add(*pose_and_landmarks(landmarks=MOST_RECOVERIES + 2, unseen=MOST_RECOVERIES + 1), [X(0), V(0), B(0)])
+        Isam2Tree(MOTION, baseline_m=0.1).add(graph, values, [X(pairs[-1] + 1)])
+
+
+def test_however_many_landmarks_nothing_determines_one_recovery_drops_them():
+    tree = Isam2Tree(MOTION, baseline_m=0.1)
+    unseen = MOST_RECOVERIES + 1
+    log, dropped = tree.add(*pose_and_landmarks(landmarks=unseen + 2, unseen=unseen), [X(0), V(0), B(0)])
+    assert (len(log), len(dropped)) == (unseen, unseen)
+    assert sorted(tree.landmarks()) == [L(0), L(1)]
 
 
 class Refusing:
