@@ -68,7 +68,8 @@ class Isam2Tree:
         self._sightings: dict[int, list[int]] = {}
         # Where the factors are that tie the last variable to the newest state.
         self._tie_slots: list[int] = []
-        self._retired, self._retires = RetiredVariables(), True
+        # Whether anything leaves at all, and whether what had left was taken back and leaves again with the next frame.
+        self._retired, self._retires, self._taken_back = RetiredVariables(), True, False
         # The landmarks in the tree, and what of them, and beside chained sightings of all, is linearised anew next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
@@ -272,13 +273,15 @@ class Isam2Tree:
 
     def _leaving(self) -> list[int]:
         """Return the variables to be retired now: none in most frames, and none while it is solved by QR."""
-        if not self._retires or self._factorization == "QR" or self._frozen.count % RETIRING_EVERY_FRAMES:
+        is_time = self._taken_back or self._frozen.count % RETIRING_EVERY_FRAMES == 0
+        if not self._retires or self._factorization == "QR" or not is_time:
             return []
         return [key for key in self._frozen.unused_for(RETIRED_AFTER_FRAMES) if self.has(key)]
 
     def _retire(self, leaving: list[int]) -> None:
         still_there = [key for key in leaving if self.has(key)]
         self._retired.take(self.isam, still_there)
+        self._taken_back = False
         self._slot_count = self.isam.getFactorsUnsafe().size()
         self._frozen.leave(self._retired.keys)
         self._landmarks -= self._retired.keys
@@ -325,7 +328,8 @@ class Isam2Tree:
             factors = self._retired.with_factors_of(self.isam)
             values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
             if kind_of(key) == "l":
-                for culprit in undetermined(without_gaps(factors), values) or [key]:
+                of_tree = without_gaps(self.isam.getFactorsUnsafe()), self.isam.getLinearizationPoint()
+                for culprit in undetermined(*of_tree) or [key]:
                     dropped.add(gtsam.Symbol(culprit).index())
                     log.append(
                         f"landmark {gtsam.Symbol(culprit).index()} made the system indeterminate and was dropped"
@@ -373,6 +377,7 @@ class Isam2Tree:
         if self._chained is not None:
             self._chained.move(slot_of)
         self._frozen.come_back(self._retired.keys)
+        self._taken_back = bool(self._retired.keys)
         self._retired, self._landmarks = RetiredVariables(), set(self._sightings)
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(list(compact.keys()), in_view=()))

@@ -344,6 +344,25 @@ def test_a_track_that_returns_has_the_tree_whole_again(monkeypatch):
     assert ours._tree.has(L(int(seen_first_and_late[0])))
 
 
+@pytest.mark.usefixtures("nothing_linearised_anew")
+def test_what_a_recovery_takes_back_leaves_again_with_the_next_frame(monkeypatch):
+    """A frame of the whole tree costs as much as the run is long."""
+    few_tracks = replace(DRIVE, duration_s=2.5, camera=replace(DRIVE.camera, max_tracks=20))
+    sequence = without_returns(simulate(few_tracks, 1))
+    _, expected = stepped(sequence, monkeypatch, retired_after=8)
+    estimator, estimates = isam2_of(sequence), []
+    for packet in sequence.packets():
+        if packet.index == 20:
+            assert not estimator._tree.has(X(0))
+            estimator._tree._restored()
+            assert estimator._tree.has(X(0))
+        estimates.append(estimator.step(packet))
+        if packet.index == 20:
+            assert estimator._tree._frozen.count % isam2_tree.RETIRING_EVERY_FRAMES
+            assert not estimator._tree.has(X(0))
+    assert_same_answers(estimates, expected)
+
+
 def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
     rng = np.random.default_rng(0)
     sequence = simulate(replace(FLIGHT, duration_s=0.5), 0)
