@@ -48,7 +48,7 @@ class Isam2:
         self._builder = GraphBuilder(setup)
         self._chained = None
         if setup.rig.track_noise is not None:
-            self._chained = ChainedPast(setup.rig, setup.settings.outliers.smoother_huber, FROZEN_AFTER_FRAMES)
+            self._chained = ChainedPast(setup.rig, setup.settings.outliers.smoother_huber, FROZEN_AFTER_FRAMES + 1)
         self._tree = Isam2Tree(self._builder.motion, setup.rig.baseline_m, self._chained)
         self._stamps_ns: list[int] = []
         self._log: list[str] = []

@@ -27,10 +27,9 @@ from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.graph_builder import GraphExtension
 from filters.smoothing.indeterminate import (
     LAST,
-    MOST_CONDITION,
     Recovery,
-    landmark_conditions,
     ties_of_the_last,
+    undetermined,
     variable_named,
     weak_hold,
     without_gaps,
@@ -117,7 +116,6 @@ class FixedLagTree:
                     factors, values = self._emptied()
                     remedy = "to rounding: solved by QR for some frames"
                 elif culprits := self._undetermined(but=key) if kind_of(key) == "l" else []:
-                    # GTSAM names the first variable of a clique, and these are in it.
                     factors, values = self._emptied()
                     for culprit in culprits:
                         factors, values = self._without(culprit, factors, values)
@@ -139,8 +137,7 @@ class FixedLagTree:
 
     def _undetermined(self, but: int) -> list[int]:
         """Return the landmarks whose own factors do not determine them; none where a given one is among them."""
-        factors, at = without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint()
-        beyond = [key for key, condition in landmark_conditions(factors, at).items() if condition > MOST_CONDITION]
+        beyond = undetermined(without_gaps(self._isam.getFactorsUnsafe()), self._isam.getLinearizationPoint())
         return [] if but in beyond else beyond
 
     def _newest_ns(self) -> int:

@@ -56,19 +56,30 @@ def variable_named(refusal: RuntimeError) -> int:
     return int(named.group(1))
 
 
+def undetermined(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> list[int]:
+    """Return the landmarks whose factors do not determine them, of a graph without empty slots.
+
+    GTSAM names the first variable of a clique, which need not be the one that makes it indeterminate, and of many one
+    at a time.
+    """
+    return [key for key, condition in landmark_conditions(factors, at).items() if not condition <= MOST_CONDITION]
+
+
 def landmark_conditions(factors: gtsam.NonlinearFactorGraph, at: gtsam.Values) -> dict[int, float]:
     """Return the condition of the information that factors have of each landmark, scaled to a unit diagonal.
 
     That of one which went thousands of baselines away is beyond what GTSAM allows: its depth is not determined.
     """
-    linear = factors.linearize(at)
-    keys = sorted(set(linear.keys()))
-    starts = np.cumsum([0, *(at.extract([key]).dim() for key in keys)])
-    rows = [np.arange(start, start + 3) for start in starts.tolist()]
-    landmarks = {key: row for key, row in zip(keys, rows, strict=False) if kind_of(key) == "l"}
-    information, _ = linear.hessian()
-    blocks = (information[np.ix_(row, row)] for row in landmarks.values())
-    return {key: float(np.linalg.cond(_scaled(block))) for key, block in zip(landmarks, blocks, strict=True)}
+    linear, information = factors.linearize(at), dict[int, Array]()
+    size_of = {key: at.extract([key]).dim() for key in set(linear.keys())}
+    for factor in (linear.at(i) for i in range(linear.size())):
+        keys: list[int] = factor.keys()
+        if any(kind_of(key) == "l" for key in keys):
+            of_all, ends = factor.information(), np.cumsum([size_of[key] for key in keys])
+            for key, end in zip(keys, ends.tolist(), strict=True):
+                if kind_of(key) == "l":
+                    information[key] = information.get(key, 0.0) + of_all[end - 3 : end, end - 3 : end]
+    return {key: float(np.linalg.cond(_scaled(information[key]))) for key in sorted(information)}
 
 
 def _scaled(information: Array) -> Array:

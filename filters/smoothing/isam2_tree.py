@@ -20,16 +20,18 @@ from filters.smoothing.cached_linearisation import (
     renewed,
     with_linearisations,
 )
-from filters.smoothing.chained_past import ChainedPast
+from filters.smoothing.chained_past import ChainedPast, Places
 from filters.smoothing.frozen_variables import FrozenVariables
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
     ties_of_the_last,
+    undetermined,
     variable_named,
     weak_hold,
     without_gaps,
 )
+from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
 from filters.smoothing.retired_variables import RetiredVariables, key_list
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
@@ -48,13 +50,6 @@ FROZEN_AFTER_FRAMES = 30
 RETIRED_AFTER_FRAMES, RETIRING_EVERY_FRAMES = 60, 30
 # So many frames with vision after rounding spoilt Cholesky's factors, they are tried again.
 QR_FRAMES = 20
-# How far states may move from where they are linearised: rad; m/s, or the unit of a rate; m/s^2 and rad/s of a bias;
-# and multiples of the baseline, the length that sets the scale of what stereo sees: the image of a point 20 baselines
-# away is then off by a tenth of a pixel. A velocity and a bias of the accelerometer that all states share change no
-# residual but by the turn between two frames. Coarser thresholds mix linearisation points: five times 0.01 rad, 0.1
-# baselines and 0.01 of the rest made a flight of two minutes five times less accurate.
-ROTATION_THRESHOLD_RAD, VELOCITY_THRESHOLD, BIAS_THRESHOLD = 0.01, 0.1, (0.1, 0.01)
-POSITION_THRESHOLD_BASELINES = 0.3
 MOST_RECOVERIES = 20
 
 
@@ -62,7 +57,8 @@ class Isam2Tree:
     """A Bayes tree that takes in frames, reads single variables and survives an indeterminate system."""
 
     def __init__(self, motion: MotionModel, baseline_m: float, chained: ChainedPast | None = None) -> None:
-        self._motion, self._baseline_m, self._chained = motion, baseline_m, chained
+        self._motion, self._chained = motion, chained
+        self._at_most = state_thresholds(motion, baseline_m)
         self._factorization, self._frames_by_qr = "CHOLESKY", 0
         self.isam = self._empty_tree()
         self._recent: deque[list[int]] = deque(maxlen=RECENT_FRAMES)
@@ -72,8 +68,9 @@ class Isam2Tree:
         self._sightings: dict[int, list[int]] = {}
         # Where the factors are that tie the last variable to the newest state.
         self._tie_slots: list[int] = []
-        self._retired, self._retires = RetiredVariables(), True
-        # The landmarks in the tree, and those of them that the next frame linearises anew.
+        # Whether anything leaves at all, and whether what had left was taken back and leaves again with the next frame.
+        self._retired, self._retires, self._taken_back = RetiredVariables(), True, False
+        # The landmarks in the tree, and what of them, and beside chained sightings of all, is linearised anew next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
@@ -88,8 +85,7 @@ class Isam2Tree:
         ``seen`` are its sightings and its number where the tree is to chain them. Raises EstimatorError where the
         system stays indeterminate whatever is dropped.
         """
-        if self._factorization == "QR":
-            self._return_to_cholesky(values)
+        sees = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
         self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
         cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
@@ -101,14 +97,18 @@ class Isam2Tree:
         moved = renewed(watched, self.read)
         factors, stale = with_linearisations(factors, cached), list[int]()
         if seen is not None and self._chained is not None:
-            first_slot = self._slot_count + factors.size()
-            renewal = self._chained.renewal(*seen, lambda keys: self._first_values(keys, values), first_slot)
+            self._chained.add(*seen)
+            self._to_relinearise = self._moved_beside_chains()
+            renewal = self._chained.renewal(lambda keys: self._places(keys, values), self._slot_count + factors.size())
             factors.push_back(renewal.factors)
             for slot, landmark in renewal.replaced.items():
                 self._sightings[landmark].remove(slot)
             stale = list(renewal.replaced)
         factors, values, old_ties = self._with_the_last_tied(factors, values, state_keys)
-        return self._update(factors, values, cached, moved, [*stale, *old_ties])
+        added = self._update(factors, values, cached, moved, [*stale, *old_ties])
+        # Only now: a landmark that is dropped on the way back may be among those of the frame.
+        back = self._back_to_cholesky(sees)
+        return Recovery(added.log + back.log, added.dropped | back.dropped)
 
     def _with_the_last_tied(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, newest: list[int]
@@ -151,7 +151,7 @@ class Isam2Tree:
         return self._restored()
 
     def _restored(self) -> Recovery:
-        """Take back all that left the tree; return what had to be recovered."""
+        """Build the tree anew, with all that left it; return what had to be recovered."""
         points = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
         try:
             self._rebuild(self._retired.with_factors_of(self.isam), points)
@@ -210,6 +210,27 @@ class Isam2Tree:
         values.insert(new.extract([key for key in keys if new.exists(key)]))
         return values
 
+    def _moved_beside_chains(self) -> set[int]:
+        """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
+        assert self._chained is not None
+        stay = {*self._frozen.keys, *self.isam.getFixedVariables(), *self._chained.settled}
+        states = [key for keys in self._recent for key in keys if key not in stay and self.has(key)]
+        at = self.isam.getLinearizationPoint().extract(states)
+        landmarks = {key for key in self._to_relinearise - stay if self.has(key)}
+        return landmarks.union(states if any_moved_beyond(self._at_most, self.read(states), at) else [])
+
+    def _places(self, keys: list[int], new: gtsam.Values) -> Places:
+        """Return values of states and landmarks, and where the tree linearises them from this frame on."""
+        stay = [key for key in keys if not new.exists(key) and key not in self._to_relinearise]
+        estimates, at = self._first_values(keys, new), self.isam.getLinearizationPoint().extract(stay)
+        at.insert(estimates.extract([key for key in keys if not at.exists(key)]))
+        return Places(estimates, at)
+
+    def _held(self) -> gtsam.KeyList:
+        """Return what GTSAM is not to linearise anew; beside chained sightings every state that they do not expect."""
+        states = [key for keys in self._recent for key in keys] if self._chained is not None else []
+        return key_list([*self._frozen.keys, *(self._landmarks.union(states) - self._to_relinearise)])
+
     def _unchain(self, landmarks: list[int]) -> None:
         if self._chained is not None:
             self._chained.drop([gtsam.Symbol(key).index() for key in landmarks])
@@ -239,7 +260,7 @@ class Isam2Tree:
                     self._landmarks.add(key)
         self._slot_count += factors.size()
         new = list(factors.keys())
-        leaving, held = self._leaving(), key_list([*self._frozen.keys, *(self._landmarks - self._to_relinearise)])
+        leaving, held = self._leaving(), self._held()
         order, anew = (self._order(new, new), None) if not leaving else self._order_before_retiring(values, leaving)
         try:
             self.isam.update(factors, values, [*moved, *dropped_slots], order, held, anew)
@@ -252,13 +273,15 @@ class Isam2Tree:
 
     def _leaving(self) -> list[int]:
         """Return the variables to be retired now: none in most frames, and none while it is solved by QR."""
-        if not self._retires or self._factorization == "QR" or self._frozen.count % RETIRING_EVERY_FRAMES:
+        is_time = self._taken_back or self._frozen.count % RETIRING_EVERY_FRAMES == 0
+        if not self._retires or self._factorization == "QR" or not is_time:
             return []
         return [key for key in self._frozen.unused_for(RETIRED_AFTER_FRAMES) if self.has(key)]
 
     def _retire(self, leaving: list[int]) -> None:
         still_there = [key for key in leaving if self.has(key)]
         self._retired.take(self.isam, still_there)
+        self._taken_back = False
         self._slot_count = self.isam.getFactorsUnsafe().size()
         self._frozen.leave(self._retired.keys)
         self._landmarks -= self._retired.keys
@@ -298,19 +321,22 @@ class Isam2Tree:
         return groups
 
     def _recovered(self, refusal: RuntimeError) -> Recovery:
-        """Build the tree anew without the landmarks GTSAM names, or with a weak hold on the states it names."""
+        """Build the tree anew without undetermined landmarks, or the one named, or with a hold on the state named."""
         log, dropped = [], set()
         for _ in range(MOST_RECOVERIES):
             key = variable_named(refusal)
             factors = self._retired.with_factors_of(self.isam)
             values = self._retired.with_linearisation_points(self.isam.getLinearizationPoint())
             if kind_of(key) == "l":
-                dropped.add(gtsam.Symbol(key).index())
-                log.append(f"landmark {gtsam.Symbol(key).index()} made the system indeterminate and was dropped")
-                self._unchain([key])
-                for slot in self._sightings.pop(key):
-                    factors.remove(slot)
-                values.erase(key)
+                of_tree = without_gaps(self.isam.getFactorsUnsafe()), self.isam.getLinearizationPoint()
+                for culprit in undetermined(*of_tree) or [key]:
+                    dropped.add(gtsam.Symbol(culprit).index())
+                    log.append(
+                        f"landmark {gtsam.Symbol(culprit).index()} made the system indeterminate and was dropped"
+                    )
+                    self._unchain([culprit])
+                    for slot in self._sightings.pop(culprit):
+                        factors.remove(slot)
             elif self._factorization == "CHOLESKY":
                 log.append(f"{gtsam.Symbol(key).string()} was indeterminate to rounding: solved by QR for some frames")
                 self._factorization, self._frames_by_qr = "QR", 0
@@ -325,29 +351,25 @@ class Isam2Tree:
                 return Recovery(log, dropped)
         raise EstimatorError(f"the system stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
-    def _return_to_cholesky(self, new: gtsam.Values) -> None:
+    def _back_to_cholesky(self, sees: bool) -> Recovery:
         """Go back from QR, ten times dearer, once vision has been back for some frames."""
-        sees = any(kind_of(key) == "l" for key in list(new.keys()))
         self._frames_by_qr += sees
-        if self._frames_by_qr <= QR_FRAMES:
-            return
-        values = self._retired.with_values(self.isam.calculateBestEstimate())
-        for factorization in ("CHOLESKY", "QR"):
-            self._factorization, self._frames_by_qr = factorization, 0
-            try:
-                self._rebuild(self._retired.with_factors_of(self.isam), values)
-            except RuntimeError:
-                if factorization == "QR":
-                    raise
-            else:
-                return
+        if self._factorization == "CHOLESKY" or self._frames_by_qr <= QR_FRAMES:
+            return Recovery([], set())
+        self._factorization = "CHOLESKY"
+        return self._restored()
 
     def _rebuild(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Build the tree anew of all factors, those of what had left it among them."""
+        """Build the tree anew of all factors, those of what had left it among them, and of the values they are on.
+
+        A landmark that was dropped with all its factors would be a variable without a place in it, and could not begin
+        anew.
+        """
         kept = [slot for slot in range(factors.size()) if factors.exists(slot)]
         compact, slot_of = gtsam.NonlinearFactorGraph(), {old: new for new, old in enumerate(kept)}
         for slot in kept:
             compact.add(factors.at(slot))
+        values = values.extract(compact.keyVector())
         self._slot_count = len(kept)
         self._cached = {slot_of[old]: factor for old, factor in self._cached.items()}
         self._sightings = {key: [slot_of[old] for old in slots] for key, slots in self._sightings.items()}
@@ -355,6 +377,7 @@ class Isam2Tree:
         if self._chained is not None:
             self._chained.move(slot_of)
         self._frozen.come_back(self._retired.keys)
+        self._taken_back = bool(self._retired.keys)
         self._retired, self._landmarks = RetiredVariables(), set(self._sightings)
         self.isam = self._empty_tree()
         self.isam.update(compact, values, [], self._order(list(compact.keys()), in_view=()))
@@ -362,10 +385,9 @@ class Isam2Tree:
 
     def _empty_tree(self) -> gtsam.ISAM2:
         params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
-        pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * self._baseline_m], 3)
-        at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
-        for kind, size in self._motion.variable_sizes.items():
-            thresholds.insert((kind, at_most[kind][-size:]))
+        for kind, at_most in self._at_most.items():
+            # Beside chained sightings, as for landmarks, what is linearised anew is told by key.
+            thresholds.insert((kind, at_most if self._chained is None else np.zeros(at_most.size)))
         thresholds.insert((kind_of(LAST), np.ones(1)))
         # Which landmarks are linearised anew is told by key.
         thresholds.insert(("l", np.zeros(3)))

@@ -183,6 +183,7 @@ def test_the_condition_of_a_landmark_tells_that_its_depth_is_unknown():
     conditions = indeterminate.landmark_conditions(factors, at)
     assert conditions[L(1)] < 1.0 + 1e-9
     assert conditions[L(2)] > indeterminate.MOST_CONDITION
+    assert indeterminate.undetermined(factors, at) == [L(2)]
 
 
 class BrokenOff:

@@ -30,6 +30,7 @@ from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
+from toolkit.simulation.track_faults import moving_objects
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
@@ -144,9 +145,23 @@ def test_a_state_that_nothing_holds_is_cached_weakly_and_named():
 
 
 def test_a_system_beyond_recovery_ends_with_an_error_and_not_with_an_answer():
+    """Of pairs of states that nothing holds, one is held in each recovery."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pairs = range(0, 2 * MOST_RECOVERIES, 2)
+    for k in pairs:
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
+        values.insert(X(k), gtsam.Pose3())
+        values.insert(X(k + 1), gtsam.Pose3())
     with pytest.raises(EstimatorError, match="stays indeterminate"):
-        tree = Isam2Tree(MOTION, baseline_m=0.1)
-        tree.add(*pose_and_landmarks(landmarks=MOST_RECOVERIES + 2, unseen=MOST_RECOVERIES + 1), [X(0), V(0), B(0)])
+        Isam2Tree(MOTION, baseline_m=0.1).add(graph, values, [X(pairs[-1] + 1)])
+
+
+def test_however_many_landmarks_nothing_determines_one_recovery_drops_them():
+    tree = Isam2Tree(MOTION, baseline_m=0.1)
+    unseen = MOST_RECOVERIES + 1
+    log, dropped = tree.add(*pose_and_landmarks(landmarks=unseen + 2, unseen=unseen), [X(0), V(0), B(0)])
+    assert (len(log), len(dropped)) == (unseen, unseen)
+    assert sorted(tree.landmarks()) == [L(0), L(1)]
 
 
 class Refusing:
@@ -226,7 +241,7 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     With thresholds that any motion passes: what is not frozen is linearised anew in every frame.
     """
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES"):
-        monkeypatch.setattr(isam2_tree, name, 1e-9)
+        monkeypatch.setattr(linearisation_error, name, 1e-9)
     monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", 0.0)
     sequence = simulate(replace(DRIVE, duration_s=5.0), 0)
     estimator, points = isam2_of(sequence), []
@@ -262,8 +277,8 @@ def test_a_python_factor_whose_states_are_frozen_is_renewed_no_more(monkeypatch)
 def nothing_linearised_anew(monkeypatch):
     """Then what leaves the tree is linearised as what stays, and answers may differ by rounding alone."""
     for name in ("ROTATION_THRESHOLD_RAD", "POSITION_THRESHOLD_BASELINES", "VELOCITY_THRESHOLD"):
-        monkeypatch.setattr(isam2_tree, name, 1e9)
-    monkeypatch.setattr(isam2_tree, "BIAS_THRESHOLD", (1e9, 1e9))
+        monkeypatch.setattr(linearisation_error, name, 1e9)
+    monkeypatch.setattr(linearisation_error, "BIAS_THRESHOLD", (1e9, 1e9))
     monkeypatch.setattr(linearisation_error, "LANDMARK_BEYOND_SIGMA", np.inf)
 
 
@@ -329,6 +344,25 @@ def test_a_track_that_returns_has_the_tree_whole_again(monkeypatch):
     assert ours._tree.has(L(int(seen_first_and_late[0])))
 
 
+@pytest.mark.usefixtures("nothing_linearised_anew")
+def test_what_a_recovery_takes_back_leaves_again_with_the_next_frame(monkeypatch):
+    """A frame of the whole tree costs as much as the run is long."""
+    few_tracks = replace(DRIVE, duration_s=2.5, camera=replace(DRIVE.camera, max_tracks=20))
+    sequence = without_returns(simulate(few_tracks, 1))
+    _, expected = stepped(sequence, monkeypatch, retired_after=8)
+    estimator, estimates = isam2_of(sequence), []
+    for packet in sequence.packets():
+        if packet.index == 20:
+            assert not estimator._tree.has(X(0))
+            estimator._tree._restored()
+            assert estimator._tree.has(X(0))
+        estimates.append(estimator.step(packet))
+        if packet.index == 20:
+            assert estimator._tree._frozen.count % isam2_tree.RETIRING_EVERY_FRAMES
+            assert not estimator._tree.has(X(0))
+    assert_same_answers(estimates, expected)
+
+
 def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
     rng = np.random.default_rng(0)
     sequence = simulate(replace(FLIGHT, duration_s=0.5), 0)
@@ -384,3 +418,18 @@ def test_a_landmark_that_was_dropped_begins_anew_with_its_next_sighting(recordin
     run = run_estimator("isam2", recording_with_a_fleck(replace(DRIVE_IMU, duration_s=5.0), 2, 2, 30.0))
     assert run.status == "ok", run.log
     assert any("indeterminate and was dropped" in line for line in run.log)
+
+
+def test_among_vehicles_landmarks_without_a_depth_are_dropped_and_may_begin_anew():
+    """Their depths grow without end. One of which nothing was left but its value could not begin anew: it failed."""
+    sequence = moving_objects(simulate(replace(DRIVE, duration_s=2.0), seed=0), dose=0.6, seed=0)
+    estimator = isam2_of(sequence)
+    newest = [estimator.step(packet) for packet in sequence.packets()][-1]
+    log, tree = estimator.finish().log, estimator._tree
+    assert any("indeterminate and was dropped" in line for line in log)
+    assert set(tree.isam.getLinearizationPoint().keys()) == {*tree.isam.getFactorsUnsafe().keyVector()}
+    truth = sequence.truth
+    assert truth is not None
+    ends_at = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns[-1]), :3, 3]
+    # 20 m of odometry that is good to 0.1 m.
+    assert np.linalg.norm(newest.T_world_imu[:3, 3] - ends_at) < 0.5
