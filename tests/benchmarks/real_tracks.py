@@ -10,7 +10,7 @@ whose twists are noisy as they are. Each run is one line of the results, and one
 The table has, for each estimator and model, the geometric mean over drives of the ATE over that of dead reckoning (the
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
 parameters, ``correlated:white,walk,offset`` with others, in px, or ``fitted``; ``+scale`` behind it gives the
-disparities a scale of 1 %, ``+gaps`` bridges what has no track.
+disparities a scale of 1 %, ``+gaps`` bridges what has no track, ``+still`` leaves out what moves.
 
     python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
 
@@ -45,7 +45,7 @@ from toolkit.models.gap_bridge import gaps
 from toolkit.models.noise import twist_noise
 from toolkit.runner import run
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Settings
+from toolkit.settings import Noise, Settings, TrackUse
 from toolkit.track_noise import CHANNELS
 
 SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
@@ -107,11 +107,11 @@ def noise_of(model: str) -> Noise:
 
 def prepared(drive: str, seed: int, model: str) -> Prepared:
     """Return a drive as estimators read it under a noise model."""
-    source, noise = drives()[drive], noise_of(model)
+    source, noise, tracks = drives()[drive], noise_of(model), TrackUse(leave_out_moving="still" in model.split("+"))
     if drive == LONG_DRIVE:
-        return prepare(Recording(str(source), truth=data() / "ucsd/gt/0027.tum", noise=noise))
+        return prepare(Recording(str(source), truth=data() / "ucsd/gt/0027.tum", noise=noise, tracks=tracks))
     clean = prepare(Recording(str(source))).whole
-    return prepare(Recording(with_noisy_twists(clean, seed), noise=noise))
+    return prepare(Recording(with_noisy_twists(clean, seed), noise=noise, tracks=tracks))
 
 
 def measured(case: Case, ready: Prepared) -> dict[str, Any]:
