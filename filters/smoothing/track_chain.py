@@ -10,8 +10,7 @@ sightings that err each by itself are then chains without memory.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain as chain_of
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -22,15 +21,12 @@ from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only, stereo
 from toolkit.models.correlated_noise import Chain, channels_of, in_channels
 from toolkit.models.disparity_scale import d_uv_d_scale, scaled_rig
-from toolkit.models.factors import SCALE, L, X
+from toolkit.models.factors import SCALE, L, X, linear_factor
 from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.track_noise import TrackNoise
 
 # Of Student's t over tracks, as fitted to all real recordings (docs/tracks.md); Gaussian ones lose a few percent by it.
 FREEDOM_OF_TRACKS = 2.0
-
-# GTSAM's Python has linear factors on so many variables; on more it has conditionals, which are such factors too.
-_MOST_TERMS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +300,7 @@ class ChainedFactors:
         self, linear: "LinearInnovations", rows: BoolArray, to_scale: Array | None
     ) -> Iterator[gtsam.JacobianFactor]:
         """Yield innovations of a mask (N,) as linear factors."""
-        seen, unit = self.sightings, gtsam.noiseModel.Unit.Create(3)
+        seen = self.sightings
         innovation, own, before, points = linear
         poses, landmarks = [X(k) for k in seen.pose.tolist()], [L(i) for i in seen.track_ids[seen.point].tolist()]
         previous = seen.chain.before.tolist()
@@ -314,7 +310,7 @@ class ChainedFactors:
                 terms.insert(0, (poses[previous[row]], before[row]))
             if to_scale is not None:
                 terms.append((SCALE, to_scale[row]))
-            yield _linear(terms, innovation[row], unit)
+            yield linear_factor(terms, innovation[row])
 
 
 class LinearInnovations(NamedTuple):
@@ -334,13 +330,6 @@ class LinearInnovations(NamedTuple):
         return LinearInnovations(
             column[:, 0] * self.innovation, column * self.own, column * self.before, column * self.point
         )
-
-
-def _linear(terms: list[tuple[int, Array]], residual: Array, unit: gtsam.noiseModel.Unit) -> gtsam.JacobianFactor:
-    if len(terms) <= _MOST_TERMS:
-        arguments: Any = [*chain_of(*terms), residual, unit]
-        return gtsam.JacobianFactor(*arguments)
-    return gtsam.JacobianFactor(gtsam.GaussianConditional(terms, len(terms), residual, unit))
 
 
 def scale_in(values: gtsam.Values) -> float:

@@ -10,11 +10,17 @@ whose twists are noisy as they are. Each run is one line of the results, and one
 The table has, for each estimator and model, the geometric mean over drives of the ATE over that of dead reckoning (the
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
 parameters, ``correlated:white,walk,offset`` with others, in px, or ``fitted``; ``+scale`` behind it gives the
-disparities a scale of 1 %, ``+gaps`` bridges what has no track.
+disparities a scale of 1 %, ``+gaps`` bridges what has no track, ``+still`` leaves out what moves.
 
     python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
 
 compares two models run by run: per drive the ratio of the final ATE, its standard error over seeds, and on average.
+
+    python tests/benchmarks/real_tracks.py truth
+
+says how far the drives' truth can be trusted: the ATE SE(3) of their clean twists, which are the truth's instrument's
+own; and the median px by which withheld tracks, seen in stereo, are missed in (c, v) a second later, by the poses of
+the truth, of the clean twists and of ``batch`` with correlated noise; and how many intervals no track leads across.
 """
 
 import argparse
@@ -34,10 +40,13 @@ from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.geometry import Array
 from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import score_run
+from toolkit.models import stereo
+from toolkit.models.gap_bridge import gaps
 from toolkit.models.noise import twist_noise
 from toolkit.runner import run
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Settings
+from toolkit.settings import Noise, Settings, TrackUse
+from toolkit.track_noise import CHANNELS
 
 SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
 ESTIMATORS = ("dead-reckoning", "ekf", "msckf-fej", "msckf-slam", "fixed-lag", "smart", "isam2", "batch")
@@ -98,11 +107,11 @@ def noise_of(model: str) -> Noise:
 
 def prepared(drive: str, seed: int, model: str) -> Prepared:
     """Return a drive as estimators read it under a noise model."""
-    source, noise = drives()[drive], noise_of(model)
+    source, noise, tracks = drives()[drive], noise_of(model), TrackUse(leave_out_moving="still" in model.split("+"))
     if drive == LONG_DRIVE:
-        return prepare(Recording(str(source), truth=data() / "ucsd/gt/0027.tum", noise=noise))
+        return prepare(Recording(str(source), truth=data() / "ucsd/gt/0027.tum", noise=noise, tracks=tracks))
     clean = prepare(Recording(str(source))).whole
-    return prepare(Recording(with_noisy_twists(clean, seed), noise=noise))
+    return prepare(Recording(with_noisy_twists(clean, seed), noise=noise, tracks=tracks))
 
 
 def measured(case: Case, ready: Prepared) -> dict[str, Any]:
@@ -191,6 +200,37 @@ def pairs(options: argparse.Namespace) -> None:
     _print_ratios("mean", short, len(short))
 
 
+def truths(options: argparse.Namespace) -> None:
+    """Print how well the truth of each drive agrees with its instrument's twists, and with tracks nobody was given."""
+    print("drive     gaps  ATE SE(3) m: clean twists  batch    px a second on: truth  clean twists  batch")
+    for drive in options.drives:
+        clean, noisy = prepare(Recording(str(drives()[drive]))), prepared(drive, 0, "correlated")
+        assert clean.sequence.truth is not None
+        turned = run("dead-reckoning", find("dead-reckoning").load(), clean.sequence, clean.prior)
+        settings = Settings(noise=noise_of("correlated"))
+        smoothed = run("batch", find("batch").load(), noisy.sequence, noisy.prior, settings=settings)
+        errors_m = [score_run(one, "final", clean.sequence).values["ate_se3_m"] for one in (turned, smoothed)]
+        assert turned.final is not None and smoothed.final is not None
+        np.testing.assert_array_equal(clean.sequence.truth.t_ns, turned.final.t_ns)
+        ways = (clean.sequence.truth, turned.final, smoothed.final)
+        missed_px = [missed_a_second_on(clean.sequence, way.T_world_imu) for way in ways]
+        gap_count = gaps([packet.frame for packet in clean.sequence.packets()]).size
+        figures = "".join(f"{px:14.2f}" for px in missed_px)
+        print(f"{drive}  {gap_count:4d}{errors_m[0]:28.3f}{errors_m[1]:7.3f}{figures}", flush=True)
+
+
+def missed_a_second_on(sequence: Sequence, T_world_imu: Array) -> float:
+    """Return the median px by which poses (K, 4, 4) miss withheld tracks ten frames on, seen in stereo before."""
+    held = sequence.held_out
+    place = {key: row for row, key in enumerate(zip(held.track_id.tolist(), held.frame.tolist(), strict=True))}
+    pairs = [(row, place[track, frame + 10]) for (track, frame), row in place.items() if (track, frame + 10) in place]
+    now, later = np.array(pairs).T
+    points = stereo.triangulate_world(held.uv_px[now], T_world_imu[held.frame[now]], sequence.rig)
+    predicted = stereo.predict(points, T_world_imu[held.frame[later]], sequence.rig)
+    missed = (held.uv_px[later] - predicted.uv_px) @ CHANNELS.T
+    return float(np.nanmedian(np.hypot(missed[:, 0], missed[:, 2])))
+
+
 def _print_ratios(name: str, logs: Array, count: int) -> None:
     ratios = np.exp(logs.mean(axis=0))
     errors = ratios * logs.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(3, np.nan)
@@ -226,6 +266,10 @@ def main() -> None:
     pairing = commands.add_parser("pairs")
     pairing.set_defaults(command=pairs)
     pairing.add_argument("--estimator", default="batch")
+    trusting = commands.add_parser("truth")
+    trusting.set_defaults(command=truths)
+    short = [drive for drive in drives() if drive != LONG_DRIVE]
+    trusting.add_argument("--drives", type=lambda text: text.split(","), default=short)
     for command in (running, showing, pairing):
         command.add_argument("results", type=Path)
     pairing.add_argument("one")

@@ -15,6 +15,8 @@ from toolkit.sequence import StereoFrame, StereoRig
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 # The scale of all disparities, a vector (1,).
 SCALE: int = gtsam.symbol("s", 0)
+# GTSAM's Python has linear factors on so many variables; on more it has conditionals, which are such factors too.
+_MOST_TERMS = 3
 
 
 def kind_of(key: int) -> str:
@@ -69,10 +71,18 @@ def joint_prior(at: gtsam.Values, blocks: dict[int, slice], cov: Array) -> gtsam
     """
     root_information = np.linalg.inv(np.linalg.cholesky(cov))
     terms = [(key, root_information[:, block]) for key, block in blocks.items()]
-    arguments: Any = [*chain.from_iterable(terms), np.zeros(len(cov)), gtsam.noiseModel.Unit.Create(len(cov))]
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.LinearContainerFactor(gtsam.JacobianFactor(*arguments), at))
+    graph.add(gtsam.LinearContainerFactor(linear_factor(terms, np.zeros(len(cov))), at))
     return graph
+
+
+def linear_factor(terms: list[tuple[int, Array]], residual: Array) -> gtsam.JacobianFactor:
+    """Return the linear factor of a whitened residual (m,) on variables, each with its key and Jacobian (m, d)."""
+    unit = gtsam.noiseModel.Unit.Create(len(residual))
+    if len(terms) <= _MOST_TERMS:
+        arguments: Any = [*chain.from_iterable(terms), residual, unit]
+        return gtsam.JacobianFactor(*arguments)
+    return gtsam.JacobianFactor(gtsam.GaussianConditional(terms, len(terms), residual, unit))
 
 
 class EliminatedGraph(Protocol):

@@ -12,10 +12,16 @@ the way: on a drive of 125 frames a standard deviation of the first came out wro
 cuts the graph in halves again and again, and what cuts it comes last (George 1973, "Nested dissection of a regular
 finite element mesh"): from the root to any state it is some tens of variables, and on that drive all were right to
 1e-9; with an IMU it loses all digits within seconds. An order counts where it gives states the covariance that each has
-by itself: in time the first, where rounding ends up, else some. Where neither does, all are refused.
+by itself: in time the first, where rounding ends up, else some.
+
+Where neither does, landmarks are looked at. Of one that went thousands of baselines away the measurements tell the
+depth in metres so badly that GTSAM refuses it, or that its rounding is the states', though its disparity is told as
+well as any. A linear change of a landmark's coordinates changes no state's covariance, so every landmark is then given
+by what the measurements know of it, each direction in its own standard deviation, and a direction that they say nothing
+of is left out: nothing hangs on it. Where that does not help either, all are refused.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
@@ -23,11 +29,14 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.models.factors import joint_cov
+from toolkit.models.factors import linear_factor
 from toolkit.models.motion import MotionModel
 
 # A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
 _MOST_ROUNDED = 0.01
+# A direction of a variable of which less is said than this share of what is said of the best is lost in the sixteen
+# digits of the Jacobians: a landmark's depth beyond ten thousand million baselines.
+_LEAST_TOLD = 1e-10
 
 
 class RoundingError(RuntimeError):
@@ -51,28 +60,76 @@ def covs_beside(
     Those are of no frame, as the scale of disparities is: they are eliminated after all states.
     """
     states = [motion.keys(k) for k in range(len(poses))]
-    together = [*states, beside] if beside else states
+    try:
+        covs = _of_groups(linear, states, beside)
+    except RuntimeError:
+        kept = {key for group in (*states, beside) for key in group}
+        covs = _of_groups(_others_as_measured(linear, kept), states, beside)
+    of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
+    return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
+
+
+def _of_groups(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], beside: Sequence[int]) -> list[Array]:
+    """Return the joint covariance of the variables of each state, and of those beside them if there are any."""
+    together: Sequence[Sequence[int]] = [*states, beside] if beside else states
     tied = _tied(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
     for ordering, judged in ((_in_time(tied, together), [0]), (_dissected(tied, beside), some)):
         try:
             covs = _recovered(_eliminated(tied, ordering), together)
-            if not all(_is_right(covs[k], linear, states[k]) for k in judged):
-                continue
+            if all(_is_right(covs[k], linear, states[k]) for k in judged):
+                return covs
         except RuntimeError as error:  # a variable that this order finds undetermined
             failure = error
-            continue
-        of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
-        return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
     raise failure
 
 
+def _others_as_measured(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
+    """Return the graph with all variables but those kept in coordinates whose Jacobians are orthonormal.
+
+    A variable has as many of them as there are directions that the graph says anything of, and leaves it if there are
+    none.
+    """
+    factors, sizes = [linear.at(i) for i in range(linear.size())], linear.gradientAtZero()
+    blocks = defaultdict[int, list[Array]](list)
+    for factor in factors:
+        for key, block in _terms(factor, sizes):
+            if key not in kept:
+                blocks[key].append(block)
+    directions = {key: _measured(np.vstack(rows)) for key, rows in blocks.items()}
+    graph = gtsam.GaussianFactorGraph()
+    for factor in factors:
+        terms = [(key, block @ directions[key] if key in directions else block) for key, block in _terms(factor, sizes)]
+        if left := [(key, block) for key, block in terms if block.shape[1]]:
+            graph.add(linear_factor(left, factor.jacobian()[1]))
+    return graph
+
+
+def _terms(factor: gtsam.GaussianFactor, sizes: gtsam.VectorValues) -> list[tuple[int, Array]]:
+    """Return the variables of a factor with their whitened Jacobians."""
+    keys = list(factor.keys())
+    ends = np.cumsum([sizes.at(key).size for key in keys])
+    return list(zip(keys, np.split(factor.jacobian()[0], ends[:-1], axis=1), strict=True))
+
+
+def _measured(jacobian: Array) -> Array:
+    """Return the directions (d, r) that a Jacobian (m, d) says anything of, each as long as its standard deviation."""
+    _, per_unit, directions = np.linalg.svd(jacobian, full_matrices=False)
+    told = per_unit > _LEAST_TOLD * per_unit[0]
+    return np.asarray(directions[told].T / per_unit[told])
+
+
 def _is_right(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int]) -> bool:
-    """Say whether the covariance of a state is what it is by itself."""
+    """Say whether the covariance of a state is what it is by itself, all else eliminated variable by variable.
+
+    By cliques GTSAM refuses here what has a covariance: the world behind hundreds of frames is so much looser than the
+    step between two that both in one clique are beyond the condition it allows.
+    """
     last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
-    expected = np.diag(joint_cov(linear.eliminateMultifrontal(last), keys))
-    return np.allclose(np.diag(cov), expected, rtol=2.0 * _MOST_ROUNDED, atol=0.0)
+    _, left = linear.eliminatePartialSequential(_ordering(_others(last, keys)))
+    information, _ = left.hessian(_ordering(keys))
+    return np.allclose(np.diag(cov), np.diag(np.linalg.inv(information)), rtol=2.0 * _MOST_ROUNDED, atol=0.0)
 
 
 def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) -> gtsam.GaussianFactorGraph:
