@@ -10,10 +10,11 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg.blas import dtrsm
+from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
-from toolkit.models.state import Belief, Prediction
+from toolkit.models.state import POSE, Belief, Prediction
 
 
 class JointBelief:
@@ -123,7 +124,7 @@ class JointBelief:
         carried = np.asarray(H @ self._cov[columns])
         innovation_cov = np.asarray(H @ carried[:, columns].T)
         innovation_cov.flat[:: len(carried) + 1] += 1.0
-        root = np.asarray(np.linalg.cholesky(innovation_cov), dtype=float)
+        root = cholesky_root(innovation_cov)
         return root, divided_by_root(root, carried)
 
     def move(self, delta: Array) -> None:
@@ -138,8 +139,9 @@ class JointBelief:
 
     def _displace(self, delta: Array) -> None:
         d, clones = self._core.layout.size, self.clone_columns
-        self._core = self._core.moved(delta[:d], self._core.cov)
-        self.clones = self.clones @ se3_exp(delta[clones].reshape(-1, 6))
+        steps = se3_exp(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
+        self._core = self._core.displaced(delta[:d], steps[0])
+        self.clones = self.clones @ steps[1:]
         self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)
 
     def pulled_back(self, delta: Array, H_pose: Array, H_point: Array) -> tuple[Array, Array]:
@@ -149,6 +151,18 @@ class JointBelief:
         """
         newest = delta[self.clone_columns][-6:]
         return H_pose @ se3_right_jacobian(newest), H_point
+
+
+def cholesky_root(cov: Array) -> Array:
+    """Return the lower triangular C with ``C C^T`` a covariance (n, n), which may be overwritten.
+
+    Raises LinAlgError where it has none.
+    """
+    # LAPACK takes columns where NumPy has rows: the transposed upper root is the lower one, and nothing is copied.
+    root, failed = dpotrf(cov.T, lower=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+    return np.asarray(root.T)
 
 
 def divided_by_root(root: Array, right: Array) -> Array:
@@ -165,7 +179,9 @@ def _symmetric(cov: Array) -> Array:
 
 def _stretches(kept: BoolArray) -> list[slice]:
     """Return the stretches of a mask (n,) that are True."""
-    edges = np.flatnonzero(np.diff(kept, prepend=False, append=False)).reshape(-1, 2)
+    padded = np.zeros(kept.size + 2, dtype=bool)
+    padded[1:-1] = kept
+    edges = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
     return [slice(begin, end) for begin, end in edges.tolist()]
 
 

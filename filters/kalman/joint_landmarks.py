@@ -89,11 +89,11 @@ def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisatio
         np.ones((len(rows), 1), dtype=bool),
         frame.ages[rows][:, None],
     )
-    newest = joint.clones[-1:]
-    now = multiview.linearise(sightings, joint.points, newest, newest, rig)
-    there = multiview.linearise(sightings, at.points(joint), newest, at.clones(joint)[-1:], rig)
+    residuals, depth_m = multiview.compared(sightings, joint.points, joint.clones[-1:], rig)
+    newest_at = at.clones(joint)[-1:]
+    there = multiview.linearise(sightings, at.points(joint), newest_at, newest_at, rig)
     dof = left_only.degrees_of_freedom(frame.uvs_px[rows])
-    return LandmarkSightings(now.residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], now.depth_m[:, 0], dof)
+    return LandmarkSightings(residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], depth_m[:, 0], dof)
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:

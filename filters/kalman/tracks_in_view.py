@@ -19,7 +19,7 @@ import numpy as np
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief, divided_by_root
+from filters.kalman.joint import JointBelief, cholesky_root, divided_by_root
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import Window
@@ -272,11 +272,11 @@ def _informed(joint: JointBelief, matrix: Array, vector: Array) -> Belief:
     core, clones = joint.core, joint.clone_columns
     cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size].copy()
     cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
-    root = np.asarray(np.linalg.cholesky(cov), dtype=float)
+    root = cholesky_root(cov)
     to_core = divided_by_root(root, cross)
     spread = root.T @ matrix @ root
     spread.flat[:: len(spread) + 1] += 1.0
-    spread_root = np.asarray(np.linalg.cholesky(spread), dtype=float)
+    spread_root = cholesky_root(spread)
     halves = divided_by_root(spread_root, np.column_stack([to_core, root.T @ vector]))
     half = halves[:, :-1]
     return core.moved(half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half)

@@ -71,14 +71,18 @@ class Belief:
 
     def moved(self, delta: Array, cov: Array) -> "Belief":
         """Return the belief moved by an error (d,), with a new covariance made exactly symmetric."""
+        moved = self.displaced(delta, se3_exp(delta[POSE]))
+        return Belief(moved.layout, moved.T_world_imu, moved.v_world, moved.bias, 0.5 * (cov + cov.T))
+
+    def displaced(self, delta: Array, step: Array) -> "Belief":
+        """Return the belief with its mean moved by an error (d,), whose pose is the motion ``step`` (4, 4)."""
         v_world, bias = self.v_world, self.bias.copy()
         if self.layout.velocity is not None:
             v_world = v_world + self.T_world_imu[:3, :3] @ delta[self.layout.velocity]
         if self.layout.accel_bias is not None:
             bias[:3] += delta[self.layout.accel_bias]
         bias[3:] += delta[self.layout.gyro_bias]
-        T_world_imu = self.T_world_imu @ se3_exp(delta[POSE])
-        return replace(self, T_world_imu=T_world_imu, v_world=v_world, bias=bias, cov=0.5 * (cov + cov.T))
+        return Belief(self.layout, self.T_world_imu @ step, v_world, bias, self.cov)
 
     def predicted(self, prediction: Prediction) -> "Belief":
         """Return the belief at the end of an interval: its mean as predicted, its covariance F P F^T + Q."""

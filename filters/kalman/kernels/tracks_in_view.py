@@ -80,23 +80,23 @@ def given_others(rows: Arrays, n: int, N: Array, B: Array, H: Array, S: Array) -
 
 
 @compiled
-def add_carried(where: IntArray, H: Array, P: Array, S: Array) -> None:
-    """Add ``H P H^T``, H being (3, 6 m) to the poses ``where`` (m,), to the covariance in the first row of S."""
-    for k in range(6 * where.size):
-        row, x, y, z = 6 * where[k // 6] + k % 6, 0.0, 0.0, 0.0
-        for j in range(k // 6 + 1):
-            first, end = 6 * j, min(6 * j + 6, k)
-            for c in range(first, end):
-                p = P[row, 6 * where[j] + c - first]
-                x, y, z = x + p * H[0, c], y + p * H[1, c], z + p * H[2, c]
-        half = 0.5 * P[row, row]
-        x, y, z = x + half * H[0, k], y + half * H[1, k], z + half * H[2, k]
-        S[0, 0] += 2.0 * x * H[0, k]
-        S[0, 1] += x * H[1, k] + y * H[0, k]
-        S[0, 2] += 2.0 * y * H[1, k]
-        S[0, 3] += x * H[2, k] + z * H[0, k]
-        S[0, 4] += y * H[2, k] + z * H[1, k]
-        S[0, 5] += 2.0 * z * H[2, k]
+def add_carried(where: IntArray, H: Array, P: Array, T: Array, S: Array) -> None:
+    """Add ``T H^T``, with ``T = H P`` (3, 6 W) and H (3, 6 m) to the poses ``where`` (m,), to what S has of it.
+
+    Rows of P are added up, which a processor does four numbers at a time.
+    """
+    at = 0
+    for a in range(3):
+        for c in range(P.shape[1]):
+            T[a, c] = 0.0
+        for k in range(6 * where.size):
+            row, factor = 6 * where[k // 6] + k % 6, H[a, k]
+            for c in range(P.shape[1]):
+                T[a, c] += factor * P[row, c]
+        for b in range(a + 1):
+            for k in range(6 * where.size):
+                S[0, at] += T[a, 6 * where[k // 6] + k % 6] * H[b, k]
+            at += 1
 
 
 @compiled
@@ -119,8 +119,8 @@ def scale(rows: Arrays, first: int, end: int, factor: float) -> None:
 
 
 @compiled
-def add_products_of_poses(where: IntArray, rows: Arrays, n: int, sign: float, told: Arrays) -> None:
-    """Add ``J^T J`` and ``J^T r`` of n rows, or take them away, to the lower half of what is told of all poses.
+def add_products_of_poses(where: IntArray, rows: Arrays, n: int, told: Arrays) -> None:
+    """Add ``J^T J`` and ``J^T r`` of n rows to the lower half of what is told of all poses.
 
     r is the last column of A; unless dense, a row depends on its own pose alone.
     """
@@ -129,7 +129,7 @@ def add_products_of_poses(where: IntArray, rows: Arrays, n: int, sign: float, to
     for i in range(n):
         for k in range(0 if dense else i // 3, where.size if dense else i // 3 + 1):
             for a in range(6 * k, 6 * k + 6):
-                row, value = 6 * where[k] + a - 6 * k, sign * J[i, a]
+                row, value = 6 * where[k] + a - 6 * k, J[i, a]
                 vector[row] += value * A[i, 3]
                 for j in range(0 if dense else k, k + 1):
                     for c in range(6 * j, 6 * j + 6):
@@ -137,20 +137,23 @@ def add_products_of_poses(where: IntArray, rows: Arrays, n: int, sign: float, to
 
 
 @compiled
-def eliminate(N: Array, B: Array, columns: int, right: Array) -> None:
-    """Multiply B (3, 6 m) by the inverse Cholesky root of ``H_f^T H_f``; put that of ``H_f^T r`` in right (3, 4)."""
+def eliminated_rows(N: Array, B: Array, where: IntArray, E: Array, first: int) -> None:
+    """Put ``C^-1 [B, H_f^T r]``, C being the root of ``H_f^T H_f``, in three rows of E (., 6 W + 1) from ``first`` on.
+
+    N has ``[H_f r]^T [H_f r]`` in its first row; B (3, 6 m) is to the poses ``where`` (m,).
+    """
     l00 = math.sqrt(N[0, 0])
     l10, l20 = N[0, 1] / l00, N[0, 3] / l00
     l11 = math.sqrt(N[0, 2] - l10 * l10)
     l21 = (N[0, 4] - l20 * l10) / l11
     l22 = math.sqrt(N[0, 5] - l20 * l20 - l21 * l21)
-    for c in range(columns):
-        B[0, c] /= l00
-        B[1, c] = (B[1, c] - l10 * B[0, c]) / l11
-        B[2, c] = (B[2, c] - l20 * B[0, c] - l21 * B[1, c]) / l22
-    right[0, 3] = N[0, 6] / l00
-    right[1, 3] = (N[0, 7] - l10 * right[0, 3]) / l11
-    right[2, 3] = (N[0, 8] - l20 * right[0, 3] - l21 * right[1, 3]) / l22
+    for k in range(6 * where.size + 1):
+        own = k < 6 * where.size
+        column = 6 * where[k // 6] + k % 6 if own else E.shape[1] - 1
+        x = (B[0, k] if own else N[0, 6]) / l00
+        y = ((B[1, k] if own else N[0, 7]) - l10 * x) / l11
+        z = ((B[2, k] if own else N[0, 8]) - l20 * x - l21 * y) / l22
+        E[first, column], E[first + 1, column], E[first + 2, column] = x, y, z
 
 
 @compiled
@@ -166,7 +169,8 @@ def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array)
     """Gate the newest sightings of F tracks and return what the tracks tell of the W poses; see :data:`SIGNATURE`.
 
     Returns points (F, 3) after a step, what the newest sightings count for (F,), which tracks all their cameras have
-    in front (F,): of others nothing is told; the information matrix (6 W, 6 W) and vector (6 W,) of the poses.
+    in front (F,): of others nothing is told; ``J^T J`` (6 W, 6 W) and ``J^T r`` (6 W,) of all tracks, and what the
+    landmarks take of both, ``E^T E``, as the rows E (3 F, 6 W + 1): a product of whole matrices is left to BLAS.
     """
     uvs_px, counted, ages, weights, points = tracks
     poses, poses_at, P = window
@@ -181,7 +185,7 @@ def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array)
     told, most = (np.zeros((6 * longest, 6 * longest)), np.zeros(6 * longest)), 3 * longest
     H_pose, A, J = np.empty((most, 6)), np.empty((most, 4)), np.empty((most, 2 * most))
     roots, H, B = np.empty((most, longest)), np.empty((3, 2 * most)), np.empty((3, 2 * most))
-    N, S, right = np.empty((2, 10)), np.empty((1, 10)), np.empty((3, 4))
+    N, S, T, E = np.empty((2, 10)), np.empty((1, 10)), np.empty((3, 2 * most)), np.zeros((3 * count, 2 * most + 1))
     for f in range(count):
         where = sighted(counted, f)
         m, n, rows = where.size, 3 * where.size, (A, J, correlated)
@@ -198,16 +202,15 @@ def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array)
             N[0], B[:] = 0.0, 0.0
             add_normals(rows, 0, n - 3, N, B)
             given_others(rows, n, N, B, H, S)
-            add_carried(where, H, P, S)
+            add_carried(where, H, P, T, S)
             newest[f] = weight_of(S, rules[BOUND], rules[HUBER_THRESHOLD])
             scale(rows, n - 3, n, math.sqrt(newest[f]))
             add_normals(rows, n - 3, n, N, B)
             step(stepped, f, nearest_m, N)
-            eliminate(N, B, 2 * n, right)
-            add_products_of_poses(where, rows, n, 1.0, told)
-            add_products_of_poses(where, (right, B, True), 3, -1.0, told)
+            add_products_of_poses(where, rows, n, told)
+            eliminated_rows(N, B, where, E, 3 * f)
     mirror(told[0])
-    return stepped, newest, in_front, told[0], told[1]
+    return stepped, newest, in_front, told[0], told[1], E
 
 
 COMPILED = what_was_compiled(told_by_tracks, "what tracks in view tell was")
