@@ -25,6 +25,8 @@ def told(tracks: FollowedTracks, window: Window, rig: StereoRig, gate: FrameGate
     threshold = np.inf if gate.huber is None else float(huber_threshold(3, gate.huber))
     arrays = given((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
     rules = np.array([LEAST_DEPTH_M, float(gate.bound(3)), threshold])
-    points, newest, in_front, matrix, vector, E = kernel.told_by_tracks(arrays, given(window), camera_of(rig), rules)
-    taken = E.T @ E
+    points, newest, in_front, matrix, vector, taken = kernel.told_by_tracks(
+        arrays, given(window), camera_of(rig), rules
+    )
+    taken = taken.T @ taken
     return Told(points, newest, in_front, matrix - taken[:-1, :-1], vector - taken[:-1, -1])

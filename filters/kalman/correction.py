@@ -45,10 +45,11 @@ def correct_pose(
     dof = left_only.degrees_of_freedom(uvs_px)
     accepted = gate.accepts(nis, dof, depth_m > 0.0)
     weights = accepted.astype(float)
+    informed = np.linalg.solve(own_cov, np.concatenate([H_pose, residual_px[..., None]], axis=2))
     if huber is not None:
         threshold = huber if isinstance(dof, int) else huber_threshold(dof, huber)
-        weights *= huber_weights(mahalanobis_squared(residual_px, own_cov), threshold)
-    weighted = weights[:, None, None] * np.linalg.solve(own_cov, H_pose)
+        weights *= huber_weights(np.einsum("ni,ni->n", residual_px, informed[..., 6]), threshold)
+    weighted = weights[:, None, None] * informed[..., :6]
     corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weighted)
     return PoseCorrection(corrected, accepted)
 

@@ -36,14 +36,16 @@ class FrameGate:
         return np.asarray(self._table(dof).bound[dof])
 
     def _table(self, dof: IntArray | int) -> "_Table":
-        return _table(self.probability, int(np.max(dof, initial=1)).bit_length())
+        most = max(dof, 1) if isinstance(dof, int) else int(np.max(dof, initial=1))
+        return _table(self.probability, most.bit_length())
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
-        accepted = np.asarray((nis < self.bound(dof)) & in_front)
+        table = self._table(dof)
+        accepted = np.asarray((nis < table.bound[dof]) & in_front)
         self.nis += float(nis[accepted].sum())
         self.dof += int(np.broadcast_to(dof, nis.shape)[accepted].sum())
-        expected = self._table(dof).expected[dof]
+        expected = table.expected[dof]
         self.nis_expected += float(np.broadcast_to(expected, nis.shape)[accepted].sum())
         self.tested += accepted.size
         self.accepted += int(accepted.sum())

@@ -62,7 +62,9 @@ class FollowedTracks(NamedTuple):
         return cls(sightings, ids, np.empty((0, 3)), nothing)
 
     def select(self, rows: BoolArray) -> "FollowedTracks":
-        """Return some of the tracks (F,)."""
+        """Return some of the tracks (F,), nearly always all of them."""
+        if rows.all():
+            return self
         return FollowedTracks(self.sightings.select(rows), self.clone_frames, self.points[rows], self.weights[rows])
 
 
