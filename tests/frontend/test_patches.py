@@ -54,3 +54,24 @@ def test_a_flat_patch_is_no_error(image: Array) -> None:
     _, places, alike = Patches.taken(flat, CENTRES).fitted(image, CENTRES)
     assert np.isfinite(places).all()
     assert (alike < 0.5).all()
+
+
+@pytest.mark.parametrize("opening_deg", [60.0, 90.0])
+def test_the_best_place_of_a_corner_is_its_tip_wherever_the_patch_was_taken(opening_deg: float) -> None:
+    """A wedge looks alike at every scale about its tip, so that the scale that fits is anyone's guess."""
+    tip, sides = np.array([50.3, 50.3]), 0.4 + np.deg2rad([0.0, opening_deg])
+    ends = tip + 200.0 * np.stack([np.cos(sides), np.sin(sides)], axis=1)
+    fine = np.zeros((800, 800), dtype=np.uint8)
+    cv2.fillPoly(fine, [np.rint(8.0 * np.vstack([tip, ends]) + 3.5).astype(np.int32)], 160)
+    drawn = cv2.GaussianBlur(cv2.resize(fine, (100, 100), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    centres = tip + np.array([[0.0, 0.0], [1.5, -1.0], [-1.0, 2.0], [2.0, 0.0], [0.0, -2.0]])
+    best = centres + Patches.taken(drawn.astype(np.float32), centres).best_places
+    # blur moves the corner of the grey values inwards, the more the sharper it is; the centres are 3 to 4 px apart
+    assert np.linalg.norm(best - tip, axis=1).max() < 1.0
+    assert np.ptp(best, axis=0).max() < 0.6
+
+
+def test_the_best_place_of_a_flat_patch_is_near(image: Array) -> None:
+    best = Patches.taken(np.full_like(image, 7.0), CENTRES).best_places
+    assert np.isfinite(best).all()
+    assert np.abs(best).max() <= 3.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from toolkit.frontend.cameras import RectifiedPair
-from toolkit.geometry import Array, BoolArray, IntArray, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3, transform
 
 _FEWEST = 8
 _ITERATIONS, _CONFIDENCE = 200, 0.999
@@ -59,24 +59,12 @@ class StereoMotion:
 
         Where they are too few to tell, all agree and the motion is unknown.
         """
-        import cv2
-
         unknown = replace(self, T_now_before=None), np.ones(len(rows), dtype=bool)
-        if self.points is None or len(rows) < _FEWEST:
+        if self.points is None:
             return unknown
-        rig = self.rig
-        K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
-        found, turn, shift, inliers = cv2.solvePnPRansac(
-            *(np.ascontiguousarray(self.points[rows]), np.ascontiguousarray(left_px), K, np.zeros(4)),
-            iterationsCount=_ITERATIONS,
-            reprojectionError=self.threshold_px,
-            confidence=_CONFIDENCE,
-            flags=cv2.SOLVEPNP_P3P,
-        )
-        if not found or inliers is None or len(inliers) < max(_FEWEST, 0.3 * len(rows)):
+        T_now_before = pose_of(self.points[rows], left_px, self.rig, self.threshold_px)
+        if T_now_before is None:
             return unknown
-        T_now_before = np.eye(4)
-        T_now_before[:3, :3], T_now_before[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
         moved = replace(self, T_now_before=T_now_before)
         expected = self._projected(transform(T_now_before, self.points[rows]))
         off_px = np.linalg.norm(expected[:, [0, 2]] - left_px, axis=1)
@@ -98,3 +86,25 @@ class StereoMotion:
         u = rig.fx_px * points[:, 0] / depth + rig.cx_px
         v = rig.fy_px * points[:, 1] / depth + rig.cy_px
         return np.stack([u, u - rig.fx_px * rig.baseline_m / depth, v], axis=1)
+
+
+def pose_of(points: Array, left_px: Array, rig: RectifiedPair, threshold_px: float) -> Array | None:
+    """Return T_now_before (4, 4) from points (N, 3) m of the camera before and their places (N, 2) px in it now.
+
+    None where fewer than eight of them, or three in ten, agree to the threshold.
+    """
+    import cv2
+
+    if len(points) < _FEWEST:
+        return None
+    K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        *(np.ascontiguousarray(points), np.ascontiguousarray(left_px), K, np.zeros(4)),
+        iterationsCount=_ITERATIONS,
+        reprojectionError=threshold_px,
+        confidence=_CONFIDENCE,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not found or inliers is None or len(inliers) < max(_FEWEST, 0.3 * len(points)):
+        return None
+    return se3(np.asarray(cv2.Rodrigues(turn)[0], dtype=float), np.ravel(shift))

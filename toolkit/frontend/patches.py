@@ -17,6 +17,8 @@ from toolkit.geometry import Array, BoolArray, IntArray
 _HALF_PX = 7
 _ITERATIONS = 4
 _DAMPING = 1e-3
+# A corner detector is not off by more; further away another structure may be the better one.
+_FARTHEST_PX = 3.0
 # The lattice of a patch, (2, P) px about its centre.
 _LATTICE = np.stack(np.meshgrid(*2 * [np.arange(-_HALF_PX, _HALF_PX + 1)], indexing="xy")).reshape(2, -1).astype(float)
 
@@ -58,6 +60,20 @@ class Patches:
         diagonal += 1e-12
         solvers = np.asarray(np.linalg.inv(normal) @ jacobian, dtype=np.float64)
         return cls(values, solvers, warps)
+
+    @property
+    def best_places(self) -> Array:
+        """Return which point of each first patch (N, 2) px from its centre a fit to the same image places best.
+
+        A step of the fit moves the point x by t + W x. With the covariance of both, that of its place is least where
+        the derivative of its trace by x is zero. It is the tip of a corner, which looks alike at every scale: any
+        other point would move with the scale that the fit makes up.
+        """
+        of_steps = self.solvers @ np.swapaxes(self.solvers, 1, 2)
+        of_warp = of_steps[:, :2, :2] + of_steps[:, 2:4, 2:4] + 1e-9 * np.eye(2)  # a flat patch takes no steps
+        with_shift = of_steps[:, :2, 4] + of_steps[:, 2:4, 5]
+        places = -np.linalg.solve(of_warp, with_shift[:, :, None])[:, :, 0]
+        return np.asarray(np.clip(places, -_FARTHEST_PX, _FARTHEST_PX))
 
     def select(self, rows: BoolArray | IntArray) -> "Patches":
         """Return the patches of some tracks."""

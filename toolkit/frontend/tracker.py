@@ -16,6 +16,7 @@ from toolkit.frontend.corners import corners, count_in_cells, grid_of
 from toolkit.frontend.flow import Flow
 from toolkit.frontend.motion import StereoMotion
 from toolkit.frontend.patches import Patches, as_floats
+from toolkit.frontend.rigidity import Rigidity
 from toolkit.frontend.rows import halved, match_rows
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.settings import Frontend
@@ -41,7 +42,8 @@ class Sightings(NamedTuple):
 class _Tracks:
     """Tracks as the last pair has them: ids (N,), places left and right (N, 2) px, and their first patches.
 
-    ``right_warps`` (N, 2, 2) are those that fit the first patches into the right image.
+    ``right_warps`` (N, 2, 2) are those that fit the first patches into the right image. A track that is not ``sound``
+    (N,) has left its point: it is followed on so that none begins in its place, which would leave it again.
     """
 
     ids: IntArray
@@ -49,12 +51,14 @@ class _Tracks:
     right_px: Array
     patches: Patches
     right_warps: Array
+    sound: BoolArray
 
     def select(self, rows: BoolArray) -> "_Tracks":
         if rows.all():  # as most tests leave it; the patches are megabytes
             return self
         return _Tracks(
-            self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows), self.right_warps[rows]
+            *(self.ids[rows], self.left_px[rows], self.right_px[rows], self.patches.select(rows)),
+            *(self.right_warps[rows], self.sound[rows]),
         )
 
     def joined(self, others: "_Tracks") -> "_Tracks":
@@ -66,11 +70,13 @@ class _Tracks:
             np.concatenate([self.right_px, others.right_px]),
             self.patches.joined(others.patches),
             np.concatenate([self.right_warps, others.right_warps]),
+            np.concatenate([self.sound, others.sound]),
         )
 
 
 _NO_TRACKS = _Tracks(
-    np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2)), Patches.none(), np.empty((0, 2, 2))
+    *(np.empty(0, dtype=np.int64), np.empty((0, 2)), np.empty((0, 2)), Patches.none()),
+    *(np.empty((0, 2, 2)), np.empty(0, dtype=bool)),
 )
 
 
@@ -91,6 +97,7 @@ class Tracker:
         self._flow = Flow(asked.window_px, asked.levels, asked.forward_backward_px)
         self._across = Flow(asked.window_px, _LEVELS_RIGHT, 2.0 * asked.forward_backward_px)
         self._motion = StereoMotion(self.rig, asked.ransac_px)
+        self._rigidity = Rigidity(self.rig, asked.ransac_px)
         self._seen = self.rig.seen(0), self.rig.seen(1)
         self._grid = grid_of(self.rig.size_px, asked.max_tracks)
 
@@ -107,10 +114,14 @@ class Tracker:
             return None
         self._motion = motion
         tracks = paired.select(agrees)
+        at_their_points = self._rigidity.agrees(tracks.left_px, tracks.right_px, tracks.ids)
+        tracks = replace(tracks, sound=tracks.sound & at_their_points)
         tracks = tracks.joined(self._fitted_right(right_floats, self._begun(left, right, floats, tracks)))
         self._motion = self._motion.at(tracks.left_px, tracks.right_px, tracks.ids)
         self._tracks, self._before = tracks, left
-        return Sightings(tracks.ids, np.hstack([tracks.left_px, tracks.right_px]))
+        seen = tracks.ids[tracks.sound], tracks.left_px[tracks.sound], tracks.right_px[tracks.sound]
+        self._rigidity = self._rigidity.after(*seen[1:], seen[0])
+        return Sightings(seen[0], np.hstack(seen[1:]))
 
     def _followed(self, left: Image, floats: Array) -> tuple[_Tracks, StereoMotion]:
         """Return the tracks that are found in the left image, still paired as before, and how the camera moved."""
@@ -130,7 +141,10 @@ class Tracker:
         rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
         shift_px = here_px - before.left_px[rows]
         right_warps = before.right_warps[rows] @ np.linalg.inv(before.patches.warps[rows]) @ patches.warps
-        return _Tracks(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches, right_warps), motion
+        followed = _Tracks(
+            *(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches, right_warps, before.sound[rows])
+        )
+        return followed, motion
 
     def _paired(self, left: Image, right: Image, tracks: _Tracks) -> _Tracks:
         """Return the tracks found in the right image, near where they are in ``right_px``."""
@@ -164,7 +178,7 @@ class Tracker:
 
     def _begun(self, left: Image, right: Image, floats: Array, tracks: _Tracks) -> _Tracks:
         """Return new tracks where there is room for them."""
-        wanted = self.settings.max_tracks - len(tracks.ids)
+        wanted = self.settings.max_tracks - int(tracks.sound.sum())
         if wanted <= 0:
             return _NO_TRACKS
         present = count_in_cells(tracks.left_px, self.rig.size_px, self._grid)
@@ -177,10 +191,13 @@ class Tracker:
         found[rows] = paired
         self._hopeless = [places_px[~found], *self._hopeless[: _COOL_DOWN_FRAMES - 1]]
         begun_px, right_px = places_px[found][:wanted], right_px[paired][:wanted]
+        best_px = Patches.taken(floats, begun_px).best_places
+        begun_px, right_px = begun_px + best_px, right_px + best_px
         new_ids = self._next_id + np.arange(len(begun_px))
         self._next_id += len(begun_px)
         identities = np.tile(np.eye(2), (len(begun_px), 1, 1))
-        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px), identities)
+        sound = np.ones(len(begun_px), dtype=bool)
+        return _Tracks(new_ids, begun_px, right_px, Patches.taken(floats, begun_px), identities, sound)
 
     def _free(self, taken_px: Array) -> BoolArray:
         """Return for each pixel whether a track may begin there."""
