@@ -16,7 +16,7 @@ from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.smoothing.indeterminate import with_covariances
-from filters.smoothing.robust import Smoothed, seen_ids, solve_robustly, worth_smoothing
+from filters.smoothing.robust_schedule import Smoothed, seen_ids, solve_robustly, worth_smoothing
 from filters.smoothing.scale_state import ScaleState
 from filters.smoothing.track_chain import scale_in
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory

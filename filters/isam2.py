@@ -22,7 +22,7 @@ from filters.smoothing.indeterminate import Recovery, behind_camera, with_covari
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.linearisation_error import linearised_badly
-from filters.smoothing.robust import CHAIN_STOPPING
+from filters.smoothing.robust_schedule import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array

@@ -18,7 +18,7 @@ from typing import Any
 
 import gtsam
 
-from filters.smoothing import robust
+from filters.smoothing import robust_schedule
 from filters.smoothing.levenberg_marquardt import Solution, Stopping
 from toolkit import runner
 from toolkit.audit import audit
@@ -56,7 +56,7 @@ def measure(source: str, frames: int) -> None:
     sequence = audit(load_sequence(source)).sequence
     prior = start_from_measurements(sequence)
     sequence = sequence.truncated(frames) if frames else sequence
-    solve, ours_s, theirs_s = robust.solve, [], []
+    solve, ours_s, theirs_s = robust_schedule.solve, [], []
 
     def both(graph: Any, start: Any, stopping: Stopping, *rest: Any) -> Solution:
         solution, spent_s = timed(lambda: solve(graph, start, stopping, *rest))
@@ -69,12 +69,12 @@ def measure(source: str, frames: int) -> None:
         )
         return solution
 
-    robust.solve = both
+    robust_schedule.solve = both
     try:
         print(f"{sequence.name}, {sequence.frame_count} frames")
         timings = runner.run("batch", find("batch").load(), sequence, prior).timings
     finally:
-        robust.solve = solve
+        robust_schedule.solve = solve
     assert timings is not None
     whole_s = timings.cpu_s - sum(theirs_s)
     print(f"  solves {sum(ours_s) / sum(theirs_s):.2f}, whole batch {whole_s / sum(theirs_s):.2f} x GTSAM's own")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.smoothing.robust import worth_smoothing
+from filters.smoothing.robust_schedule import worth_smoothing
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import StereoFrame
