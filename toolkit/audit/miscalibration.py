@@ -8,15 +8,22 @@ import numpy as np
 
 from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.robust import Scalar, chance_sigmas
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
+from toolkit.resampling import NS_PER_S
 
 SIGMAS = 5.0
+# A turn counts that is chance less often than this.
+LEVEL = 1e-3
 # What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
 # and by rotations. Chosen with them in view.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
 SYSTEMATIC_RATIO = 0.05
+# No standard error is less: without noise it would be none.
+LEAST_ERROR_RAD = 1e-6
+# Where a turn must be larger than this to be seen, it is said.
+LARGEST_RAD = 0.15
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -24,8 +31,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     intervals, rig = evidence.intervals, evidence.sequence.rig
     if intervals is None:
         return evidence.blind
-    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam)
-    if (np.abs(turn.rad) > SIGMAS * turn.error_rad + SYSTEMATIC_RAD[evidence.sequence.motion_kind]).any():
+    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam, _known_s(evidence))
+    by_chance_rad = chance_sigmas(turn.stretches, LEVEL) * np.maximum(turn.error_rad, LEAST_ERROR_RAD)
+    least_rad = SYSTEMATIC_RAD[evidence.sequence.motion_kind] + by_chance_rad
+    if (np.abs(turn.rad) > least_rad).any():
         angle = float(np.linalg.norm(turn.rad))
         said.append(
             f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
@@ -38,7 +47,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO and _is_off(force):
         said.append(f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)")
     if not said:
-        return None
+        return _undecided(float(least_rad.min()), intervals.v_mps is not None)
     return Symptom(
         count=len(said),
         detail="; ".join(said),
@@ -47,6 +56,20 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         harmful=False,
         warns=True,
     )
+
+
+def _known_s(evidence: Evidence) -> float:
+    """Return how long the camera's own motion is known (s)."""
+    step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
+    return step_s * float(evidence.camera_motion.known.sum())
+
+
+def _undecided(least_rad: float, by_velocity: bool) -> Undecided | None:
+    if least_rad < LARGEST_RAD:
+        return None
+    cause = "what odometry slips by for seconds is no less" if by_velocity else "too little change of rotation"
+    hidden = "any turn of it" if not np.isfinite(least_rad) else f"a turn of it by less than {least_rad:.2f} rad"
+    return Undecided(f"where the camera looks: {hidden} would not show, for {cause}")
 
 
 def _is_off(ratio: Scalar) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by
+from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by, subdivided
 from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, jackknife_cov, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
@@ -27,7 +27,7 @@ LEAST_EQUATIONS = 3.0
 # Standard deviations of what an accelerometer (m/s^2) reads too much, and a gyro less its median (rad/s).
 ACCEL_BIAS, GYRO_BIAS = 0.2, 0.01
 # Unknowns: the scale, the camera's position (3), its turn (3), with an IMU both biases (6).
-_LEVER, _COMMON = slice(1, 4), 13
+_LEVER, TURN, _COMMON = slice(1, 4), slice(4, 7), 13
 
 
 class Alignment(NamedTuple):
@@ -59,16 +59,25 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> Al
     Noise of the regressor feigns a scale. What the regression of the one on the other and its inverse leave open
     between them counts for nothing (Frisch, "Statistical confluence analysis", 1934).
     """
-    R_imu_cam, p_imu_cam = T_imu_cam[:3, :3], T_imu_cam[:3, 3]
-    w_radps, seen = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
-    measured = v_mps + np.cross(w_radps, p_imu_cam)
-    jacobian = np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
-    found = _robust(measured - seen, jacobian)
-    cov = jackknife_cov(_robust, measured - seen, jacobian)
-    one, other = 1.0 / (1.0 - float(found[0])) - 1.0, float(_robust(seen - measured, measured[:, :, None])[0])
+    measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
+    found = robust_solution(measured - seen, jacobian)
+    cov = jackknife_cov(robust_solution, measured - seen, jacobian)
+    other = float(robust_solution(seen - measured, measured[:, :, None])[0])
+    one = 1.0 / (1.0 - float(found[0])) - 1.0
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
     error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
     return Alignment(Scalar(scale, error), found[_LEVER], cov[_LEVER, _LEVER])
+
+
+def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> tuple[Array, Array, Array]:
+    """Return the camera's velocity (M, 3) as the twists have it and as it is, and d(difference)/d(unknowns) (M, 3, 7).
+
+    Unknowns are the scale, the camera's position and, those of ``TURN``, its turn.
+    """
+    R_imu_cam, p_imu_cam = T_imu_cam[:3, :3], T_imu_cam[:3, 3]
+    w_radps, seen = intervals.w_cam_radps @ R_imu_cam.T, intervals.v_cam_mps @ R_imu_cam.T
+    measured = v_mps + np.cross(w_radps, p_imu_cam)
+    return measured, seen, np.concatenate([-seen[:, :, None], -skew(w_radps), skew(seen)], axis=2)
 
 
 def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
@@ -147,16 +156,18 @@ class _Path(NamedTuple):
 
 
 def _integrated(sequence: Sequence, frames_t_ns: IntArray, w_bias: Array) -> _Path:
-    """Integrate the samples from frame to frame, by the mean between two."""
-    h_s = np.diff(frames_t_ns)[:, None] / NS_PER_S
-    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, frames_t_ns)
+    """Integrate the samples up to every frame, by the means over short parts of each interval."""
+    t_ns, frame_at = subdivided(frames_t_ns)
+    h_s = np.diff(t_ns)[:, None] / NS_PER_S
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, t_ns)
     half = so3_exp(0.5 * h_s * (mean[:, 3:] - w_bias))
     R_first_imu = chained(half @ half)
     middle = R_first_imu[:-1] @ half
     force = (middle @ mean[:, :3, None]).squeeze(-1)
     turned = _from_zero(-middle * h_s[:, :, None])
     per_gyro = -skew(force) @ (0.5 * (turned[:-1] + turned[1:]))
-    return _Path(R_first_imu, _twice(force, h_s), _twice(-middle, h_s[:, :, None]), _twice(per_gyro, h_s[:, :, None]))
+    twice = (_twice(force, h_s), _twice(-middle, h_s[:, :, None]), _twice(per_gyro, h_s[:, :, None]))
+    return _Path(R_first_imu[frame_at], *(one[frame_at] for one in twice))
 
 
 def _twice(rate: Array, h_s: Array) -> Array:
@@ -178,9 +189,14 @@ def chained(step: Array) -> Array:
     return products
 
 
-def _robust(response: Array, jacobian: Array) -> Array:
+def robust_solution(response: Array, jacobian: Array) -> Array:
     """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights."""
     return _weighted(response, jacobian, np.zeros(jacobian.shape[2]))[0]
+
+
+def formal_cov(response: Array, jacobian: Array) -> Array:
+    """Return the covariance (m, m) of that solution if every row erred by itself."""
+    return np.asarray(np.linalg.inv(_weighted(response, jacobian, np.zeros(jacobian.shape[2]))[1]))
 
 
 def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from toolkit.audit.parts.alignment import chained
-from toolkit.audit.parts.intervals import Intervals, interval_means
+from toolkit.audit.parts.intervals import Intervals, interval_means, subdivided
 from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
 from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
 from toolkit.models.camera_motion import CameraMotion
@@ -149,7 +149,8 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     """Return what the change of the camera's velocity leaves of the specific force, less gravity as it is around then.
 
     In the axes of the first frame, into which the gyro turns everything, the velocity changes by the specific force
-    plus gravity, a constant but for the drift of the gyro. Of five velocities the median is taken.
+    plus gravity, a constant but for the drift of the gyro. Of five velocities the median is taken, less the integrals
+    of both: a median of what shakes or falls is no mean.
     """
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
@@ -157,33 +158,39 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
     v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
     h_s = np.diff(middle_ns)[:, None] / NS_PER_S
-    mean = interval_means(motion.t_ns, motion.values, middle_ns)
-    half = so3_exp(0.5 * h_s * (mean[:, 3:] - bias_radps))
+    t_ns, middle_at = subdivided(middle_ns)
+    step_s = np.diff(t_ns)[:, None] / NS_PER_S
+    mean = interval_means(motion.t_ns, motion.values, t_ns)
+    half = so3_exp(0.5 * step_s * (mean[:, 3:] - bias_radps))
     R_first_imu = chained(half @ half)
-    v_first = (R_first_imu @ v_mps[:, :, None]).squeeze(-1)
-    smooth = np.asarray(np.median(_neighbours(v_first), axis=-1))
-    force = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1)
-    sound = _neighbours(camera.known.astype(float)).min(axis=-1) > 0.0
+    v_first = (R_first_imu[middle_at] @ v_mps[:, :, None]).squeeze(-1)
+    gained = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1) * step_s
+    fallen = v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at]
+    fallen -= np.median(np.diff(fallen, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
+    smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
+    sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
     rows = np.flatnonzero(sound[1:] & sound[:-1])
     t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
-    value = (np.diff(smooth, axis=0) / h_s - force)[rows]
-    bend = np.abs(np.diff(v_first, n=2, axis=0))[rows[rows < len(v_first) - 2]]
+    value = (np.diff(smooth, axis=0) / h_s)[rows]
+    bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(v_first) - 2]]
     sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
 
 
-def _neighbours(values: Array) -> Array:
-    """Return each value (n, ...) with those beside it, _MEDIAN_OF in all (n, ..., _MEDIAN_OF); the ends repeat."""
-    reach = _MEDIAN_OF // 2
+def _neighbours(values: Array, reach: int) -> Array:
+    """Return each value (n, ...) with so many on either side (n, ..., 2 reach + 1); the ends repeat."""
     padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
-    return np.asarray(sliding_window_view(padded, _MEDIAN_OF, axis=0))
+    return np.asarray(sliding_window_view(padded, 2 * reach + 1, axis=0))
 
 
 def _around(t_s: Array, value: Array) -> Array:
-    """Return the median (n, 3) of values (n, 3) within GRAVITY_S of each, taken once a second."""
+    """Return the median (n, 3) of the means over a stretch of values (n, 3) within GRAVITY_S of each, once a second."""
+    if len(t_s) < LEAST_IN_STRETCH:
+        return np.zeros_like(value)
     knots_s: Array = np.unique(np.floor(t_s))
     first: IntArray = np.searchsorted(t_s, knots_s - GRAVITY_S)
     last: IntArray = np.searchsorted(t_s, knots_s + 1.0 + GRAVITY_S)
-    medians = np.array([np.median(value[i:j], axis=0) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
+    even = _neighbours(value, round(0.5 * STRETCH_S / float(np.median(np.diff(t_s))))).mean(axis=-1)
+    medians = np.array([np.median(even[i:j], axis=0) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
     return medians[np.searchsorted(knots_s, np.floor(t_s))]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from toolkit.geometry import Array
 
@@ -14,6 +15,7 @@ ITERATIONS = 10
 MEDIAN_TO_MEAN_ERROR = 1.2533
 # Parts of a recording of which a jackknife leaves out one at a time: what lasts for seconds is one event.
 STRETCHES = 10
+LEAST_STRETCHES = 2
 
 
 class Scalar(NamedTuple):
@@ -44,12 +46,20 @@ def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
     return float(np.sqrt(jackknife_cov(lambda *some: np.array([estimate(*some)]), *rows)[0, 0]))
 
 
-def jackknife_cov(estimate: Callable[..., Array], *rows: Array) -> Array:
+def jackknife_cov(estimate: Callable[..., Array], *rows: Array, stretches: int = STRETCHES) -> Array:
     """Return the covariance (m, m) of an estimate (m,) of the same kind."""
-    stretch = np.arange(len(rows[0])) * STRETCHES // len(rows[0])
-    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(STRETCHES)])
+    stretch = np.arange(len(rows[0])) * stretches // len(rows[0])
+    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(stretches)])
     off_mean = without - without.mean(axis=0)
-    return np.asarray((STRETCHES - 1) / STRETCHES * off_mean.T @ off_mean)
+    return np.asarray((stretches - 1) / stretches * off_mean.T @ off_mean)
+
+
+def chance_sigmas(stretches: float, level: float) -> float:
+    """Return from how many standard errors on an estimate is chance less often than ``level``, by Student's t.
+
+    The error is that of a jackknife over so many stretches; two or fewer tell nothing of it.
+    """
+    return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * level)) if stretches > LEAST_STRETCHES else np.inf
 
 
 def slope(instrument: Array, regressor: Array, response: Array) -> Scalar:
