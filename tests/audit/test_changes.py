@@ -35,6 +35,18 @@ def test_odometry_that_is_a_little_faster_is_within_what_sound_drives_have() -> 
     assert "scale-change" not in told(audit(faults.changed_speed(sound("drive"), 1.04)))
 
 
+def test_a_scale_that_wanders_hides_a_step_and_the_audit_says_how_large_a_one() -> None:
+    clean = sound("drive")
+    values = clean.motion.values.copy()
+    t_s = (clean.motion.t_ns - clean.motion.t_ns[0]) / 1e9
+    values[:, :3] *= 1.0 + 0.04 * np.sin(2.0 * np.pi * t_s / 7.0)[:, None]
+    said = audit(replace(clean, motion=clean.motion.of(clean.motion.t_ns, values))).undecided["scale-change"]
+    found = re.search(r"a step by less than (\d+) % would not show", said)
+    assert found is not None
+    assert 8 <= int(found[1]) <= 20
+    assert "scale-change" not in audit(clean).undecided
+
+
 @pytest.mark.parametrize("scenario", LENGTH_S)
 def test_an_image_that_jumps_and_stays_is_told_at_its_time(scenario: str) -> None:
     faulty = faults.jumped_image(sound(scenario), 15.0)

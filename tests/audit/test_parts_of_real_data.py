@@ -60,6 +60,6 @@ def test_a_disparity_that_is_off_is_told_on_a_shaken_imu() -> None:
 
 
 def test_twists_whose_axes_are_turned_at_first_are_told_of_that_part() -> None:
-    """The first 8 s of 03: velocities and rates of rotation alike are turned by 0.07 rad, as it never is from 15 s on."""
+    """The first 8 s of 03: velocities and rates of rotation alike are turned by 0.07 rad, and not from 15 s on."""
     said = warnings_of(audit(part("ucsd/03.npz", 0, 80)))
     assert "as if it were turned by 0.07" in said["miscalibration"]

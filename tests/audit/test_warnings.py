@@ -101,6 +101,13 @@ def test_scale_and_lever_arm_are_measured_within_their_errors(scenario: str) -> 
     assert found.lever_error_m[0] < 0.1
 
 
+def test_a_scale_that_the_recording_hardly_shows_says_how_large_a_fault_it_hides() -> None:
+    sound = simulate(replace(SCENARIOS["flight"], duration_s=20.0), 5)
+    hidden = re.search(r"less than (\d+) % would not show", audit(sound).undecided["vision-scale"])
+    assert hidden is not None
+    assert 8 <= int(hidden[1]) <= 15
+
+
 def test_a_camera_that_is_elsewhere_is_told_and_one_that_hardly_turns_is_not_judged() -> None:
     sound = simulate(replace(SCENARIOS["flight"], duration_s=12.0), 6)
     T_imu_cam = sound.rig.T_imu_cam.copy()
@@ -119,6 +126,16 @@ def test_tracks_that_scatter_more_than_their_noise_are_told_and_a_tenth_of_misma
     assert told is not None
     assert float(told[1]) == pytest.approx(3.0, abs=0.1)
     assert found_in(faults.outlier_tracks(sound, 0.05, 7)) == {}
+
+
+@pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 12.0), ("flight", 6.0)])
+def test_a_tenth_of_tracks_that_slide_is_told_where_the_noise_is_right(scenario: str, duration_s: float) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=duration_s), 9)
+    told = re.search(r"frame ([\d.]+)% \+- ([\d.]+)%", found_in(faults.outlier_tracks(sound, 0.1, 9))["track-scatter"])
+    assert told is not None
+    assert 1.0 < float(told[1]) < 10.0  # some slide by less than four standard deviations a frame
+    # With twice the noise stated they are beneath it.
+    assert "track-scatter" not in found_in(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
 
 
 @pytest.mark.parametrize(

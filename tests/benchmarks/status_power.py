@@ -9,8 +9,8 @@ repaired or not; faults that could not be judged do not count. In a sound record
 is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` is a third draw, of others
-yet, with one recording drawn for every fault.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` and `again` are draws of
+others yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -83,7 +83,8 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh")
+HALVES = ("fit", "score", "fresh", "again")
+DRAWN = ("fresh", "again")
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
@@ -117,7 +118,7 @@ def scenarios(half: str) -> list[Scenario]:
     drawn = np.random.default_rng(first_seed).integers(len(LENGTH_S), size=len(FAULTS))
     for i, fault in enumerate(FAULTS):
         for j, recording in enumerate(LENGTH_S):
-            if (j == drawn[i]) if half == "fresh" else (i + j) % 2 == HALVES.index(half):
+            if (j == drawn[i]) if half in DRAWN else (i + j) % 2 == HALVES.index(half):
                 count = len(faulty)
                 cheap = (CHEAP[(2 * count + k) % len(CHEAP)] for k in range(2))
                 dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 else ()

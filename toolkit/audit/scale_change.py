@@ -16,6 +16,8 @@ from toolkit.resampling import NS_PER_S
 # A step is one at this level over all places where it can be, and beyond this share: sound drives at hand have 0.057
 # at most. Chosen with them in view.
 LEVEL, SYSTEMATIC = 1e-3, 0.06
+# Where a step must be larger than this to show, it is said.
+LARGEST_HIDDEN = 0.08
 # Of a step either side has so many stretches at least.
 LEAST_STRETCHES = 2
 
@@ -36,8 +38,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     after, step = _largest_step(ratio)
     level = LEVEL / (STRETCHES + 1 - 2 * LEAST_STRETCHES)
     sigmas = float(stdtrit(STRETCHES - 2, 1.0 - 0.5 * level))
-    if abs(step.value) < max(SYSTEMATIC, sigmas * step.error):
-        return None
+    least = max(SYSTEMATIC, sigmas * step.error)
+    if abs(step.value) < least:
+        return _hidden(step, least + abs(step.value))
     frame = intervals.interval[fast][np.argmax(np.arange(len(ratio)) * STRETCHES // len(ratio) == after)]
     at_s = (evidence.sequence.frames_t_ns[frame] - evidence.sequence.frames_t_ns[0]) / NS_PER_S
     return Symptom(
@@ -50,6 +53,16 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         remedy=None,
         harmful=False,
         warns=True,
+    )
+
+
+def _hidden(step: Scalar, hidden: float) -> Undecided | None:
+    """Say how large a step the wandering of the scale may hide, where that is much."""
+    if hidden < LARGEST_HIDDEN:
+        return None
+    wanders = f"by {100.0 * step.value:+.1f} +- {100.0 * step.error:.1f} %, as those of sound drives do"
+    return Undecided(
+        f"the odometry's scale changes {wanders}: a step by less than {100.0 * hidden:.0f} % would not show"
     )
 
 

@@ -9,8 +9,8 @@ from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 # A scale counts from so many standard errors on, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the
 # odometry of cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
 SIGMAS, SYSTEMATIC = 5.0, {"twist": 0.03, "imu": 0.025}
-# A scale that is known worse than this is not judged.
-LARGEST_ERROR = 0.02
+# A scale that is known worse than this is not judged; where a fault must be larger than that to show, it is said.
+LARGEST_ERROR, LARGEST_HIDDEN = 0.02, 0.08
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -22,9 +22,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         known = "unknown" if found is None else f"known to {100.0 * found.scale.error:.0f} %"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     scale, error = found.scale
-    is_told = kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO
-    if is_told or abs(scale) < SYSTEMATIC[kind] + SIGMAS * error:
-        return None
+    least = SYSTEMATIC[kind] + SIGMAS * error
+    if kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO:
+        return None  # a disagreement, and told as such
+    if abs(scale) < least:
+        return _hidden(scale, error, least + abs(scale))
     measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
     if kind == "imu":
         measured, causes = "IMU's", ": check K and the baseline"
@@ -39,6 +41,14 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         harmful=False,
         warns=True,
     )
+
+
+def _hidden(scale: float, error: float, hidden: float) -> Undecided | None:
+    """Say how large a fault the scale may hide that is found, where that is much."""
+    if hidden < LARGEST_HIDDEN:
+        return None
+    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
+    return Undecided(f"{known}, as in sound recordings: a fault of less than {100.0 * hidden:.0f} % would not show")
 
 
 FAULT = Fault(
