@@ -11,7 +11,8 @@ from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.units import Scored, outcome_of
 from toolkit.metrics import Evaluation, Scores
-from toolkit.metrics._shared.consistency import nis_over_time
+from toolkit.metrics._shared.consistency import Nis, nees_band, nis_over_time
+from toolkit.models.gating import mean_below_bound
 
 NOTHING = np.empty(0)
 
@@ -78,6 +79,32 @@ def test_innovations_that_share_one_error_count_once_a_frame(make_evaluation: Ca
     assert dof == pytest.approx(300.0)
     assert means.var() == pytest.approx(2.0 / dof, rel=0.15)  # the variance of 2000 draws scatters by 3 %
     assert nis_over_time(make_evaluation(100, dof=2.0)).independent_dof == pytest.approx(200.0)
+
+
+def share_above_and_below(nis: np.ndarray, dof: float, expected: float) -> np.ndarray:
+    """Return the shares of frames (2,) above and below the band of each of the runs (runs, frames), on average."""
+    shares = []
+    for run in nis:
+        of_run = Nis(np.arange(run.size), run, np.full(run.size, dof), np.full(run.size, expected))
+        low, high = of_run.bands()
+        shares.append([np.mean(run / expected > high), np.mean(run / expected < low)])
+    return np.mean(shares, axis=0)
+
+
+def test_the_band_of_a_frame_holds_95_percent_behind_a_gate_and_where_frames_share_an_error() -> None:
+    """100 runs of 100 frames of 60 sightings: the share in the band is known to 0.3 %, the band itself scatters."""
+    rng = np.random.default_rng(6)
+    sightings = rng.chisquare(3, (100, 100, 60))
+    alone, gated = sightings.sum(axis=2), np.where(sightings < 7.815, sightings, 0.0).sum(axis=2)
+    expected = 60 * 0.95 * float(mean_below_bound(3, 0.95))
+    shared = alone + 20.0 * (rng.chisquare(1, (100, 100)) - 1.0)  # 2.1 times the variance
+    for nis, mean in ((alone, 180.0), (gated, expected), (shared, 180.0)):
+        above, below = share_above_and_below(nis, 180.0, mean)
+        assert 0.03 < above + below < 0.08
+    plain = nees_band(180.0)
+    assert np.mean((shared / 180.0 < plain[0]) | (shared / 180.0 > plain[1])) > 0.1
+    assert share_above_and_below(1.5 * alone, 180.0, 180.0)[0] > 0.75
+    assert share_above_and_below(alone[:, :10], 180.0, 180.0).sum() == pytest.approx(0.05, abs=0.02)  # chi-square's
 
 
 def test_without_truth_innovations_mark_a_filter_that_is_told_half_the_noise(

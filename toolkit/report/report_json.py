@@ -209,12 +209,11 @@ def _nees(row: Row, comparison: Comparison) -> NeesSeries:
 
 
 def _nis(row: Row, comparison: Comparison) -> NisSeries:
-    """Return each step's NIS over what is expected of it, with the two-sided 95 % band for its degrees of freedom."""
+    """Return each step's NIS over what is expected of it, with the two-sided 95 % band of a consistent filter's."""
     found = nis_over_time(Evaluation(row.run, row.output, comparison.sequence))
     causal = row.run.causal
     assert causal is not None, "an output without estimates has no innovations"
-    bands = {d: nees_band(d) for d in np.unique(found.dof).tolist()}
-    low, high = np.array([bands[d] for d in found.dof.tolist()]).T
+    low, high = found.bands()
     return NisSeries(
         t_s=seconds(causal.t_ns[found.rows], int(comparison.sequence.frames_t_ns[0])),
         per_dof=numbers(found.nis / found.expected),

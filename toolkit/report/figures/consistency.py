@@ -34,10 +34,10 @@ _OF_NEES = (
 )
 _OF_NIS = (
     "Innovations of each frame, squared, over what the estimator's own covariances let expect of them behind its gate "
-    "(NIS). It needs no truth. The band (grey) holds 95 % of independent innovations without a gate; how many frames "
-    "are in it stands above each panel. A gate makes them scatter less, the error of the pose that they share more: "
-    "of the joint filters' frames on the simulated drive and flight 85 to 100 % are in it. A long stay above it is of "
-    "measurements that surprise the estimator more than they should."
+    "(NIS). It needs no truth. In the band (grey) are 95 % of the frames of a consistent filter; how many are stands "
+    "above each panel. Its width is that of the run's own scatter from frame to frame: a gate makes a frame's "
+    "innovations scatter less, the error of the pose that they share more. A long stay above it is of measurements "
+    "that surprise the estimator more than they should."
 )
 
 
@@ -88,8 +88,7 @@ def _nees(comparison: Comparison, row: Row) -> Normalised:
 
 def _nis(comparison: Comparison, row: Row) -> Normalised:
     found = nis_over_time(Evaluation(row.run, row.output, comparison.sequence))
-    bands = {dof: nees_band(dof) for dof in np.unique(found.dof).tolist()}
-    low, high = np.array([bands[dof] for dof in found.dof.tolist()]).T
+    low, high = found.bands()
     t_ns = Evaluation(row.run, row.output, comparison.sequence).estimate.t_ns[found.rows]
     return Normalised((t_ns - comparison.sequence.frames_t_ns[0]) / NS_PER_S, found.nis / found.expected, low, high)
 
