@@ -23,7 +23,7 @@ SYSTEMATIC_RATIO = 0.05
 # No standard error is less: without noise it would be none.
 LEAST_ERROR_RAD = 1e-6
 # Where a turn must be larger than this to be seen, it is said.
-LARGEST_RAD = 0.15
+LARGEST_RAD = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
