@@ -19,7 +19,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     kind, found = evidence.sequence.motion_kind, evidence.alignment
     if found is None or found.scale.error > LARGEST_ERROR:
-        known = "unknown" if found is None else f"known to {100.0 * found.scale.error:.0f} %"
+        known = "unknown"
+        if found is not None:
+            least = SYSTEMATIC[kind] + SIGMAS * found.scale.error
+            known = f"known to {100.0 * found.scale.error:.0f} %, a fault of less than {100.0 * least:.0f} % would hide"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     scale, error = found.scale
     least = SYSTEMATIC[kind] + SIGMAS * error
