@@ -204,6 +204,15 @@ def test_the_user_and_the_machine_can_stop_it(sequence, error):
         run(Stopped, sequence)
 
 
+def test_an_interrupt_that_compiled_code_wraps_is_no_failure_of_the_estimator(sequence):
+    class Interrupted(Perfect):
+        def step(self, packet: Packet) -> Estimate | None:
+            raise SystemError("a compiled function returned a result with an exception set") from KeyboardInterrupt()
+
+    with pytest.raises(KeyboardInterrupt):
+        run(Interrupted, sequence)
+
+
 def test_a_sequence_that_cannot_be_run_is_the_datas_fault_not_the_estimators(sequence):
     backwards = replace(sequence, frames_t_ns=sequence.frames_t_ns[::-1])
     with pytest.raises(DataError, match="not after the one before"):

@@ -119,6 +119,9 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
     except (DataError, KeyboardInterrupt, MemoryError):
         raise
     except Exception as error:
+        # Compiled code passes an interrupt on as the cause of an error of its own.
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise error.__cause__ from None
         return replace(_failed(name, said, clock.timings(), error), arithmetic=compilation.ran)
     run = _ended(name, said, finished, clock.timings(), sequence)
     return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)

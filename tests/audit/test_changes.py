@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
+from toolkit.audit.fault import Evidence
+from toolkit.audit.time_offset import camera_offset
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -80,6 +82,18 @@ def test_a_camera_clock_that_drifts_is_told() -> None:
 
 def test_clocks_that_cannot_be_compared_are_not_blessed() -> None:
     assert "would not show" in audit(sound("drive")).undecided["clock-change"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyro_that_has_only_noise_has_no_offset_from_the_camera(seed: int) -> None:
+    # As where a vehicle stands: at some shift the noise always differs least, and looks known to a millisecond there.
+    rng, flight = np.random.default_rng(seed), sound("flight").truncated(100)
+    values = flight.motion.values.copy()
+    values[:, 3:] = rng.normal(0.0, 0.01, (len(values), 3))
+    still = replace(flight, motion=flight.motion.of(flight.motion.t_ns, values))
+    intervals = Evidence(still).intervals
+    assert intervals is not None
+    assert camera_offset(still, intervals, rng.normal(0.0, 0.001, (len(intervals.interval), 3))) is None
 
 
 def test_odometry_that_hangs_is_told_and_wheels_that_stand_or_roll_straight_do_not_hang() -> None:

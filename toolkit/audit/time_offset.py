@@ -40,6 +40,9 @@ SCATTER = 1.45
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S = 0.0064, 0.0125
 # The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
 MOST_UNEXPLAINED = 0.9
+# Rotations of which one is noise differ by the sum of their variances: a gyro's own noise, in a standstill, has some
+# shift at which it differs least. They must differ by less than this share of the sum, without gross mismatches.
+MOST_APART, GROSS_SPREADS = 0.8, 6.0
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -112,7 +115,7 @@ def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Sca
         residual = residual - np.median(residual, axis=0)
         step = slope(instrument, change, residual)
         found = Scalar(found.value + float(np.clip(step.value, -step_s, step_s)), step.error)
-    if abs(found.value) >= 2.0 * MOST_S:
+    if abs(found.value) >= 2.0 * MOST_S or _share_apart(w_imu[rows], mean[rows]) > MOST_APART:
         return None
     if isinstance(sequence.motion, TwistSamples) and _stamped_at_frames(sequence):
         return found
@@ -148,6 +151,15 @@ def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:
     if inside.sum() < LEAST_INTERVALS:
         return float("nan")
     return float(np.sum(spread((w_imu - mean)[inside]) ** 2))
+
+
+def _share_apart(w_imu: Array, mean: Array) -> float:
+    """Return the variance of the difference (M, 3) over the sum of both variances: 1 where they are independent."""
+    seen, measured = (rates - np.median(rates, axis=0) for rates in (w_imu, mean))
+    apart = seen - measured
+    apart = apart - np.median(apart, axis=0)
+    sound = (np.abs(apart) <= GROSS_SPREADS * spread(apart)).all(axis=1)
+    return float(np.sum(apart[sound] ** 2) / max(np.sum(seen[sound] ** 2 + measured[sound] ** 2), 1e-300))
 
 
 def _shifted(sequence: Sequence, offset_s: float) -> Sequence:
