@@ -181,17 +181,22 @@ class _Joint(NamedTuple):
 
     def of(self, keys: Sequence[int]) -> "_Joint":
         """Return the joint covariance of some of the variables, in the order of the keys."""
-        rows = [row for key in keys for row in self.rows[key]]
+        if list(keys) == list(self.rows):
+            return self
+        rows = np.concatenate([self.rows[key] for key in keys])
         return _Joint(_rows({key: len(self.rows[key]) for key in keys}), self.cov[np.ix_(rows, rows)])
 
     def with_first(self, conditional: gtsam.GaussianConditional) -> "_Joint":
         """Return it with the variable that a conditional gives from all that are here, before them."""
         root = np.linalg.inv(conditional.R())
         gain = -root @ conditional.S()
-        cross = gain @ self.cov
-        cov = np.block([[root @ root.T + cross @ gain.T, cross], [cross.T, self.cov]])
+        size = len(root)
+        cov = np.empty((size + len(self.cov), size + len(self.cov)))
+        cov[:size, size:] = gain @ self.cov
+        cov[:size, :size] = root @ root.T + cov[:size, size:] @ gain.T
+        cov[size:, :size], cov[size:, size:] = cov[:size, size:].T, self.cov
         sizes = {key: len(rows) for key, rows in self.rows.items()}
-        return _Joint(_rows({conditional.firstFrontalKey(): len(root), **sizes}), cov)
+        return _Joint(_rows({conditional.firstFrontalKey(): size, **sizes}), cov)
 
 
 def _rows(sizes: dict[int, int]) -> dict[int, range]:
