@@ -32,9 +32,13 @@ def _only_dissected(eliminated):
     return eliminate
 
 
-@pytest.mark.parametrize(("scenario", "in_time"), [("drive", True), ("flight", True), ("drive", False)])
-def test_every_state_has_gtsams_marginal(scenario, in_time, run_estimator, monkeypatch):
-    """In the order of time, and by nested dissection where that is no good."""
+@pytest.mark.parametrize(
+    ("scenario", "in_time", "most_tied"),
+    [("drive", True, 50), ("flight", True, 50), ("drive", True, 5), ("flight", True, 5), ("drive", False, 50)],
+)
+def test_every_state_has_gtsams_marginal(scenario, in_time, most_tied, run_estimator, monkeypatch):
+    """In the order of time, landmarks among the states or before them, and by nested dissection where it is no good."""
+    monkeypatch.setattr(state_covariances, "_MOST_TIED", most_tied)
     if not in_time:
         monkeypatch.setattr(state_covariances, "_eliminated", _only_dissected(state_covariances._eliminated))
     calls = []

@@ -22,7 +22,7 @@ of is left out: nothing hangs on it. Where that does not help either, all are re
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -34,6 +34,8 @@ from toolkit.models.motion import MotionModel
 
 # A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
 _MOST_ROUNDED = 0.01
+# A landmark that ties more states than this is eliminated among them and not before.
+_MOST_TIED = 50
 # A direction of a variable of which less is said than this share of what is said of the best is lost in the sixteen
 # digits of the Jacobians: a landmark's depth beyond ten thousand million baselines.
 _LEAST_TOLD = 1e-10
@@ -144,10 +146,33 @@ def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) 
     return graph
 
 
-def _in_time(graph: gtsam.GaussianFactorGraph, groups: Iterable[Sequence[int]]) -> gtsam.Ordering:
-    """Return the order of the groups as they are given, after all that is in none: landmarks."""
-    grouped = [key for group in groups for key in group]
-    return _ordering([*_others(gtsam.Ordering.ColamdGaussianFactorGraph(graph), grouped), *grouped])
+def _in_time(graph: gtsam.GaussianFactorGraph, groups: Sequence[Sequence[int]]) -> gtsam.Ordering:
+    """Return the order of the groups as they are given, after all that is in none: landmarks.
+
+    Eliminated, a landmark leaves a dense factor of all states that saw it. One seen for long, as all are while a
+    vehicle stands, waits for the last of them, and until then is beside each: some hundred rows instead of thousands.
+    """
+    place = {key: i for i, group in enumerate(groups) for key in group}
+    first, last = _seen_between(graph, place)
+    landmarks = _others(gtsam.Ordering.ColamdGaussianFactorGraph(graph), place)
+    waiting = {key for key in landmarks if key in last and last[key] - first[key] > _MOST_TIED}
+    before = defaultdict[int, list[int]](list)
+    for key in waiting:
+        before[last[key]].append(key)
+    in_groups = [key for i, group in enumerate(groups) for key in (*before[i], *group)]
+    return _ordering([*(key for key in landmarks if key not in waiting), *in_groups])
+
+
+def _seen_between(graph: gtsam.GaussianFactorGraph, place: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
+    """Return the first and the last group that each variable in none shares a factor with."""
+    first, last = dict[int, int](), dict[int, int]()
+    for keys in (graph.at(i).keys() for i in range(graph.size())):
+        places = [place[key] for key in keys if key in place]
+        for key in keys:
+            if key not in place and places:
+                first[key] = min(first.get(key, places[0]), *places)
+                last[key] = max(last.get(key, places[0]), *places)
+    return first, last
 
 
 def _dissected(graph: gtsam.GaussianFactorGraph, last: Collection[int]) -> gtsam.Ordering:
