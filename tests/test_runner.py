@@ -207,7 +207,10 @@ def test_the_user_and_the_machine_can_stop_it(sequence, error):
 def test_an_interrupt_that_compiled_code_wraps_is_no_failure_of_the_estimator(sequence):
     class Interrupted(Perfect):
         def step(self, packet: Packet) -> Estimate | None:
-            raise SystemError("a compiled function returned a result with an exception set") from KeyboardInterrupt()
+            try:
+                raise SystemError("unpickling returned a result with an exception set") from KeyboardInterrupt()
+            except SystemError as inner:
+                raise SystemError("compiled code returned a result with an exception set") from inner
 
     with pytest.raises(KeyboardInterrupt):
         run(Interrupted, sequence)

@@ -119,12 +119,18 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
     except (DataError, KeyboardInterrupt, MemoryError):
         raise
     except Exception as error:
-        # Compiled code passes an interrupt on as the cause of an error of its own.
-        if isinstance(error.__cause__, KeyboardInterrupt):
-            raise error.__cause__ from None
+        if (interrupt := _interrupt_behind(error)) is not None:
+            raise interrupt from None
         return replace(_failed(name, said, clock.timings(), error), arithmetic=compilation.ran)
     run = _ended(name, said, finished, clock.timings(), sequence)
     return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)
+
+
+def _interrupt_behind(error: BaseException | None) -> KeyboardInterrupt | None:
+    """Return the interrupt that an error comes from: compiled code passes one on behind errors of its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error
 
 
 def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate | None:
