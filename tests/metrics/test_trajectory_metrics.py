@@ -69,7 +69,7 @@ def test_worlds_that_disagree_on_a_measured_vertical_are_remarked(
     assert "ate_se3_m" not in notes
 
 
-@pytest.mark.parametrize(("tilt_rad", "remarked"), [(0.01, True), (0.0, False)])
+@pytest.mark.parametrize(("tilt_rad", "remarked"), [(0.02, True), (0.002, False), (0.0, False)])
 def test_a_tilt_that_no_sensor_measured_is_remarked_where_it_is_most_of_the_error_with_the_vertical_kept(
     make_sequence, drive, perturb, score, tilt_rad, remarked
 ):

@@ -58,8 +58,8 @@ class Part:
 
 WHOLE = Part()
 
-# So much of a simulation that errs as it states decides every fault, measured on ten seeds of each: two corners of
-# `drive`, where one leaves the camera's place undecided in every third.
+# So many seconds of a simulation that errs as it states decide every fault, measured on ten seeds of each. On `drive`
+# they hold two corners: after a single one the camera's place is undecided under every third seed.
 AUDITED_S = {"drive": 30.0, "drive-imu": 20.0, "flight": 20.0}
 
 

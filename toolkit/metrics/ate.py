@@ -53,10 +53,10 @@ METRICS = (
         in_contract=True,
     ),
 )
-# A world that is not level is worth a remark where it explains more than half of the squared error of the fit that
-# keeps the vertical; a straight path leaves its roll undetermined and explains nothing by it. With an IMU the two
-# verticals must be this far (deg) apart: less is the estimator's own error.
-_EXPLAINED, _TILTED_DEG = 0.5, 1.0
+# A world this far from level (deg), which explains more than half of the squared error of the fit that keeps the
+# vertical, is worth a remark; less is the estimator's own error, or that of a start that was given. A straight path
+# leaves its roll undetermined and explains nothing by it.
+_TILTED_DEG, _EXPLAINED = 1.0, 0.5
 _DISAGREE = (
     "the estimate's vertical and the truth's differ by about {:.0f} deg, which is most of this error and is in "
     "end_drift_percent too; if the truth's world is not level, compare ate_se3_m"
@@ -81,19 +81,21 @@ def score(evaluation: AgainstTruth) -> Scores:
     )
     if scores.values["ate_se3_m"] is not None and not evaluation.se3_alignment.rotation_is_unique:
         return scores.remarked(["ate_se3_m", "ate_sim3_m"], _ON_A_LINE)
-    tilt_deg = _tilt_deg(evaluation, scores)
+    tilt_deg = _telling_tilt_deg(evaluation, scores)
+    if tilt_deg is None:
+        return scores
     if evaluation.level:
-        remark = _DISAGREE.format(tilt_deg) if tilt_deg >= _TILTED_DEG else ""
-        return scores.remarked(["ate_none_m", "ate_yaw_m"], remark)
-    return scores.remarked(["ate_yaw_m"], _UNMEASURED if tilt_deg > 0.0 else "")
+        return scores.remarked(["ate_none_m", "ate_yaw_m"], _DISAGREE.format(tilt_deg))
+    return scores.remarked(["ate_yaw_m"], _UNMEASURED)
 
 
-def _tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float:
-    """Return how far apart the two verticals are (deg), 0 where that explains no more than half of ate_yaw_m."""
+def _telling_tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float | None:
+    """Return how far apart the two verticals are (deg) where that explains most of ate_yaw_m, else None."""
     se3_m, yaw_m = scores.values["ate_se3_m"], scores.values["ate_yaw_m"]
     if se3_m is None or yaw_m is None or se3_m**2 > (1.0 - _EXPLAINED) * yaw_m**2:
-        return 0.0
-    return float(np.degrees(np.arccos(np.clip(evaluation.se3_alignment.rotation[2, 2], -1.0, 1.0))))
+        return None
+    tilt_deg = float(np.degrees(np.arccos(np.clip(evaluation.se3_alignment.rotation[2, 2], -1.0, 1.0))))
+    return tilt_deg if tilt_deg >= _TILTED_DEG else None
 
 
 def _positions(evaluation: AgainstTruth) -> tuple[Array, Array]:

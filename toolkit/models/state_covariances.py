@@ -23,6 +23,7 @@ of is left out: nothing hangs on it. Where that does not help either, all are re
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
@@ -77,9 +78,10 @@ def _of_groups(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], b
     tied = _tied(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
-    for ordering, judged in ((_in_time(tied, together), [0]), (_dissected(tied, beside), some)):
+    orders = (partial(_in_time, tied, together), [0]), (partial(_dissected, tied, beside), some)
+    for order, judged in orders:
         try:
-            covs = _recovered(_eliminated(tied, ordering), together)
+            covs = _recovered(_eliminated(tied, order()), together)
             if all(_is_right(covs[k], linear, states[k]) for k in judged):
                 return covs
         except RuntimeError as error:  # a variable that this order finds undetermined
