@@ -58,10 +58,6 @@ class Part:
 
 WHOLE = Part()
 
-# So many seconds of a simulation that errs as it states decide every fault, measured on ten seeds of each. On `drive`
-# they hold two corners: after a single one the camera's place is undecided under every third seed.
-AUDITED_S = {"drive": 30.0, "drive-imu": 20.0, "flight": 20.0}
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -158,12 +154,12 @@ def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audi
 
 
 def _to_audit(sequence: Sequence, recording: Recording) -> Sequence:
-    """Return a recording, but of a simulation in AUDITED_S what is run of it, and at least so much."""
-    least_s = AUDITED_S.get(recording.source) if isinstance(recording.source, str) else None
-    if least_s is None:
+    """Return a recording; of a simulation, where its scenario says what decides, that much and what is run of it."""
+    scenario = SCENARIOS.get(recording.source) if isinstance(recording.source, str) else None
+    if scenario is None or scenario.audited_s is None:
         return sequence
     t_ns = sequence.frames_t_ns
-    end_ns = max(_cut(sequence, recording).frames_t_ns[-1], t_ns[0] + round(least_s * NS_PER_S))
+    end_ns = max(_cut(sequence, recording).frames_t_ns[-1], t_ns[0] + round(scenario.audited_s * NS_PER_S))
     return sequence.truncated(int((t_ns <= end_ns).sum()))
 
 
