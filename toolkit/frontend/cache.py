@@ -23,7 +23,7 @@ from toolkit.inputs import read_input
 from toolkit.settings import Frontend
 
 # Raised with every change of the front end that changes its tracks.
-_FRONT_END = 5
+_FRONT_END = 6
 # Settings that say where images are from, and not what becomes of them.
 _OF_THE_SOURCE = ("tracks", "topics")
 _ARRAYS = ("t_ns", "frame", "track_id", "corners_px")

@@ -25,7 +25,9 @@ def corners(image: Image, free: BoolArray, present: IntArray, spacing_px: float,
     highest = cv2.dilate(strength, np.ones((reach, reach), np.uint8))
     strong = float(np.percentile(strength[::4, ::4], _STRONG_PERCENTILE))
     least = max(_LEAST_OF_STRONG * strong, _LEAST_STRENGTH)
-    rows, columns = np.nonzero((strength == highest) & (strength > least) & free)
+    peaks = np.flatnonzero(strength == highest)
+    peaks = peaks[(strength.ravel()[peaks] > least) & free.ravel()[peaks]]
+    rows, columns = np.divmod(peaks, image.shape[1])
     points = np.stack([columns, rows], axis=1).astype(np.float64)
     cells = cells_of(points, (image.shape[1], image.shape[0]), (present.shape[0], present.shape[1]))
     by_cell = np.lexsort((-strength[rows, columns], cells))

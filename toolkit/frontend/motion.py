@@ -11,6 +11,7 @@ import numpy as np
 
 from toolkit.frontend.cameras import RectifiedPair
 from toolkit.geometry import Array, BoolArray, IntArray, se3, transform
+from toolkit.sequence import StereoRig
 
 _FEWEST = 8
 _ITERATIONS, _CONFIDENCE = 200, 0.999
@@ -88,7 +89,7 @@ class StereoMotion:
         return np.stack([u, u - rig.fx_px * rig.baseline_m / depth, v], axis=1)
 
 
-def pose_of(points: Array, left_px: Array, rig: RectifiedPair, threshold_px: float) -> Array | None:
+def pose_of(points: Array, left_px: Array, rig: RectifiedPair | StereoRig, threshold_px: float) -> Array | None:
     """Return T_now_before (4, 4) from points (N, 3) m of the camera before and their places (N, 2) px in it now.
 
     None where fewer than eight of them, or three in ten, agree to the threshold.

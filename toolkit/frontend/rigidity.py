@@ -6,7 +6,7 @@ the place in which they cross wanders with the camera, and the patch around it l
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -39,9 +39,16 @@ class _Earlier(NamedTuple):
 class Rigidity:
     """The earlier pairs that tracks are held against, the older first: the one that counts and the one that follows."""
 
-    rig: RectifiedPair
+    rig: StereoRig
     threshold_px: float
     earlier: tuple[_Earlier, ...] = ()
+
+    @classmethod
+    def of(cls, pair: RectifiedPair, threshold_px: float) -> Self:
+        """Return what no pair has been seen with yet; the noise of a place is one pixel, and of v, a mean, half that
+        variance."""
+        pinhole_px = (pair.fx_px, pair.fy_px, pair.cx_px, pair.cy_px)
+        return cls(StereoRig(*pinhole_px, pair.baseline_m, np.eye(4), np.diag([1.0, 1.0, 0.5])), threshold_px)
 
     def after(self, left_px: Array, right_px: Array, track_ids: IntArray) -> "Rigidity":
         """Return what the next pair is held against, after one with the tracks (N,) at (N, 2) px."""
@@ -61,23 +68,16 @@ class Rigidity:
         _, then, now = np.intersect1d(self.earlier[0].track_ids, track_ids, assume_unique=True, return_indices=True)
         if len(now) < _FEWEST:
             return sound
-        rig = self._stereo
-        points = stereo.triangulate(self.earlier[0].uvs_px[then], rig)
+        points = stereo.triangulate(self.earlier[0].uvs_px[then], self.rig)
         T_now_then = pose_of(points, left_px[now], self.rig, self.threshold_px)
         if T_now_then is None:
             return sound
         seen_px = _measured(left_px[now], right_px[now])
-        T_now_then = _refined(_deviations(points, T_now_then, seen_px, rig)) @ T_now_then
-        found = _deviations(points, T_now_then, seen_px, rig)
+        T_now_then = _refined(_deviations(points, T_now_then, seen_px, self.rig)) @ T_now_then
+        found = _deviations(points, T_now_then, seen_px, self.rig)
         off_px = np.linalg.norm(found.off_px, axis=1)
         sound[now] = (found.sizes < _MEDIANS * np.median(found.sizes)) | (off_px < _LEAST_PX)
         return sound
-
-    @property
-    def _stereo(self) -> StereoRig:
-        rig = self.rig
-        pinhole_px = (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px)
-        return StereoRig(*pinhole_px, rig.baseline_m, np.eye(4), np.diag([1.0, 1.0, 0.5]))
 
 
 class _Deviations(NamedTuple):

@@ -15,7 +15,7 @@ from toolkit.frontend.cameras import Image, RectifiedPair
 from toolkit.frontend.corners import corners, count_in_cells, grid_of
 from toolkit.frontend.flow import Flow
 from toolkit.frontend.motion import StereoMotion
-from toolkit.frontend.patches import Patches, as_floats
+from toolkit.frontend.patches import Floats, Patches, as_floats, inverse
 from toolkit.frontend.rigidity import Rigidity
 from toolkit.frontend.rows import halved, match_rows
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -97,7 +97,7 @@ class Tracker:
         self._flow = Flow(asked.window_px, asked.levels, asked.forward_backward_px)
         self._across = Flow(asked.window_px, _LEVELS_RIGHT, 2.0 * asked.forward_backward_px)
         self._motion = StereoMotion(self.rig, asked.ransac_px)
-        self._rigidity = Rigidity(self.rig, asked.ransac_px)
+        self._rigidity = Rigidity.of(self.rig, asked.ransac_px)
         self._seen = self.rig.seen(0), self.rig.seen(1)
         self._grid = grid_of(self.rig.size_px, asked.max_tracks)
 
@@ -123,7 +123,7 @@ class Tracker:
         self._rigidity = self._rigidity.after(*seen[1:], seen[0])
         return Sightings(seen[0], np.hstack(seen[1:]))
 
-    def _followed(self, left: Image, floats: Array) -> tuple[_Tracks, StereoMotion]:
+    def _followed(self, left: Image, floats: Floats) -> tuple[_Tracks, StereoMotion]:
         """Return the tracks that are found in the left image, still paired as before, and how the camera moved."""
         before = self._tracks
         if self._before is None or len(before.ids) == 0:
@@ -140,7 +140,7 @@ class Tracker:
         # Where the first patch fits is where the track is: KLT's small errors, added up, would walk away from it.
         rows, patches, here_px = rows[same], patches.select(same), fitted_px[same]
         shift_px = here_px - before.left_px[rows]
-        right_warps = before.right_warps[rows] @ np.linalg.inv(before.patches.warps[rows]) @ patches.warps
+        right_warps = before.right_warps[rows] @ inverse(before.patches.warps[rows]) @ patches.warps
         followed = _Tracks(
             *(before.ids[rows], here_px, before.right_px[rows] + shift_px, patches, right_warps, before.sound[rows])
         )
@@ -151,7 +151,7 @@ class Tracker:
         right_px, found = self._found_right(left, right, tracks.left_px, tracks.right_px)
         return replace(tracks, right_px=right_px).select(found)
 
-    def _fitted_right(self, right: Array, tracks: _Tracks) -> _Tracks:
+    def _fitted_right(self, right: Floats, tracks: _Tracks) -> _Tracks:
         """Return the tracks measured in the right image where their first patches fit it, without those that do not.
 
         The right camera sees a slanted surface under another angle: a window that only shifts would bias its disparity.
@@ -176,7 +176,7 @@ class Tracker:
     def _most_disparity_px(self) -> float:
         return min(self.rig.fx_px * self.rig.baseline_m / self.settings.nearest_m, 0.5 * self.rig.size_px[0])
 
-    def _begun(self, left: Image, right: Image, floats: Array, tracks: _Tracks) -> _Tracks:
+    def _begun(self, left: Image, right: Image, floats: Floats, tracks: _Tracks) -> _Tracks:
         """Return new tracks where there is room for them."""
         wanted = self.settings.max_tracks - int(tracks.sound.sum())
         if wanted <= 0:
