@@ -1,0 +1,109 @@
+"""A truth of another motion or scale, and an IMU's noise that its samples refute: told where planted, nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import overstated_noise, truth_mismatch
+from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.measured_motion import ImuNoise
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, Truth
+from toolkit.simulation import SCENARIOS, simulate
+
+DURATION_S = 6.0
+
+
+def simulated(scenario: str, seed: int = 0) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=DURATION_S), seed)
+
+
+@pytest.fixture(scope="module")
+def drive() -> Sequence:
+    return simulated("drive")
+
+
+@pytest.fixture(scope="module")
+def flight() -> Sequence:
+    return simulated("flight")
+
+
+def with_truth(sequence: Sequence, truth: Truth | None) -> Symptom | Undecided | None:
+    return truth_mismatch.check(Evidence(replace(sequence, truth=truth)))
+
+
+def truth_of(sequence: Sequence) -> Truth:
+    assert sequence.truth is not None
+    return sequence.truth
+
+
+@pytest.mark.parametrize("scenario", ["drive", "flight", "flight-realistic", "drive-realistic"])
+@pytest.mark.parametrize("seed", [21, 22])
+def test_a_sound_truth_and_a_sound_noise_are_not_accused(scenario: str, seed: int) -> None:
+    evidence = Evidence(simulated(scenario, seed))
+    assert truth_mismatch.check(evidence) is None
+    assert overstated_noise.check(evidence) is None
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.25, 2.0])
+@pytest.mark.parametrize("recording", ["drive", "flight"])
+def test_a_wrong_baseline_is_told_with_its_size(recording: str, scale: float, request: pytest.FixtureRequest) -> None:
+    sound: Sequence = request.getfixturevalue(recording)
+    wrong = replace(sound, rig=replace(sound.rig, baseline_m=scale * sound.rig.baseline_m))
+    found = truth_mismatch.check(Evidence(wrong))
+    assert isinstance(found, Symptom)
+    assert found.warns and found.remedy is None
+    told = float(found.detail.split("steps are ")[1].split()[0])
+    # what creeping and quantised disparities make of vision's scale on sound flights
+    assert told == pytest.approx(scale, rel=0.03)
+
+
+def test_a_truth_that_runs_backwards_is_told(drive: Sequence) -> None:
+    truth = truth_of(drive)
+    found = with_truth(drive, Truth(truth.t_ns, truth.T_world_imu[::-1]))
+    assert isinstance(found, Symptom)
+    assert "moves otherwise" in found.detail
+
+
+def test_a_truth_of_another_flight_is_told(flight: Sequence) -> None:
+    """Of the same hall, later: speeds and turns are alike in size, and not in direction."""
+    later = truth_of(simulate(replace(SCENARIOS["flight"], duration_s=3.0 * DURATION_S), 0))
+    rows = later.t_ns > later.t_ns[0] + 2 * DURATION_S * NS_PER_S
+    poses, frames_t_ns = later.T_world_imu[rows], flight.frames_t_ns
+    stamps = frames_t_ns[0] + later.t_ns[rows] - later.t_ns[rows][0]
+    found = with_truth(flight, Truth(stamps, poses))
+    assert isinstance(found, Symptom)
+    assert "the truth's motion is not the camera's" in found.detail
+
+
+def test_a_truth_that_stands_still_is_not_judged(drive: Sequence) -> None:
+    truth = truth_of(drive)
+    still = np.repeat(truth.T_world_imu[:1], truth.t_ns.size, axis=0)
+    assert isinstance(with_truth(drive, Truth(truth.t_ns, still)), Undecided)
+
+
+def test_a_truth_of_other_times_or_none_is_not_judged(drive: Sequence) -> None:
+    truth = truth_of(drive)
+    assert with_truth(drive, None) is None
+    elsewhen = Truth(truth.t_ns + 1000 * NS_PER_S, truth.T_world_imu)
+    assert isinstance(with_truth(drive, elsewhen), Undecided)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("accel_noise_density", 1e3), ("gyro_noise_density", 1e3), ("accel_random_walk", 1e4)]
+)
+def test_a_thousand_times_the_noise_of_an_imu_is_told_by_its_name(flight: Sequence, name: str, factor: float) -> None:
+    """A walk must be larger still: the motion of a flight hides it."""
+    noise = flight.noise
+    assert isinstance(noise, ImuNoise)
+    found = overstated_noise.check(
+        Evidence(replace(flight, noise=replace(noise, **{name: factor * getattr(noise, name)})))
+    )
+    assert found is not None
+    assert found.warns
+    assert name in found.detail
+
+
+def test_noise_that_allows_for_vibration_is_not_accused(flight: Sequence) -> None:
+    assert overstated_noise.check(Evidence(replace(flight, noise=flight.noise.scaled(10.0)))) is None

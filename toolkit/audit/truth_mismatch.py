@@ -1,0 +1,147 @@
+"""A truth that moves otherwise than vision: it is of another motion, or vision's scale is wrong.
+
+Over windows of time the camera's own displacement and turn, chained from frame to frame, are held against those of the
+truth. Vision's steps are too long or too short where the baseline or the focal length is wrong, or the truth is in
+another unit; they go elsewhere where the truth is another recording's, runs backwards or is in other axes.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.alignment import chained
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable, moved_by
+from toolkit.audit.parts.robust import chance_sigmas, median_error
+from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Truth
+
+# Long enough that the noise of single frames hardly counts, short enough that five seconds hold ten of them.
+WINDOW_S = 0.5
+LEAST_WINDOWS = 4
+# What is chance less often than this, by Student's t of as many windows, counts ...
+LEVEL = 1e-3
+# ... beyond what sound recordings at hand have; chosen with them in view.
+SYSTEMATIC = 0.06
+# Motions that have nothing to do with each other differ by more than they are large; a truth that errs, by far less.
+MOST_OFF = 0.5
+# A scale is the difference where little is left of it after scaling; while a vehicle stands there is only noise.
+MOST_SCALED_OFF = 0.25
+# A truth's noise feigns motion of what hardly moves (m, rad over a window).
+LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
+# A vehicle that fills the view turns vision alone, but not for a third of the time.
+LEAST_TURNING = 1.0 / 3.0
+_WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
+_OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Hold the camera's own motion against the truth's, in direction and in size."""
+    truth = evidence.sequence.truth
+    if truth is None or truth.t_ns.size < 2 or evidence.spoilt_by or not is_comparable(evidence.sequence):
+        return None
+    if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
+        return None
+    both = _windows(evidence, truth)
+    moved, turned = _moving(both.displaced_m, LEAST_MOVED_M), _moving(both.turned_rad, LEAST_TURNED_RAD)
+    if moved.sum() < LEAST_WINDOWS:
+        return Undecided(
+            f"the truth moves by {LEAST_MOVED_M:g} m and more, and the camera's own motion is known, in {moved.sum()} "
+            f"windows of {WINDOW_S:g} s; {LEAST_WINDOWS} are needed"
+        )
+    off = {"moves": _off(both.displaced_m[:, moved])}
+    if turned.sum() >= max(LEAST_WINDOWS, LEAST_TURNING * moved.sum()):
+        off["turns"] = _off(both.turned_rad[:, turned])
+    elsewhere = [
+        f"it {how} otherwise, by {100.0 * share.value:.0f} +- {100.0 * share.error:.0f} % of the larger of both"
+        for how, share in off.items()
+        if share.value - share.by_chance > MOST_OFF
+    ]
+    if elsewhere:
+        return _told(f"the truth's motion is not the camera's: {' and '.join(elsewhere)}", _OTHER)
+    seen, true = both.displaced_m[:, moved]
+    scale = _ratio(seen, true)
+    only_longer = scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
+    if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
+        return None
+    return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's", _WHERE)
+
+
+def _told(detail: str, treatment: str) -> Symptom:
+    return Symptom(count=1, detail=detail, treatment=treatment, remedy=None, harmful=False, warns=True)
+
+
+class _Windows(NamedTuple):
+    """What the camera and the truth (2, ...) move (2, M, 3) m and turn (2, M, 3) rad by over M windows, in the axes
+    that the camera has where each begins."""
+
+    displaced_m: Array
+    turned_rad: Array
+
+
+def _windows(evidence: Evidence, truth: Truth) -> _Windows:
+    """Return both over windows in which every interval of the camera is known and the truth has poses close by."""
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    t_ns = sequence.frames_t_ns
+    edges = np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, round(WINDOW_S * NS_PER_S)))
+    begin, end = np.array(list(pairwise(np.unique(edges).tolist())), dtype=int).reshape(-1, 2).T
+    unknown = np.concatenate([[0], np.cumsum(~camera.known)])
+    usable = (unknown[begin] == unknown[end]) & _has_truth(truth, t_ns[begin]) & _has_truth(truth, t_ns[end])
+    begin, end = begin[usable], end[usable]
+    path = chained(moved_by(camera, sequence))
+    true = [
+        interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns[k]) @ sequence.rig.T_imu_cam if k.size else path[k]
+        for k in (begin, end)
+    ]
+    both = np.stack([se3_inverse(path[begin]) @ path[end], se3_inverse(true[0]) @ true[1]])
+    return _Windows(both[..., :3, 3], so3_log(both[..., :3, :3]))
+
+
+def _has_truth(truth: Truth, t_ns: IntArray) -> BoolArray:
+    """Say of stamps (N,) whether they lie within the truth's and between two of them that are close."""
+    after = np.clip(np.searchsorted(truth.t_ns, t_ns, side="left"), 1, truth.t_ns.size - 1)
+    close = truth.t_ns[after] - truth.t_ns[after - 1] <= WINDOW_S * NS_PER_S
+    return np.asarray(close & (t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1]))
+
+
+def _moving(both: Array, least: float) -> BoolArray:
+    """Say in which windows (M,) the truth does enough, of what camera and truth do (2, M, 3).
+
+    Where it stands and the camera seems to move, a vehicle fills the view as often as the truth is wrong.
+    """
+    return np.asarray(np.linalg.norm(both[1], axis=1) > least)
+
+
+class _Compared(NamedTuple):
+    """A median over some windows with its standard error, and beyond which distance it is no chance."""
+
+    value: float
+    error: float
+    by_chance: float
+
+
+def _compared(each: Array) -> _Compared:
+    """Return the median of what windows (M,) show; of few windows neither its error by the median nor the mean's is
+    sure, so the larger one counts."""
+    error = max(float(median_error(each[:, None])[0]), float(np.std(each)) / np.sqrt(each.size))
+    return _Compared(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
+
+
+def _off(both: Array) -> _Compared:
+    """Return the share by which the two of (2, M, 3) differ, of the larger."""
+    return _compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
+
+
+def _ratio(seen: Array, true: Array) -> _Compared:
+    """Return the ratio of displacements (M, 3) along the true ones."""
+    return _compared((seen * true).sum(axis=1) / (true**2).sum(axis=1))
+
+
+FAULT = Fault(
+    "truth-mismatch",
+    "a truth that moves otherwise than vision: of another motion or unit, or beside a wrong baseline or focal length",
+    check,
+    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+)
