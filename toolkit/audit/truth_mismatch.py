@@ -85,10 +85,12 @@ def _windows(evidence: Evidence, truth: Truth) -> _Windows:
     """Return both over windows in which every interval of the camera is known and the truth has poses close by."""
     sequence, camera = evidence.sequence, evidence.camera_motion
     t_ns = sequence.frames_t_ns
-    edges = np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, round(WINDOW_S * NS_PER_S)))
+    window_ns = max(round(WINDOW_S * NS_PER_S), int(np.median(np.diff(t_ns))))
+    edges = np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, window_ns))
     begin, end = np.array(list(pairwise(np.unique(edges).tolist())), dtype=int).reshape(-1, 2).T
     unknown = np.concatenate([[0], np.cumsum(~camera.known)])
-    usable = (unknown[begin] == unknown[end]) & _has_truth(truth, t_ns[begin]) & _has_truth(truth, t_ns[end])
+    near = _has_truth(truth, t_ns, 2 * window_ns)
+    usable = (unknown[begin] == unknown[end]) & near[begin] & near[end]
     begin, end = begin[usable], end[usable]
     path = chained(moved_by(camera, sequence))
     true = [
@@ -99,10 +101,10 @@ def _windows(evidence: Evidence, truth: Truth) -> _Windows:
     return _Windows(both[..., :3, 3], so3_log(both[..., :3, :3]))
 
 
-def _has_truth(truth: Truth, t_ns: IntArray) -> BoolArray:
-    """Say of stamps (N,) whether they lie within the truth's and between two of them that are close."""
+def _has_truth(truth: Truth, t_ns: IntArray, apart_ns: int) -> BoolArray:
+    """Say of stamps (N,) whether they lie within the truth's and between two of them that are no farther apart."""
     after = np.clip(np.searchsorted(truth.t_ns, t_ns, side="left"), 1, truth.t_ns.size - 1)
-    close = truth.t_ns[after] - truth.t_ns[after - 1] <= WINDOW_S * NS_PER_S
+    close = truth.t_ns[after] - truth.t_ns[after - 1] <= apart_ns
     return np.asarray(close & (t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1]))
 
 

@@ -26,7 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
 from toolkit.datasets.io.fields import check_frame_count, observations
-from toolkit.datasets.io.image_pairs import facts_of, images_in, pairs_of_asl, rig_of
+from toolkit.datasets.io.image_pairs import facts_of, image_folder, images_in, pairs_of_asl, rig_of
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
 from toolkit.datasets.io.truth_at_frames import stamps_within, truth_at, truth_near
@@ -48,6 +48,7 @@ SIMULATED = "real IMU, stereo tracks simulated on the true trajectory"
 ALL_SIMULATED = "simulated IMU, stereo tracks simulated on the true trajectory"
 _STAMPS, _LEAN_IMU = "cam_timestamps_ns.txt", "imu.csv"
 _GYRO, _ACCEL = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("w_RS_S", "a_RS_S"))
+_KALIBR_IMU = tuple(f"{name}_{axis}" for name in ("alpha", "omega") for axis in "xyz")
 _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
 # With fewer of its images a recording is cut short or a sample: tracks from them would be of another recording.
 _NEARLY_ALL = 0.9
@@ -64,7 +65,11 @@ class _Layout:
 
     @property
     def imu(self) -> Path:
-        return self.root / _LEAN_IMU if self.mav0 is None else self.mav0 / "imu0" / "data.csv"
+        """The table of the IMU, which Kalibr's bag extractor puts beside the cameras."""
+        if self.mav0 is None:
+            return self.root / _LEAN_IMU
+        extracted = self.mav0 / "imu0.csv"
+        return extracted if is_regular(extracted) else self.mav0 / "imu0" / "data.csv"
 
     @property
     def stamps(self) -> Path:
@@ -168,7 +173,13 @@ def _whole(path: Path) -> _Layout:
 
 
 def _imu(layout: _Layout) -> ImuSamples:
-    table = read_table(layout.imu, _ACCEL + _GYRO)
+    if layout.mav0 is not None and not is_regular(layout.imu):
+        raise DataError(
+            f"{layout.mav0}: cameras without an IMU, imu0/data.csv or Kalibr's imu0.csv; name the folder with mav0, "
+            "or rectify images that have none and lay them out as KITTI's image_0, image_1 and calib.txt"
+        )
+    columns = _KALIBR_IMU if _KALIBR_IMU[0] in columns_of(layout.imu) else _ACCEL + _GYRO
+    table = read_table(layout.imu, columns)
     return ImuSamples(table.t_ns, table.values[:, :3], table.values[:, 3:])
 
 
@@ -205,7 +216,7 @@ def _filmed(
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:
     """Return which share of the camera's stamps have both images; 0 where nothing can be read."""
-    if not any(images_in(mav0 / camera / "data") for camera in ("cam0", "cam1")):
+    if not any(images_in(image_folder(mav0 / camera)) for camera in ("cam0", "cam1")):
         return 0.0
     try:
         count = np.unique(read_stamps(stamps)).size if is_regular(stamps) else 0

@@ -51,6 +51,13 @@ def images_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES) if folder.is_dir() else []
 
 
+def image_folder(camera: Path) -> Path:
+    """Return where a camera's images are: in ``data`` as ASL has it, in ``images`` (TUM-VI's dso), or in its folder."""
+    return next(
+        (folder for folder in (camera / "data", camera / "images", camera) if images_in(folder)), camera / "data"
+    )
+
+
 def pairs_of_asl(mav0: Path) -> Listed:
     """Pair the images of cam0 and cam1 by their stamps; files that are listed and missing stay in, to be named.
 
@@ -59,10 +66,10 @@ def pairs_of_asl(mav0: Path) -> Listed:
     left, right = (_files(mav0 / camera) for camera in ("cam0", "cam1"))
     remarks = []
     if not np.array_equal(np.sort(left.t_ns), left.t_ns):
-        remarks.append(f"the stamps of {left.folder.name}/data.csv were out of order and have been sorted")
+        remarks.append(f"the stamps of {left.camera}/data.csv were out of order and have been sorted")
     t_ns, first = np.unique(left.t_ns, return_index=True)
     if t_ns.size < left.t_ns.size:
-        remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.folder.name} had the stamp of another; left out")
+        remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.camera} had the stamp of another; left out")
     partner = _nearest(right.t_ns, t_ns)
     alone = int((partner < 0).sum())
     if alone:
@@ -151,23 +158,29 @@ def facts_of(tracks: ImageTracks, pairs: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Files:
-    """The stamps (N,) and names of one camera's images."""
+    """The stamps (N,) and names of the images of a camera, and the folder they are in."""
 
+    camera: str
     folder: Path
     t_ns: IntArray
     names: tuple[str, ...]
 
     def path(self, row: int) -> Path:
-        return self.folder / "data" / self.names[row]
+        return self.folder / self.names[row]
 
 
-def _files(folder: Path) -> _Files:
-    """Return what a camera's table lists, or the images there are, whose names are stamps."""
-    table = folder / "data.csv"
+def _files(camera: Path) -> _Files:
+    """Return what a camera's table lists, or the images there are, whose names are stamps.
+
+    An image that was converted is found by its stem: tables keep the old suffix.
+    """
+    table, folder = camera / "data.csv", image_folder(camera)
+    there = images_in(folder)
     if not is_regular(table):
-        found = [path for path in images_in(folder / "data") if path.stem.isdigit()]
-        t_ns = np.array([int(path.stem[:19]) for path in found], dtype=np.int64)
-        return _Files(folder, t_ns, tuple(path.name for path in found))
+        stamped = [(stamp, path.name) for path in there if (stamp := _stamp_ns(path.stem)) is not None]
+        return _Files(
+            camera.name, folder, np.array([t for t, _ in stamped], dtype=np.int64), tuple(n for _, n in stamped)
+        )
     lines = read_text_input(table, "copy it again").splitlines()
     headings = 0 if lines and lines[0][:1].isdigit() else 1
     t_ns = read_stamps(table, headings)
@@ -175,7 +188,18 @@ def _files(folder: Path) -> _Files:
     names = tuple(row.partition(",")[2].strip() for row in rows)
     if len(names) != t_ns.size or any("/" in name or "\\" in name for name in names):
         raise DataError(f"{table}: expected a stamp and the name of an image in each row; export it again")
-    return _Files(folder, t_ns, tuple(name or f"{t}.png" for name, t in zip(names, t_ns.tolist(), strict=True)))
+    named = (name or f"{t}.png" for name, t in zip(names, t_ns.tolist(), strict=True))
+    known, by_stem = {path.name for path in there}, {path.stem: path.name for path in there}
+    found = (name if name in known else by_stem.get(Path(name).stem, name) for name in named)
+    return _Files(camera.name, folder, t_ns, tuple(found))
+
+
+def _stamp_ns(stem: str) -> int | None:
+    """Return the stamp that a name without its suffix is, in nanoseconds or in seconds with a point; None otherwise."""
+    whole, point, fraction = stem.partition(".")
+    if not whole.isdecimal() or (point and not fraction.isdecimal()):
+        return None
+    return int(f"{whole}{fraction[:9]:0<9}") if point else int(whole[:19])
 
 
 def _nearest(t_ns: IntArray, asked_ns: IntArray) -> IntArray:

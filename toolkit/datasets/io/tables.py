@@ -107,4 +107,4 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
     try:
         return np.array([int(entry) for entry in entries], dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise DataError(f"{path}: a stamp is not in whole nanoseconds ({error}); export it again") from error
+        raise DataError(f"{path}: a stamp is not in whole nanoseconds ({error}); write seconds times 1e9") from error

@@ -1,5 +1,6 @@
 """What is told of a path that is of no format: an archive, a trajectory, a run directory, a folder of recordings."""
 
+import os
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -19,28 +20,54 @@ _ARCHIVES = {
 _TAR, _TAR_AT = b"ustar", 257
 # So many entries of a folder are looked at, and so many recordings among them named.
 _LOOKED_AT, _NAMED = 50, 3
+# Data sets come as dataset/sequences/00, and people name a camera's folder: so many levels below and above are tried.
+_BELOW, _ABOVE = 3, 4
 
 
 def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
     """Return what a path of no format is, and what to do; ``recognised`` says whether a path is a recording."""
-    if path.is_dir():
-        if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
-            return (
-                "is a run directory and no recording: vislam report shows it, and --config "
-                f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
-            )
-        inside = [entry.name for entry in islice(sorted(path.iterdir()), _LOOKED_AT) if recognised(entry)][:_NAMED]
-        if inside:
-            return f"is no recording, and holds some: name {printable(' or '.join(inside))} in it"
-    elif is_regular(path):
-        if path.stat().st_size == 0:
-            return "the file is empty and so of no known format"
-        archive = _archive(path)
-        if archive is not None:
-            return f"is packed ({archive}), unpack it and name what was in it: as it stands it is of no known format"
-        if _is_trajectory(path):
-            return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
+    told = _of_folder(path, recognised) if path.is_dir() else _of_file(path) if is_regular(path) else ""
+    if told:
+        return told
+    whole = next((above for above in islice(path.absolute().parents, _ABOVE) if recognised(above)), None)
+    if whole is not None:
+        return f"is a part of a recording: name the whole, {printable(str(whole))}; by itself it is of no known format"
     return "its content is of no known format"
+
+
+def _of_folder(path: Path, recognised: Callable[[Path], bool]) -> str:
+    """Return what a folder is, nothing where it cannot be told."""
+    if (path / "manifest.json").is_file() and (path / "metrics.json").is_file():
+        return (
+            "is a run directory and no recording: vislam report shows it, and --config "
+            f"{printable(str(path / 'manifest.json'))} runs it again; as a recording it is of no known format"
+        )
+    inside = [printable(str(entry.relative_to(path))) for entry in _recordings_in(path, recognised)]
+    return f"is no recording, and holds some: name {' or '.join(inside)} in it" if inside else ""
+
+
+def _of_file(path: Path) -> str:
+    """Return what a file is, nothing where it cannot be told."""
+    if path.stat().st_size == 0:
+        return "the file is empty and so of no known format"
+    archive = _archive(path)
+    if archive is not None:
+        return f"is packed ({archive}), unpack it and name what was in it: as it stands it is of no known format"
+    if _is_trajectory(path):
+        return "is a trajectory and no recording; name a recording and --trajectory NAME=FILE, or vislam evaluate"
+    return ""
+
+
+def _recordings_in(path: Path, recognised: Callable[[Path], bool]) -> list[Path]:
+    """Return a few recordings in a folder, or, where it has none, in the folders in it, and so on."""
+    level = [path]
+    for _ in range(_BELOW):
+        entries = [entry for folder in level for entry in islice(sorted(folder.iterdir()), _LOOKED_AT)][:_LOOKED_AT]
+        found = [entry for entry in entries if recognised(entry)][:_NAMED]
+        if found:
+            return found
+        level = [entry for entry in entries if entry.is_dir() and os.access(entry, os.R_OK | os.X_OK)]
+    return []
 
 
 def _archive(path: Path) -> str | None:
