@@ -175,8 +175,8 @@ def _whole(path: Path) -> _Layout:
 def _imu(layout: _Layout) -> ImuSamples:
     if layout.mav0 is not None and not is_regular(layout.imu):
         raise DataError(
-            f"{layout.mav0}: cameras without an IMU, imu0/data.csv or Kalibr's imu0.csv; name the folder with mav0, "
-            "or rectify images that have none and lay them out as KITTI's image_0, image_1 and calib.txt"
+            f"{layout.imu}: cannot be read, and there is no imu0.csv of Kalibr's: name the folder that has mav0, or "
+            "rectify images without an IMU and lay them out as KITTI's image_0, image_1 and calib.txt"
         )
     columns = _KALIBR_IMU if _KALIBR_IMU[0] in columns_of(layout.imu) else _ACCEL + _GYRO
     table = read_table(layout.imu, columns)

@@ -102,7 +102,7 @@ def read_calibration(root: Path, mav0: Path) -> Calibration:
 
 def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
     if (mav0 / "cam0").is_dir() and not (mav0 / "cam1").is_dir():
-        raise DataError(f"{mav0}: has cam0 and no cam1; stereo needs both, copy the other folder too")
+        raise DataError(f"{mav0 / 'cam1/sensor.yaml'}: cannot be read: there is cam0 and no cam1; stereo needs both")
     left, right, imu = (read_fields(mav0 / sensor / "sensor.yaml") for sensor in ("cam0", "cam1", "imu0"))
     left.require("T_BS.data", "intrinsics", "resolution")
     stated = _stated_noise(imu)
