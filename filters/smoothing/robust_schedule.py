@@ -16,7 +16,7 @@ from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import SCALE, L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
@@ -172,14 +172,16 @@ def _residuals(
     frames: list[StereoFrame], values: gtsam.Values, rig: StereoRig
 ) -> Iterator[tuple[StereoFrame, Array, Array]]:
     """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
-    ids = seen_ids(frames)
+    ids, sizes = seen_ids(frames), [len(frame.track_ids) for frame in frames]
     points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-    for k, frame in enumerate(frames):
-        seen = points[np.searchsorted(ids, frame.track_ids)]
-        predicted = stereo.predict(seen, values.atPose3(X(k)).matrix(), rig)
-        residuals_px = left_only.residuals_px(frame.uvs_px, predicted.uv_px)
-        covs_px2 = np.broadcast_to(left_only.noise_px2(frame.uvs_px, rig), (len(seen), 3, 3))
-        yield frame, mahalanobis_squared(residuals_px, covs_px2), predicted.depth_m
+    T_imu_world = se3_inverse(np.array([values.atPose3(X(k)).matrix() for k in range(len(frames))]))
+    uvs_px = np.concatenate([frame.uvs_px for frame in frames])
+    seen = points[np.searchsorted(ids, np.concatenate([frame.track_ids for frame in frames]))]
+    predicted_px, depth_m = stereo.images(transform(np.repeat(T_imu_world, sizes, axis=0), seen), rig)
+    covs_px2 = np.broadcast_to(left_only.noise_px2(uvs_px, rig), (len(seen), 3, 3))
+    distance = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted_px), covs_px2)
+    ends = np.cumsum(sizes)[:-1]
+    yield from zip(frames, np.split(distance, ends), np.split(depth_m, ends), strict=True)
 
 
 def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:

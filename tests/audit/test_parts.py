@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import slope
+from toolkit.audit.parts.robust import median, slope
 from toolkit.audit.parts.tracks import split
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models.camera_motion import camera_motion
@@ -68,3 +68,11 @@ def test_split_renames_from_the_start_on_and_keeps_every_other_track() -> None:
     assert renamed[(observations.track_id == 7) & (observations.frame < 2)].tolist() == [7, 7]
     assert renamed[(observations.track_id == 7) & (observations.frame >= 2)].tolist() == [10, 10]
     assert (renamed[observations.track_id == 9] == 9).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 8])
+def test_the_median_is_numpys_also_of_what_is_not_a_number(count: int) -> None:
+    values = np.random.default_rng(5).standard_normal((count, 3))
+    values[2 * count // 3 : 2 * count // 3 + count // 4, 1] = np.nan
+    expected = np.median(values, axis=0) if count else np.full(3, np.nan)
+    np.testing.assert_array_equal(median(values), expected)

@@ -83,10 +83,11 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     ("asked", "undecided", "audited_s"),
     [
         (Recording("drive", max_frames=7), {}, [30]),
-        (Recording("flight", max_frames=7), {}, [20]),
+        (Recording("flight", max_frames=7), {}, [40]),
         (Recording("drive", part=Part(30.0, 40.0)), {}, [40]),
         (Recording("drive"), {}, [60]),
         (Recording("drive", max_frames=7), {"lever-arm": "too little rotation"}, [30, 60]),
+        (Recording("drive"), {"lever-arm": "too little rotation"}, [60]),
         (Recording("drive-realistic", max_frames=7), {}, [60]),  # its tracks err otherwise than it states
     ],
 )

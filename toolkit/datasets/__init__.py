@@ -214,11 +214,15 @@ def is_drawn_from_a_seed(source: str, frontend: Frontend = DEFAULTS.frontend) ->
     Raises DataError where it is no source at all.
     """
     if source in built_ins():
-        make = built_ins()[source]
-        return make(0).content_hash() != make(1).content_hash()
+        return _differs_by_seed(built_ins()[source])
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
     return isinstance(reader, DrawnFromASeed) and not _of_images(reader, path, frontend)
+
+
+@cache
+def _differs_by_seed(make: Maker) -> bool:
+    return make(0).content_hash() != make(1).content_hash()
 
 
 def load_references(source: str) -> dict[str, Trajectory]:

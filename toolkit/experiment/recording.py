@@ -160,7 +160,7 @@ def _to_audit(sequence: Sequence, recording: Recording) -> Sequence:
         return sequence
     t_ns = sequence.frames_t_ns
     end_ns = max(_cut(sequence, recording).frames_t_ns[-1], t_ns[0] + round(scenario.audited_s * NS_PER_S))
-    return sequence.truncated(int((t_ns <= end_ns).sum()))
+    return sequence if end_ns >= t_ns[-1] else sequence.truncated(int((t_ns <= end_ns).sum()))
 
 
 def recording_card(recording: Recording, progress: Progress = SILENT) -> tuple[Sequence, Card]:

@@ -49,6 +49,9 @@ class SceneOf(Protocol):
     def __call__(self, duration_s: float, drawn: np.random.Generator | None = None) -> Scene:
         """Return the scene."""
 
+    def __hash__(self) -> int:
+        """Tell it from others, for what all seeds see of it is kept."""
+
 
 @dataclass(frozen=True)
 class _Streets:

@@ -4,6 +4,7 @@ Neither tells alone which of the two is wrong. What the mean of a stretch of tim
 means scatter by in the rest of the recording, which holds noise, slip and what else is usual there.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means, subdivided
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR
+from toolkit.audit.parts.robust import MAD_TO_SIGMA, MEDIAN_TO_MEAN_ERROR, median
 from toolkit.geometry import Array, BoolArray, IntArray, so3_exp
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.resampling import NS_PER_S
@@ -116,8 +117,9 @@ def _stretches(deviation: Deviation) -> _Stretches:
         enough &= gaps[np.maximum(end - 1, 0)] == gaps[begin]
     begin, end = begin[enough], end[enough]
     count = (end - begin)[:, None]
-    average = np.mean if deviation.telescopes else np.median
-    mean = np.array([average(value[i:j], axis=0) for i, j in zip(begin, end, strict=True)]).reshape(-1, 3)
+    of_stretches = (value[i:j] for i, j in zip(begin, end, strict=True))
+    average = partial(np.mean, axis=0) if deviation.telescopes else median
+    mean = np.array([average(of_one) for of_one in of_stretches]).reshape(-1, 3)
     noise = deviation.noise / (count if deviation.telescopes else np.sqrt(count))
     return _Stretches(0.5 * (t_s[begin] + t_s[end - 1]), mean, noise)
 
@@ -192,5 +194,5 @@ def _around(t_s: Array, value: Array) -> Array:
     first: IntArray = np.searchsorted(t_s, knots_s - GRAVITY_S)
     last: IntArray = np.searchsorted(t_s, knots_s + 1.0 + GRAVITY_S)
     even = _neighbours(value, round(0.5 * STRETCH_S / float(np.median(np.diff(t_s))))).mean(axis=-1)
-    medians = np.array([np.median(even[i:j], axis=0) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
+    medians = np.array([median(even[i:j]) for i, j in zip(first, last, strict=True)]).reshape(-1, 3)
     return medians[np.searchsorted(knots_s, np.floor(t_s))]

@@ -27,9 +27,23 @@ class Scalar(NamedTuple):
 
 def spread(residuals: Array) -> Array:
     """Return the standard deviation (d,) of residuals (M, d) about their median, from the median deviation."""
-    centred = np.abs(residuals - np.median(residuals, axis=0))
-    deviation: Array = MAD_TO_SIGMA * np.median(centred, axis=0)
+    centred = np.abs(residuals - median(residuals))
+    deviation: Array = MAD_TO_SIGMA * median(centred)
     return deviation
+
+
+def median(values: Array) -> Array:
+    """Return the median (...) of values (N, ...), NaN where one is NaN or N is 0: of a few, in a fifth of NumPy's time.
+
+    An audit takes some thousand of them.
+    """
+    if len(values) == 0:
+        return np.full(values.shape[1:], np.nan)
+    # The middle value stands for both where there is one. What is not a number comes last in the order.
+    lower, upper, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
+    ordered = np.partition(values, (lower, upper, last), axis=0)
+    middle: Array = np.where(np.isnan(ordered[last]), np.nan, 0.5 * (ordered[lower] + ordered[upper]))
+    return middle
 
 
 def median_error(residuals: Array) -> Array:
