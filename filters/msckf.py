@@ -12,4 +12,5 @@ RUNG, CHANGE = 60, "+ past poses, tracks used at once but kept at their end; usu
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates())))
+    window = SlidingWindowFilter(setup, AtLatestEstimates())
+    return Thinned(setup, OnlineOutput(window, window.log))

@@ -12,4 +12,5 @@ RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates())))
+    window = SlidingWindowFilter(setup, AtFirstEstimates())
+    return Thinned(setup, OnlineOutput(window, window.log))

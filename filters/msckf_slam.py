@@ -13,4 +13,5 @@ DEFAULT = True
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks)))
+    window = SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks)
+    return Thinned(setup, OnlineOutput(window, window.log))

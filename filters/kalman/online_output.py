@@ -1,5 +1,6 @@
 """Makes an estimator of a filter, whose final answer is its online output: the estimates it gave frame by frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,10 +20,10 @@ class Filter(Protocol):
 
 
 class OnlineOutput:
-    """Keeps the estimates of a filter."""
+    """Keeps the estimates of a filter; ``log`` is asked at the end for what a user should know of the run."""
 
-    def __init__(self, filter_: Filter) -> None:
-        self._filter = filter_
+    def __init__(self, filter_: Filter, log: Callable[[], tuple[str, ...]] = tuple) -> None:
+        self._filter, self._log = filter_, log
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
@@ -32,7 +33,7 @@ class OnlineOutput:
 
     def finish(self) -> Finished:
         """Return the estimates of every frame and the landmarks as last known."""
-        return Finished(Trajectory.of(self._estimates), self._filter.landmarks())
+        return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._log())
 
 
 @dataclass

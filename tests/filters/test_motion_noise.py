@@ -1,0 +1,95 @@
+"""Windowed filters find that an IMU has more noise than it states, where it has, and change nothing where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman.motion_noise import CorrectionTest, MatchedNoise, correction_test
+from toolkit.metrics import score_run
+from toolkit.models.motion import motion_model
+from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
+
+FRAMES = 20
+SHAKEN = 4.0
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Return eight seconds of a drive whose noise is as stated."""
+    return simulate(replace(DRIVE_IMU, duration_s=8.0), 3)
+
+
+@pytest.fixture(scope="module")
+def shaken(sound):
+    """Return the same with four times the noise that its IMU states, drawn on top."""
+    motion, noise, rng = sound.motion, sound.noise, np.random.default_rng(0)
+    per_sample = SHAKEN / np.sqrt(np.median(np.diff(motion.t_ns)) / 1e9)
+    accel = motion.accel_mps2 + rng.normal(0.0, per_sample * noise.accel_noise_density, motion.accel_mps2.shape)
+    gyro = motion.gyro_radps + rng.normal(0.0, per_sample * noise.gyro_noise_density, motion.gyro_radps.shape)
+    return replace(sound, motion=replace(motion, accel_mps2=accel, gyro_radps=gyro))
+
+
+def test_a_consistent_correction_has_a_chi_square_length(sound):
+    model, rng = motion_model(sound.noise, sound.gravity_world), np.random.default_rng(5)
+    before = model.initial_belief(sound.prior)
+    d, m, count = len(before.cov), 6, 400
+    H = rng.normal(size=(m, d)) / np.sqrt(np.diag(before.cov))
+    S = H @ before.cov @ H.T + np.eye(m)
+    gain = np.linalg.solve(S, H @ before.cov).T
+    root, found = np.linalg.cholesky(S), []
+    for _ in range(count):
+        after = before.moved(gain @ root @ rng.normal(size=m), before.cov - gain @ S @ gain.T)
+        found.append(correction_test(before, after))
+    assert {test.dof for test in found} == {m}
+    # The mean of so many chi-square variables is within four of its standard errors.
+    assert abs(np.mean([test.nis for test in found]) - m) < 4.0 * np.sqrt(2.0 * m / count)
+
+
+def test_what_nothing_corrected_is_not_tested(sound):
+    belief = motion_model(sound.noise, sound.gravity_world).initial_belief(sound.prior)
+    assert correction_test(belief, belief) == CorrectionTest(0.0, 0)
+
+
+def test_the_noise_is_never_taken_for_less_than_stated():
+    noise = MatchedNoise()
+    for nis in [*[90.0] * 3, *[0.0] * 200]:
+        noise.learn(CorrectionTest(nis, 15), FRAMES)
+    assert noise.scale == 1.0
+
+
+def test_one_correction_within_chance_moves_nothing_and_many_alike_do():
+    noise = MatchedNoise()
+    noise.learn(CorrectionTest(40.0, 15), FRAMES)  # by chance once in two thousand
+    assert noise.scale == 1.0
+    for _ in range(FRAMES):
+        noise.learn(CorrectionTest(40.0, 15), FRAMES)
+    assert noise.scale > 2.0
+
+
+def test_the_scale_settles_where_corrections_are_as_large_as_expected():
+    noise = MatchedNoise()
+    for _ in range(300):
+        noise.learn(CorrectionTest(15.0 * 16.0 / noise.scale, 15), FRAMES)
+    assert noise.scale == pytest.approx(16.0, rel=1e-3)  # 300 steps of a twentieth of the way
+
+
+@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam"])
+def test_a_sound_imu_is_believed(name, sound, run_estimator):
+    assert run_estimator(name, sound).log == ()
+
+
+def test_an_imu_that_is_shaken_is_found_and_does_less_harm(shaken, run_estimator, monkeypatch):
+    run = run_estimator("msckf-slam", shaken)
+    assert "the tracks contradict the IMU by more than chance allows" in run.log[0]
+    found = score_run(run, "causal", shaken).values
+    monkeypatch.setattr(MatchedNoise, "learn", lambda *_: None)
+    believed = score_run(run_estimator("msckf-slam", shaken), "causal", shaken).values
+    for metric in ("nees_pose_mean", "ate_se3_m", "heldout_reproj_median_px"):
+        assert found[metric] < believed[metric]
+
+
+def test_a_twist_is_believed_whatever_tracks_say(run_estimator):
+    drive = simulate(replace(DRIVE, duration_s=6.0), 3)
+    doubtful = replace(drive, noise=drive.noise.scaled(1.0 / SHAKEN))
+    assert run_estimator("msckf-slam", doubtful).log == ()
