@@ -138,6 +138,15 @@ def test_se3_right_jacobian_equals_the_exponential_of_ad(angle: float) -> None:
         np.testing.assert_allclose(geometry.se3_right_jacobian(xi), expm(augmented)[:6, 6:], atol=2e-13)
 
 
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_exponential_and_its_jacobian_together_are_those_of_each_alone(angle: float) -> None:
+    xi = np.array(list(twists(angle)))
+    T, J_r = geometry.se3_exp_and_right_jacobian(xi)
+    np.testing.assert_array_equal(T, geometry.se3_exp(xi))
+    # The same products of matrices, of which two have both signs turned.
+    np.testing.assert_allclose(J_r, geometry.se3_right_jacobian(xi), rtol=1e-14, atol=ROUNDING)
+
+
 def test_coefficients_agree_on_both_sides_of_the_series_switch() -> None:
     below, above = 0.5 - 1e-9, 0.5 + 1e-9
     for xi in twists(1.0):

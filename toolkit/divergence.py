@@ -15,7 +15,8 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.models.motion import MotionModel, motion_model
+from toolkit.measured_motion import Motion
+from toolkit.models.motion import MotionModel, integrated, motion_model
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import Sequence
 from toolkit.track_noise import TrackNoise
@@ -97,17 +98,25 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
 
 def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
     model = motion_model(sequence.noise, sequence.gravity_world)
+    intervals = list(_intervals(trajectory, sequence))
+    motions = [motion for *_, motion in intervals]
+    beliefs = [_belief_at(trajectory, start, model) for start, *_ in intervals]
+    increments = integrated(model, motions, [belief.bias for belief in beliefs])
+    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
+        prediction = increment.predict(belief)
+        noise = prediction.noise[POSE, POSE]
+        if model.layout.velocity is not None:
+            noise = noise + np.diag(_slack(trajectory, float(motion.dt_s.sum())))
+        yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
+
+
+def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
+    """Yield the motions between neighbouring frames of which the trajectory has both, with the rows of these."""
     row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
     for before, packet in pairwise(sequence.packets()):
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
-        if start is None or end is None or packet.motion is None:
-            continue
-        belief = _belief_at(trajectory, start, model)
-        prediction = model.integrate(packet.motion, belief.bias).predict(belief)
-        noise = prediction.noise[POSE, POSE]
-        if model.layout.velocity is not None:
-            noise = noise + np.diag(_slack(trajectory, float(packet.motion.dt_s.sum())))
-        yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
+        if start is not None and end is not None and packet.motion is not None:
+            yield start, end, packet.motion
 
 
 def _belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:

@@ -57,6 +57,8 @@ def correct_pose(
 def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> stereo.StereoPrediction:
     """Return sightings (N, 3) px less what is predicted of them, with Jacobians, zero where uR is missing."""
     predicted = stereo.predict(landmarks.points, T_world_imu, rig)
+    if not left_only.any_missing(uvs_px):
+        return predicted._replace(uv_px=uvs_px - predicted.uv_px)
     return stereo.StereoPrediction(
         left_only.residuals_px(uvs_px, predicted.uv_px),
         left_only.seen_rows(uvs_px, predicted.d_uv_d_pose),

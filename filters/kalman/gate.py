@@ -43,12 +43,16 @@ class FrameGate:
         """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
         table = self._table(dof)
         accepted = np.asarray((nis < table.bound[dof]) & in_front)
+        count = int(np.count_nonzero(accepted))
         self.nis += float(nis[accepted].sum())
-        self.dof += int(np.broadcast_to(dof, nis.shape)[accepted].sum())
-        expected = table.expected[dof]
-        self.nis_expected += float(np.broadcast_to(expected, nis.shape)[accepted].sum())
+        if isinstance(dof, int):
+            self.dof += dof * count
+            self.nis_expected += float(table.expected[dof]) * count
+        else:
+            self.dof += int(dof[accepted].sum())
+            self.nis_expected += float(table.expected[dof][accepted].sum())
         self.tested += accepted.size
-        self.accepted += int(accepted.sum())
+        self.accepted += count
         return accepted
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:

@@ -17,6 +17,11 @@ _U_RIGHT = 1
 _SEEN = np.ix_([0, 2], [0, 2])
 
 
+def any_missing(uvs_px: Array) -> bool:
+    """Say whether any of the sightings (..., 3) px lacks the right image."""
+    return bool(is_left_only(uvs_px).any())
+
+
 def degrees_of_freedom(uvs_px: Array) -> int | IntArray:
     """Return how many coordinates sightings (..., 3) px have: 3 of all, or 2 or 3 of each (...)."""
     missing = is_left_only(uvs_px)

@@ -6,7 +6,7 @@ increment (mean, F, Q), a smoother makes its factors of the same one. There is o
 :mod:`toolkit.models.smooth_twist`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import gtsam
@@ -86,6 +86,13 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
     if isinstance(noise, TwistChangeNoise):
         return SmoothTwist(noise)
     return ImuModel(noise, gravity_world)
+
+
+def integrated(model: MotionModel, motions: Sequence[Motion], biases: Sequence[Array]) -> Sequence[Increment]:
+    """Return the motions between frames, each integrated about its own bias (6,): twists all at once."""
+    if isinstance(model, TwistModel) and motions:
+        return model.integrate_each(motions, biases)
+    return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
 
 
 def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Array) -> Array:

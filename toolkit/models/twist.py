@@ -4,7 +4,7 @@ The pose moves by T <- T exp(dt [w - b, v]); everything is in GTSAM's order [rot
 on the right. The state is pose and gyro bias; the velocity is measured, not estimated.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from toolkit.estimate import Estimate
-from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_right_jacobian
+from toolkit.geometry import Array, se3_adjoint, se3_exp_and_right_jacobian, se3_inverse
 from toolkit.measured_motion import Motion, TwistMotion, TwistNoise
 from toolkit.models.factors import B, X, joint_prior, kind_of
 from toolkit.models.state import POSE, Belief, Layout, Prediction
@@ -37,21 +37,58 @@ class TwistStep(NamedTuple):
 
 def integrate(motion: TwistMotion, gyro_bias: Array, noise: TwistNoise) -> TwistStep:
     """Integrate the twists of one interval with a gyro bias (3,) rad/s taken off."""
-    density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
-    if motion.noise_scale is not None:
-        density_squared = density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1)
-    dt_s = motion.dt_s[:, None]
-    xi = dt_s * np.concatenate([motion.w_radps - gyro_bias, motion.v_mps], axis=1)
-    pieces, d_end_d_xi = se3_exp(xi), se3_right_jacobian(xi)
+    pieces = _pieces(motion.dt_s, motion.w_radps - gyro_bias, motion.v_mps, _density_squared(motion, noise))
+    return _joined(pieces, float(motion.dt_s.sum()))
+
+
+def integrate_each(motions: Sequence[TwistMotion], gyro_biases: Array, noise: TwistNoise) -> list[TwistStep]:
+    """Integrate the twists of N intervals, each with its own gyro bias (N, 3) rad/s taken off."""
+    pieces = _pieces(
+        np.concatenate([motion.dt_s for motion in motions]),
+        np.concatenate([motion.w_radps - bias for motion, bias in zip(motions, gyro_biases, strict=True)]),
+        np.concatenate([motion.v_mps for motion in motions]),
+        np.concatenate([np.broadcast_to(_density_squared(m, noise), (*m.v_mps.shape[:1], 6)) for m in motions]),
+    )
+    ends = np.cumsum([motion.dt_s.size for motion in motions]).tolist()
+    return [
+        _joined(_Pieces(*(part[start:end] for part in pieces)), float(motion.dt_s.sum()))
+        for motion, start, end in zip(motions, [0, *ends[:-1]], ends, strict=True)
+    ]
+
+
+class _Pieces(NamedTuple):
+    """What each twist makes of a step: motions (n, 4, 4), derivatives (n, 6, 3) and covariances (n, 6, 6)."""
+
+    motions: Array
+    biases: Array
+    covs: Array
+
+
+def _pieces(dt_s: Array, w_radps: Array, v_mps: Array, density_squared: Array) -> _Pieces:
+    """Integrate n twists, each by itself, with squared noise densities (n, 6) or (6,) of turn rate and velocity."""
+    dt_s = dt_s[:, None]
+    motions, d_end_d_xi = se3_exp_and_right_jacobian(dt_s * np.concatenate([w_radps, v_mps], axis=1))
     covs = (d_end_d_xi * (dt_s * density_squared)[:, None]) @ np.swapaxes(d_end_d_xi, 1, 2)
-    biases = -dt_s[..., None] * d_end_d_xi[:, :, :3]
-    T_start_end, d_step_d_bias, cov = pieces[0], biases[0], covs[0]
-    for piece, own_bias, own_cov in zip(pieces[1:], biases[1:], covs[1:], strict=True):
+    return _Pieces(motions, -dt_s[..., None] * d_end_d_xi[:, :, :3], covs)
+
+
+def _density_squared(motion: TwistMotion, noise: TwistNoise) -> Array:
+    """Return the squared noise densities of turn rate and velocity: of each twist (n, 6), or of all (6,)."""
+    density_squared = np.concatenate([noise.gyro_noise_density**2, noise.velocity_noise_density**2])
+    if motion.noise_scale is None:
+        return density_squared
+    return np.asarray(density_squared * np.repeat(motion.noise_scale[:, ::-1] ** 2, 3, axis=1))
+
+
+def _joined(pieces: _Pieces, dt_s: float) -> TwistStep:
+    """Return the step of consecutive pieces."""
+    T_start_end, d_step_d_bias, cov = (part[0] for part in pieces)
+    for piece, own_bias, own_cov in zip(*(part[1:] for part in pieces), strict=True):
         carry = se3_adjoint(se3_inverse(piece))
         T_start_end = T_start_end @ piece
         d_step_d_bias = carry @ d_step_d_bias + own_bias
         cov = carry @ cov @ carry.T + own_cov
-    return TwistStep(T_start_end, d_step_d_bias, cov, float(motion.dt_s.sum()))
+    return TwistStep(T_start_end, d_step_d_bias, cov, dt_s)
 
 
 def bias_walk_cov(noise: TwistNoise, dt_s: float) -> Array:
@@ -142,6 +179,12 @@ class TwistModel:
         """Integrate the twists between two frames about a bias (6,), of which the gyro's counts."""
         assert isinstance(motion, TwistMotion)
         return TwistIncrement(integrate(motion, bias[3:], self._noise), bias[3:], self._noise)
+
+    def integrate_each(self, motions: Sequence[Motion], biases: Sequence[Array]) -> list[TwistIncrement]:
+        """Integrate the twists of some intervals, each about its own bias (6,), in one go."""
+        twists = [motion for motion in motions if isinstance(motion, TwistMotion)]
+        steps = integrate_each(twists, np.array(biases)[:, 3:], self._noise)
+        return [TwistIncrement(step, bias[3:], self._noise) for step, bias in zip(steps, biases, strict=True)]
 
     def keys(self, k: int) -> list[int]:
         """Return the keys of pose and gyro bias (3,)."""

@@ -66,8 +66,17 @@ def transpose(A: Array, n: int) -> None:
 
 
 @compiled
-def inverses(T: Array, result: Array) -> None:
-    """Put the inverses of rigid motions (W, 4, 4) in the first three rows of ``result``."""
+def clear(A: Array, rows: int) -> None:
+    """Make the first rows of A zero."""
+    for i in range(rows):
+        for j in range(A.shape[1]):
+            A[i, j] = 0.0
+
+
+@compiled
+def inverses(T: Array) -> Array:
+    """Return the inverses of rigid motions (W, 4, 4) in the first three rows of as many matrices."""
+    result = np.empty(T.shape)
     for k in range(T.shape[0]):
         for i in range(3):
             shift = 0.0
@@ -75,17 +84,20 @@ def inverses(T: Array, result: Array) -> None:
                 result[k, i, j] = T[k, j, i]
                 shift -= T[k, j, i] * T[k, j, 3]
             result[k, i, 3] = shift
+    return result
 
 
 @compiled
-def products(T: Array, A: Array, result: Array) -> None:
-    """Put the products of rigid motions (W, 4, 4) with one (1, 4, 4) in the first three rows of ``result``."""
+def products(T: Array, A: Array) -> Array:
+    """Return the products of rigid motions (W, 4, 4) with one (1, 4, 4) in the first three rows of as many matrices."""
+    result = np.empty(T.shape)
     for k in range(T.shape[0]):
         for i in range(3):
             for c in range(4):
                 result[k, i, c] = T[k, i, 3] if c == 3 else 0.0
                 for d in range(3):
                     result[k, i, c] += T[k, i, d] * A[0, d, c]
+    return result
 
 
 @compiled

@@ -8,12 +8,16 @@ import gc
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from numba import njit, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Flags, compile_extra
 from numba.core.registry import CPUDispatcher
+from numba.core.typing.context import Context
 
 Arrays = tuple[Any, ...]
 ROW, MATRIX, STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
@@ -29,8 +33,74 @@ CAMERA = types.Tuple((ROW, STACK, MATRIX, MATRIX, MATRIX))
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}
 
 
+class _Unfinished(JITCodeLibrary):
+    """The code of a part as numba writes it: optimised and made machine code within the kernels that call it alone.
+
+    Otherwise both are done for every part by itself, too, and again within every part that calls it.
+    """
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Leave the functions as they are, but for the layout of their data."""
+        ll_module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        """Leave the code as it is."""
+
+    def _finalize_final_module(self) -> None:
+        """Make no machine code."""
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _Remembering(Context):
+    """numba's rules of types, which are asked once what comes of a call with arguments of some types.
+
+    They would try a dozen of them, for arrays, tuples and texts, at each product of two numbers.
+    """
+
+    def __init__(self, rules: Context) -> None:
+        self.__dict__ = {**rules.__dict__, "_signatures": {}}
+
+    def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
+        """Return the signature of a call."""
+        if kws or not all(isinstance(arg, types.Type) for arg in args):
+            return super().resolve_function_type(func, args, kws)
+        key = (func, tuple(args))
+        if key not in self._signatures:
+            self._signatures[key] = super().resolve_function_type(func, args, kws)
+        return self._signatures[key]
+
+
+@cache
+def _remembering(rules: Context) -> Context:
+    return _Remembering(rules)
+
+
 class _Part(CPUDispatcher):
-    """What kernels call: compiled once for all numbers, where numba would compile it again for each constant."""
+    """What kernels call: compiled as far as they need it, once for all numbers; numba would again for each constant."""
+
+    _compiler: Any
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=options)
+        self._compiler._compile_core = self._compile_for_callers
+
+    def _compile_for_callers(self, args: Any, return_type: Any) -> Any:
+        """Return what numba makes of the function for some types of its arguments."""
+        flags = Flags()
+        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags.no_compile = True
+        rules, target = _remembering(self.typingctx), self.targetctx
+        library = _Unfinished(target.codegen(), self.py_func.__qualname__)
+        result = compile_extra(rules, target, self.py_func, args, return_type, flags, {}, library)
+        # By which callers find it: numba takes the function that Python would call, and there is none.
+        name = object()
+        target.insert_user_function(name, result.fndesc, [library])
+        return result._replace(entry_point=name)
+
+    def add_overload(self, cres: Any) -> None:
+        """Remember what was compiled for some types."""
+        self.overloads[tuple(cres.signature.args)] = cres
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return what a call with arguments of some types is resolved to."""
@@ -39,7 +109,7 @@ class _Part(CPUDispatcher):
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Return a function that kernels may call, compiled together with the first of them that is."""
-    return _Part(function, targetoptions={"nopython": True, "no_cpython_wrapper": True, **_OPTIONS})
+    return _Part(function, {"nopython": True, "no_cpython_wrapper": True, **_OPTIONS})
 
 
 class _KeptFor(FunctionCache):

@@ -117,11 +117,10 @@ def triangulate(
     tracks stop together, as soon as no step of any has lessened its error by the relative decrease.
     """
     uvs_px, seen = sightings
-    count, window = seen.shape
-    T_world_cam, T_cam_world = np.zeros((window, 4, 4)), np.zeros((window, 4, 4))
-    products(poses, T_imu_cam, T_world_cam)
-    inverses(T_world_cam, T_cam_world)
-    reliable = np.zeros(count, dtype=np.bool_)
+    count = seen.shape[0]
+    T_world_cam = products(poses, T_imu_cam)
+    T_cam_world = inverses(T_world_cam)
+    reliable = np.empty(count, dtype=np.bool_)
     N, costs, depths, dampings = np.empty((count + 1, 10)), np.empty(count), np.empty(count), np.empty(count)
     for f in range(count):
         points[f, 0] = rules[LEAST_DISPARITY]
@@ -315,10 +314,7 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
     points, nis = np.empty((count + 1, 3)), np.empty(count)
     worst, ends = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     reliable = triangulate((uvs_px, seen), poses, T_imu_cam, (intrinsics, whitener), rules, points)
-    inverses_now, inverses_at, T_cam_imu = np.empty_like(poses), np.empty_like(poses), np.empty_like(T_imu_cam)
-    inverses(poses, inverses_now)
-    inverses(poses_at, inverses_at)
-    inverses(T_imu_cam, T_cam_imu)
+    inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
     window_of_all = (poses, inverses_now, poses_at, inverses_at, P)
     eye = (intrinsics, T_cam_imu, channels if correlated else whitener, variances)
     most, rows = 3 * longest, 0

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import types
 
-from filters.kalman.kernels.algebra import inverses, solved_3
+from filters.kalman.kernels.algebra import clear, inverses, solved_3
 from filters.kalman.kernels.compiling import (
     CAMERA,
     COUNTS,
@@ -176,12 +176,9 @@ def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array)
     poses, poses_at, P = window
     intrinsics, T_imu_cam, whitener, variances, channels = camera
     (count, longest), correlated = counted.shape, variances.shape[0] > 0
-    inverses_now, inverses_at, T_cam_imu = np.empty_like(poses), np.empty_like(poses), np.empty_like(T_imu_cam)
-    inverses(poses, inverses_now)
-    inverses(poses_at, inverses_at)
-    inverses(T_imu_cam, T_cam_imu)
+    inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
     views, eye = (inverses_now, poses_at, inverses_at), (intrinsics, T_cam_imu, channels if correlated else whitener)
-    newest, in_front, stepped = np.zeros(count), np.zeros(count, dtype=np.bool_), points.copy()
+    newest, in_front, stepped = np.zeros(count), np.empty(count, dtype=np.bool_), points.copy()
     told, most = (np.zeros((6 * longest, 6 * longest)), np.zeros(6 * longest)), 3 * longest
     H_pose, A, J = np.empty((most, 6)), np.empty((most, 4)), np.empty((most, 2 * most))
     roots, H, B = np.empty((most, longest)), np.empty((3, 2 * most)), np.empty((3, 2 * most))
@@ -199,7 +196,8 @@ def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array)
             for k in range(m - 1):
                 if weights[f, where[k]] < 1.0:
                     scale(rows, 3 * k, 3 * k + 3, math.sqrt(weights[f, where[k]]))
-            N[0], B[:] = 0.0, 0.0
+            clear(N, 1)
+            clear(B, 3)
             add_normals(rows, 0, n - 3, N, B)
             given_others(rows, n, N, B, H, S)
             add_carried(where, H, P, T, S)
