@@ -59,6 +59,13 @@ class ChainedWindow:
         """Return the keys of the poses and landmarks of all sightings."""
         return self._rows.keys()
 
+    def counted_keys(self, values: gtsam.Values) -> set[int]:
+        """Return the keys of the poses and landmarks of the sightings that count at some values."""
+        if not self._rows.pose.size:
+            return set()
+        sightings = ChainedFactors.of(self._rows, self._rig, self._huber).in_front(values).sightings
+        return set(self._rows.select(sightings.counted).keys())
+
     def factors(self, values: gtsam.Values, jacobians_at: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return what is new in each sighting, linear about the values; their slots are to be told."""
         if not self._rows.pose.size:

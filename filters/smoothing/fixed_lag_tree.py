@@ -59,6 +59,8 @@ class FixedLagTree:
         # The variables of the newest state with their sizes; where the factors are that tie the last variable to them.
         self._newest: dict[int, int] = {}
         self._tie_slots: list[int] = []
+        # The landmarks that did not come into the latest tree, none of their sightings counting any more.
+        self._behind = set[int]()
 
     def add(self, extension: GraphExtension, t_ns: int) -> Recovery:
         """Take in what a packet at a time adds, and solve; return what had to be recovered.
@@ -132,7 +134,9 @@ class FixedLagTree:
                     remedy = "and is held weakly where it was"
                 log.append(f"{gtsam.Symbol(key).string()} was indeterminate {remedy}")
             else:
-                return Recovery(log, dropped)
+                behind, self._behind = self._behind, set()
+                log += [f"l{i} was behind every camera that saw it and was dropped" for i in sorted(behind)]
+                return Recovery(log, dropped | behind)
         raise EstimatorError(f"the window stays indeterminate after {MOST_RECOVERIES} recoveries: {log[-1]}")
 
     def _undetermined(self, but: int) -> list[int]:
@@ -197,12 +201,16 @@ class FixedLagTree:
     def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return the factors of chained sightings about the latest estimates, or where there are none the new."""
         keys = self._chained.keys()
-        known = [key for key in keys if self._values.exists(key) and key not in self._left]
-        estimates = _joined(self._values.extract(known), new, keys)
+        estimates = self._latest(new, keys)
         held = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
         in_tree = [key for key in held if self._isam.valueExists(key)]
         at = _joined(self._isam.getLinearizationPoint().extract(in_tree), new, held)
         return self._chained.factors(estimates, _joined(at, estimates, keys))
+
+    def _latest(self, new: gtsam.Values, keys: Collection[int]) -> gtsam.Values:
+        """Return the latest estimates of keys, or where there are none the new."""
+        known = [key for key in keys if self._values.exists(key) and key not in self._left]
+        return _joined(self._values.extract(known), new, keys)
 
     def _forget(self, leaving: Iterable[int]) -> None:
         for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns):
@@ -214,6 +222,7 @@ class FixedLagTree:
         """Begin a new tree; return all that was in the old one, to be taken in.
 
         A landmark that was dropped with all its factors stays behind: in a tree it would be a variable without a place.
+        So is one that the last step took behind every camera that saw it: none of its sightings counts.
         GTSAM's marginal factors have no linearisation point: they stay right only while their variables stay linearised
         where they are. The tree that made them holds those fixed; the next one must be given them.
         """
@@ -224,8 +233,12 @@ class FixedLagTree:
         factors, self._tie_slots = _without_ties(without_gaps(others)), []
         self._fixed.update(self._isam.getFixedVariables())
         self._isam = self._empty_tree()
-        known = {*factors.keyVector(), *self._chained.keys()}
+        seen = self._chained.keys()
+        known = {*factors.keyVector(), *self._chained.counted_keys(self._latest(values, seen))}
         lost = [key for key in values.keys() if key not in known]  # noqa: SIM118 - not a mapping
+        behind = {gtsam.Symbol(key).index() for key in seen if key in lost}
+        self._chained.drop(behind)
+        self._behind |= behind
         for key in lost:
             values.erase(key)
         self._forget(lost)

@@ -13,7 +13,7 @@ from filters.smoothing.alignment import aligned
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_exp, se3_inverse, se3_log, transform
 from toolkit.models import stereo
-from toolkit.models.factors import L, kind_of
+from toolkit.models.factors import L, X, kind_of
 from toolkit.models.motion import motion_model
 from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES, Settings
@@ -172,3 +172,22 @@ def test_a_state_begins_where_its_sightings_put_it_though_the_motion_is_off_and_
 def belief_at(pose):
     belief = motion_model(DRIVE.motion.noise, DRIVE.gravity_world).initial_belief(simulate(SHORT_DRIVE, 0).prior)
     return replace(belief, T_world_imu=pose)
+
+
+def test_a_landmark_behind_every_camera_that_saw_it_does_not_come_into_a_tree_built_anew(oracle):
+    """None of its sightings counts there; GTSAM has no place for a variable without a factor, and said ``map::at``."""
+    sequence = oracle.with_track_errors(SHORT_DRIVE, NOISE, 3)
+    estimator, packets = FixedLag(setup_of(sequence), 100.0), list(sequence.packets())
+    for packet in packets[:6]:
+        estimator.step(packet)
+    lost = int(packets[5].frame.track_ids[0])
+    values = estimator._tree.values()
+    values.update(L(lost), values.atPose3(X(0)).matrix()[:3] @ np.array([-1e4, 0.0, 0.0, 1.0]))
+    recovery = estimator._tree.rebuild()
+    assert recovery.dropped == {lost}
+    assert recovery.log == [f"l{lost} was behind every camera that saw it and was dropped"]
+    assert not estimator._tree.values().exists(L(lost))
+    estimator._note(packets[5], recovery)
+    for packet in packets[6:9]:
+        estimator.step(packet)
+    assert estimator._tree.values().exists(L(lost)) == (lost in packets[8].frame.track_ids)
