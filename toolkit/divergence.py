@@ -15,8 +15,8 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.models.motion import MotionModel, motion_model
-from toolkit.models.state import POSE, Belief
+from toolkit.models.motion import belief_at, motion_model
+from toolkit.models.state import POSE
 from toolkit.sequence import Sequence
 from toolkit.track_noise import TrackNoise
 
@@ -102,20 +102,12 @@ def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
         if start is None or end is None or packet.motion is None:
             continue
-        belief = _belief_at(trajectory, start, model)
+        belief = belief_at(trajectory, start, model)
         prediction = model.integrate(packet.motion, belief.bias).predict(belief)
         noise = prediction.noise[POSE, POSE]
         if model.layout.velocity is not None:
             noise = noise + np.diag(_slack(trajectory, float(packet.motion.dt_s.sum())))
         yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
-
-
-def _belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
-    """Return a state of the trajectory as a belief; velocity and biases it lacks are zero, and so is its covariance."""
-    d = model.layout.size
-    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
-    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
 
 
 def _slack(trajectory: Trajectory, dt_s: float) -> Array:
