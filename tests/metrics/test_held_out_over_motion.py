@@ -11,7 +11,7 @@ from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
 from toolkit.measured_motion import TwistSamples
 from toolkit.metrics import Evaluation, held_out_over_motion
 from toolkit.metrics._shared.scores import Unavailable
-from toolkit.metrics.held_out_over_motion import ERROR, RATIO, is_worse
+from toolkit.metrics.held_out_over_motion import ERROR, RATIO
 from toolkit.sequence import Sequence
 
 PERIOD_S = 0.1
@@ -70,9 +70,3 @@ def test_no_ratio_is_made_up_where_there_is_nothing_to_compare_with(recording, m
     imu = make_sequence(drive(60), motion="imu")
     with pytest.raises(Unavailable, match="no velocity"):
         scored(imu, make_run(imu.frames_t_ns, imu.truth.T_world_imu))
-
-
-def test_one_is_worse_than_another_beyond_a_factor_of_three_and_the_errors_of_both() -> None:
-    assert is_worse((0.9, 0.03), (0.2, 0.03))
-    assert not is_worse((0.5, 0.03), (0.2, 0.03))
-    assert not is_worse((0.9, 0.2), (0.2, 0.2))

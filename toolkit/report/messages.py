@@ -10,7 +10,7 @@ from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
-from toolkit.metrics.held_out_over_motion import ERROR, RATIO, is_worse
+from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
@@ -236,9 +236,7 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
 
 
 def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each row that explains withheld tracks worse than the motion alone, or than another row."""
-    known = {row: pair for row in comparison.lines if (pair := _over_motion(row)) is not None}
-    best = min(known, key=lambda row: known[row][0], default=None)
+    """Yield a line for each row that explains withheld tracks worse than the measured motion alone."""
     for row in comparison.lines:
         harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
         if harmed and comparison.over_seeds:
@@ -246,15 +244,6 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
             yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {under}"
         elif harmed:
             yield f"{_of(row)} {harmed[0][1]}"
-        elif best is not None and row in known and is_worse(known[row], known[best]):
-            times = known[row][0] / known[best][0]
-            yield f"{_of(row)} explains withheld tracks worse than {_of(best)}: it misses them {times:.1f} times as far"
-
-
-def _over_motion(row: Row) -> tuple[float, float] | None:
-    """Return a row's held-out error over that of the motion and its error; None over seeds or for the motion itself."""
-    ratio, error = row.scores.values.get(RATIO), row.scores.values.get(ERROR)
-    return None if len(row.outcomes) > 1 or ratio is None or not error else (ratio, error)
 
 
 def _remark_on(key: str, scored: Scored | None) -> str:
