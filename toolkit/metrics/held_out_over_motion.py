@@ -26,7 +26,7 @@ _FLOOR_PX = 0.1
 # So many tracks, drawn evenly, tell the ratio to a few percent; fewer than the second tell nothing.
 _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
 # A run does harm that is worse by this factor, or by that one in the worst of ten stretches, both beyond so many
-# standard errors. Of 320 sound simulated runs the first bound is 1.03 at most beside twists and 2.0 beside an IMU,
+# standard errors. Of 365 sound simulated runs the first bound is 1.03 at most beside twists and 2.0 beside an IMU,
 # which is smoother from frame to frame than any causal answer that is corrected. Chosen with them in view.
 MOST_RATIO, MOST_RATIO_OF_STRETCH, SIGMAS = {"twist": 1.25, "imu": 2.5}, {"twist": 2.0, "imu": 4.0}, 5.0
 _STRETCHES, _FEWEST_IN_STRETCH = 10, 10
