@@ -24,7 +24,7 @@ _MARK = {
     "heavy-tailed": "heavy-tailed, of innovations that no one covariance describes",
 }
 _TAILS = (
-    "; and yet its gate refused much: most innovations are far smaller than stated and some far larger, which no one "
+    "; and yet its gate refused much: most innovations are smaller than stated and some far larger, which no one "
     "noise of pixels describes"
 )
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
