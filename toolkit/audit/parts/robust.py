@@ -91,12 +91,12 @@ def in_motion(moved: Array, stretches: int) -> float:
     return float(gone.sum() ** 2 / max(float(np.sum(gone**2)), 1e-12))
 
 
-def chance_sigmas(stretches: float) -> float:
-    """Return from how many standard errors on an estimate is chance less often than ``LEVEL``, by Student's t.
+def chance_sigmas(stretches: float, level: float = LEVEL) -> float:
+    """Return from how many standard errors on an estimate is chance less often than ``level``, by Student's t.
 
     The error is that of a jackknife over so many stretches; two or fewer tell nothing of it.
     """
-    return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * LEVEL)) if stretches > LEAST_STRETCHES else np.inf
+    return float(stdtrit(stretches - 1.0, 1.0 - 0.5 * level)) if stretches > LEAST_STRETCHES else np.inf
 
 
 def chance_bound(error: Array, formal: Array, stretches: float, usual: float) -> Array:
