@@ -16,8 +16,8 @@ from scipy.special import chdtri
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.measured_motion import Motion
-from toolkit.models.motion import MotionModel, integrated, motion_model
-from toolkit.models.state import POSE, Belief
+from toolkit.models.motion import belief_at, integrated, motion_model
+from toolkit.models.state import POSE
 from toolkit.sequence import Sequence
 from toolkit.track_noise import TrackNoise
 
@@ -100,7 +100,7 @@ def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
     model = motion_model(sequence.noise, sequence.gravity_world)
     intervals = list(_intervals(trajectory, sequence))
     motions = [motion for *_, motion in intervals]
-    beliefs = [_belief_at(trajectory, start, model) for start, *_ in intervals]
+    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
     increments = integrated(model, motions, [belief.bias for belief in beliefs])
     for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
         prediction = increment.predict(belief)
@@ -117,14 +117,6 @@ def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int
         start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
         if start is not None and end is not None and packet.motion is not None:
             yield start, end, packet.motion
-
-
-def _belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
-    """Return a state of the trajectory as a belief; velocity and biases it lacks are zero, and so is its covariance."""
-    d = model.layout.size
-    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
-    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
-    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))
 
 
 def _slack(trajectory: Trajectory, dt_s: float) -> Array:

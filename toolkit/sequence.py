@@ -333,7 +333,7 @@ def check_runnable(sequence: Sequence) -> None:
         if backwards.size:
             raise DataError(
                 f"{name}: the stamp of {what} {backwards[0] + 1} is not after the one before it; "
-                "sort or drop it in the recording"
+                "mend the stamps; 'vislam check-data' says what is wrong with all of them"
             )
     samples, sightings = np.isfinite(motion.values).all(axis=1), is_measured(sequence.observations.uv_px)
     for what, sound in (("motion sample", samples), ("observation", sightings)):

@@ -9,7 +9,7 @@ import pytest
 
 from toolkit.audit import Audit, audit
 from toolkit.audit.fault import Evidence
-from toolkit.audit.time_offset import camera_offset
+from toolkit.audit.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s, camera_offset
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -134,3 +134,32 @@ def test_mismatches_beneath_a_noise_that_is_stated_too_large_are_told_by_their_s
 def test_samples_that_are_rarer_than_frames_are_told() -> None:
     assert "every 1 s and frames every 0.1 s" in told(audit(faults.thinned_motion(sound("drive"))))["sparse-motion"]
     assert "sparse-motion" not in told(audit(faults.thinned_motion(sound("drive"), 3.0)))
+
+
+@pytest.mark.parametrize("late_s", [0.02, -0.03])
+def test_twists_that_come_beside_every_frame_are_told_where_the_tracks_allow_a_clock_that_is_off(late_s: float) -> None:
+    said = told(audit(faults.camera_clock(sound("drive"), late_s)))["time-offset"]
+    assert f"to be shifted by {-1e3 * late_s:+.0f} ms" in said
+    assert "does not tell that from none" in said
+
+
+def test_twists_at_the_frames_or_at_another_rate_are_no_clock_that_is_off() -> None:
+    clean = sound("drive")
+    assert not told(audit(clean))
+    late = faults.camera_clock(clean, 0.02)
+    other_rate = replace(late, motion=late.motion.of(late.motion.t_ns * 21 // 20, late.motion.values))
+    assert _constant_phase_s(late) == pytest.approx(0.02)
+    assert _constant_phase_s(other_rate) is None
+    assert _constant_phase_s(clean) is None
+
+
+def test_an_offset_beyond_chance_is_told_though_it_is_known_badly() -> None:
+    """50 ms, known to more than 6.4 ms: six seconds of a level drive hold little turning."""
+    late = faults.camera_clock(sound("drive-imu").truncated(75), -0.05)
+    evidence = Evidence(late)
+    assert evidence.intervals is not None
+    w_imu = evidence.intervals.w_cam_radps @ late.rig.T_imu_cam[:3, :3].T
+    found = camera_offset(late, evidence.intervals, w_imu)
+    assert found is not None
+    assert LARGEST_ERROR_S < found.error < abs(found.value) / SIGMAS
+    assert "frames are stamped early" in told(audit(late))["time-offset"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit.parts.intervals import interval_means
-from toolkit.audit.parts.robust import median, slope
+from toolkit.audit.parts.robust import INFLATION, LEVEL, chance_bound, jackknife_cov, median, slope
 from toolkit.audit.parts.tracks import split
 from toolkit.geometry import se3_inverse, se3_log
 from toolkit.models.camera_motion import camera_motion
@@ -76,3 +76,25 @@ def test_the_median_is_numpys_also_of_what_is_not_a_number(count: int) -> None:
     values[2 * count // 3 : 2 * count // 3 + count // 4, 1] = np.nan
     expected = np.median(values, axis=0) if count else np.full(3, np.nan)
     np.testing.assert_array_equal(median(values), expected)
+
+
+@pytest.mark.parametrize("stretches", [3, 5, 10])
+def test_what_is_beyond_the_bound_of_chance_is_so_as_rarely_as_it_says(stretches: int) -> None:
+    """Means of 30 intervals whose errors last as long as a stretch, and scatter as much as real odometry's or less."""
+    rng, beyond = np.random.default_rng(stretches), 0
+    for _ in range(2000):
+        shared = np.repeat(rng.normal(0.0, 0.7, (stretches, 1)), 30 // stretches, axis=0)
+        rows = shared + rng.standard_normal((len(shared), 1))
+        error = np.sqrt(jackknife_cov(lambda some: some.mean(axis=0), rows, stretches=stretches)[:1, 0])
+        formal = np.full(1, rows.std() / np.sqrt(len(rows)))
+        beyond += bool(abs(rows.mean()) > chance_bound(error, formal, float(stretches), INFLATION["twist"])[0])
+    assert beyond <= 2000 * LEVEL + 3.0 * np.sqrt(2000 * LEVEL)  # three standard deviations of a count of two
+
+
+def test_few_stretches_have_a_bound_and_many_are_not_loosened_by_it() -> None:
+    error, formal = np.array([0.002]), np.array([0.002])
+    two, ten = (chance_bound(error, formal, stretches, 3.0)[0] for stretches in (2.0, 10.0))
+    assert two < 0.05  # by their own scatter two stretches have none
+    assert ten == pytest.approx(
+        4.781 * 0.002, rel=1e-3
+    )  # Student's t of nine degrees of freedom, 0.0005 on either side

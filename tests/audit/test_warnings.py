@@ -71,6 +71,13 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
     assert (np.abs(turn_of_camera(intervals, T_imu_cam).rad) < 0.006).all()
 
 
+def test_a_turned_camera_is_told_on_five_seconds_of_a_drive() -> None:
+    """Three stretches as long as slip lasts tell little of their own scatter; what real odometry has helps them out."""
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=5.0), 2)
+    assert "miscalibration" not in found_in(sound)
+    assert "as if it were turned by" in found_in(faults.turned_camera(sound, 0.1, 2))["miscalibration"]
+
+
 def found_in(sequence: Sequence) -> dict[str, str]:
     """Return what the audit says of each fault that it finds and does not repair."""
     return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}

@@ -4,13 +4,13 @@ A scenario is a fault of toolkit.simulation.faults in a stretch of a simulated r
 away. The recording is audited and run as a user would; then the truth is put back for the error: the RMS of the
 position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
 that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
-overconfident, where a note says that its gate refused much, or where the audit found something in its recording,
-repaired or not; faults that could not be judged do not count. In a sound recording all of that is a false alarm, and so
-is the mark timid.
+overconfident, where a note says that its gate refused much or that it explains withheld tracks worse than dead
+reckoning, or where the audit found something in its recording, repaired or not; faults that could not be judged do not
+count. In a sound recording all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh` and `again` are draws of
-others yet, with one recording drawn for every fault.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again` and `third` are
+draws of others yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -38,6 +38,7 @@ from toolkit.experiment.recording import Prepared, Recording, prepare
 from toolkit.experiment.units import Unit, outcome_of, run_estimator
 from toolkit.metrics import Evaluation, ate, score_run
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
+from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.progress import SILENT
 from toolkit.resampling import NS_PER_S
 from toolkit.runner import with_divergence
@@ -83,8 +84,8 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again")
-DRAWN = ("fresh", "again")
+HALVES = ("fit", "score", "fresh", "again", "third")
+DRAWN = ("fresh", "again", "third")
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
@@ -148,11 +149,13 @@ class Ended:
     found: Sequence[str] = ()
     log: Sequence[str] = ()
     refuses: bool = False
+    harms: bool = False
 
     @property
     def is_told(self) -> bool:
-        """Say whether the run's status, its mark, the note on its gate or the audit says that something is wrong."""
-        return bool(self.found) or self.status != "ok" or self.mark == "overconfident" or self.refuses
+        """Say whether its status, its mark, a note on its gate or withheld tracks, or the audit tells of a fault."""
+        by_notes = self.refuses or self.harms
+        return bool(self.found) or self.status != "ok" or self.mark == "overconfident" or by_notes
 
     @property
     def is_alarm(self) -> bool:
@@ -238,7 +241,7 @@ def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
 
 
 def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> Ended:
-    scored = outcome_of(run, prepared.sequence, 0).outputs.values()
+    scored = list(outcome_of(run, prepared.sequence, 0).outputs.values())
     verdicts = [found.verdict for found in map(consistency_of, ([output] for output in scored)) if found is not None]
     return replace(
         one,
@@ -248,6 +251,7 @@ def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> E
         found=tuple(sorted(finding.fault for finding in prepared.findings)),
         log=run.log,
         refuses=refuses_much(accepted) if (accepted := _accepted(run, prepared)) is not None else False,
+        harms=any(RATIO in output.scores.notes and output.scores.values[RATIO] is not None for output in scored),
     )
 
 

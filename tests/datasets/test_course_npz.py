@@ -292,3 +292,18 @@ def test_features_without_a_sighting_are_not_taken_for_a_file_that_has_none(cour
     assert not blind.provenance.facts
     del course["features"]
     assert course_npz.load(written(tmp_path, course)).provenance.facts
+
+
+def test_two_names_of_one_quantity_that_differ_are_refused(course: Course, tmp_path: Path) -> None:
+    course |= {"imu_T_cam": np.eye(4), "cam_T_imu": np.eye(4)}
+    assert course_npz.load(written(tmp_path, course)).frame_count > 0
+    course["cam_T_imu"] = np.diag([1.0, -1.0, -1.0, 1.0])
+    with pytest.raises(DataError, match="both imu_T_cam and cam_T_imu, and they differ"):
+        course_npz.load(written(tmp_path, course))
+
+
+def test_stamps_that_went_through_single_precision_are_named(course: Course, tmp_path: Path) -> None:
+    stamps_s = 1.3e9 + 0.1 * np.arange(course["time_stamps"].size)[None]
+    course["time_stamps"] = stamps_s.astype(np.float32)
+    with pytest.raises(DataError, match=r"time_stamps went through single precision, whose steps are 128 s there"):
+        course_npz.load(written(tmp_path, course))

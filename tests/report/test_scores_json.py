@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from msgspec import UNSET
 
 from toolkit.documents import parse, to_text
-from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.comparison import Comparison, Row, consistency_of
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
 from toolkit.report.records.scores import PROMISED_KEYS, Metrics
@@ -82,6 +83,33 @@ def test_the_verdict_on_the_stated_uncertainty_is_told_with_its_figures(
         "steady is timid: its NEES pose is 0.10, and 0.21 to 2.41 holds 95 % of consistent estimators however "
         "correlated their errors"
     )
+
+
+def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimator(comparison: Comparison) -> None:
+    def mark(accepted: float) -> str:
+        one = replace(comparison.lines[0].outcomes[0].outputs["causal"], nis_dof=900.0)
+        values = {"nis_mean": 0.4, "gate_accepted_percent": accepted}
+        judged = consistency_of([replace(one, scores=Scores(values, {}))])
+        assert judged is not None
+        return judged.verdict
+
+    assert mark(95.0) == "timid"
+    assert mark(76.0) == "heavy-tailed"
+
+
+def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    harm = "explains withheld tracks worse than dead reckoning: it misses them 3.00 +- 0.10 times as far"
+
+    def given(row: Row) -> Scores:
+        is_first = row.estimator == comparison.lines[0].estimator
+        found = {"heldout_over_motion": 3.0 if is_first else 0.9}
+        return Scores(row.scores.values | found, {"heldout_over_motion": harm} if is_first else {})
+
+    told = [line for line in note_lines(rescored(comparison, given)) if "withheld tracks worse" in line]
+    assert told == [f"{comparison.lines[0].estimator} {harm}"] * len(told)
+    assert told
 
 
 def test_a_gate_that_refuses_much_is_told_with_its_share(comparison: Comparison, rescored: Rescored) -> None:

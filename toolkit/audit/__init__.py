@@ -67,7 +67,7 @@ def _finding(fault: Fault, symptom: Symptom, before: Sequence, repaired: bool) -
     left_alone = symptom.remedy is not None and not repaired
     detail = f"{symptom.detail}; {'left as it is' if left_alone else symptom.treatment}"
     lost = _share_lost(before, symptom.remedy) if repaired and symptom.remedy is not None else 0.0
-    if lost > MOST_LOST:
+    if symptom.harmful and lost > MOST_LOST:
         detail += f"; it takes {lost:.0%} of the sightings, with which the recording is another one"
     blocking = symptom.harmful and (not repaired or lost > MOST_LOST)
     return Finding(fault.name, symptom.count, repaired, detail, blocking, symptom.warns, symptom.spans_ns)

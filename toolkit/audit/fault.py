@@ -4,10 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import OneStep, one_step
 from toolkit.models.camera_motion import CameraMotion, camera_motion
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 
@@ -101,6 +104,12 @@ class Evidence:
         if self.spoilt_by or not is_comparable(self.sequence):
             return None
         return compare(self.sequence, self.camera_motion)
+
+    @property
+    def known_s(self) -> float:
+        """How long the camera's own motion is known (s)."""
+        step_s = float(np.median(np.diff(self.sequence.frames_t_ns))) / NS_PER_S
+        return step_s * float(self.camera_motion.known.sum())
 
     @cached_property
     def alignment(self) -> Alignment | None:

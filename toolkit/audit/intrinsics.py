@@ -19,6 +19,8 @@ from toolkit.sequence import Sequence, StereoRig, is_measured
 RANGE = (0.005, 0.995)
 # The range over the focal length: 2 is a view of 90 degrees, 12 one of 161; below 0.02 a view of 1 degree.
 WIDEST, NARROWEST = 12.0, 0.02
+# An image in pixels is wider than this, one in multiples of the focal length is not.
+NORMALISED = 10.0
 # What a usual lens has.
 USUAL = 1.5
 # Share by which other intrinsics must lower the tracks' residual: 0.15 and more where the point is off by half a view.
@@ -33,6 +35,8 @@ def check(evidence: Evidence) -> Symptom | None:
     if len(uv_px) < LEAST_INTERVALS or not is_measured(uv_px).all():
         return None
     low, high = np.quantile(uv_px[:, [0, 2]], RANGE, axis=0)
+    if np.abs([low, high]).max() < NORMALISED and sequence.rig.fx_px > NORMALISED:
+        return _normalised(sequence.rig, low, high)
     faults = _suspects(sequence.rig, low, high)
     if not faults:
         return None
@@ -48,6 +52,18 @@ def check(evidence: Evidence) -> Symptom | None:
             f"{given_px:.2f} px, and by {other_px:.2f} px with ordinary values"
         ),
         treatment="the true ones are not in the data: mend K, or the pixels",
+        remedy=None,
+        spoils_vision=True,
+    )
+
+
+def _normalised(rig: StereoRig, low: Array, high: Array) -> Symptom:
+    """Tell of sightings that K was taken off already: x / z and y / z of a point, not its pixels."""
+    u, v = (f"{a:.2g} to {b:.2g}" for a, b in zip(low, high, strict=True))
+    return Symptom(
+        count=1,
+        detail=f"the sightings, u {u} and v {v}, are no pixels of fx_px = {rig.fx_px:g}: normalised image coordinates",
+        treatment="write fx_px u + cx_px and fy_px v + cy_px for them",
         remedy=None,
         spoils_vision=True,
     )

@@ -8,20 +8,15 @@ import numpy as np
 
 from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.robust import Scalar, chance_sigmas
+from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
-from toolkit.resampling import NS_PER_S
 
 SIGMAS = 5.0
-# A turn counts that is chance less often than this.
-LEVEL = 1e-3
 # What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
 # and by rotations. Chosen with them in view.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
 SYSTEMATIC_RATIO = 0.05
-# No standard error is less: without noise it would be none.
-LEAST_ERROR_RAD = 1e-6
 # Where a turn must be larger than this to be seen, it is said.
 LARGEST_RAD = 0.05
 
@@ -31,9 +26,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     intervals, rig = evidence.intervals, evidence.sequence.rig
     if intervals is None:
         return evidence.blind
-    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam, _known_s(evidence))
-    by_chance_rad = chance_sigmas(turn.stretches, LEVEL) * np.maximum(turn.error_rad, LEAST_ERROR_RAD)
-    least_rad = SYSTEMATIC_RAD[evidence.sequence.motion_kind] + by_chance_rad
+    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
+    least_rad = SYSTEMATIC_RAD[evidence.sequence.motion_kind] + turn.by_chance_rad
     if (np.abs(turn.rad) > least_rad).any():
         angle = float(np.linalg.norm(turn.rad))
         said.append(
@@ -56,12 +50,6 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         harmful=False,
         warns=True,
     )
-
-
-def _known_s(evidence: Evidence) -> float:
-    """Return how long the camera's own motion is known (s)."""
-    step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
-    return step_s * float(evidence.camera_motion.known.sum())
 
 
 def _undecided(least_rad: float, by_velocity: bool) -> Undecided | None:

@@ -18,6 +18,8 @@ from toolkit.resampling import NS_PER_S
 LEVEL, SYSTEMATIC = 1e-3, 0.06
 # Where a step must be larger than this to show, it is said.
 LARGEST_HIDDEN = 0.08
+# A camera that is slower stands, and its speed is noise.
+STANDING_MPS = 0.05
 # Of a step either side has so many stretches at least.
 LEAST_STRETCHES = 2
 
@@ -31,7 +33,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None  # an IMU has no speed to compare
     w_imu, seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T, intervals.v_cam_mps @ T_imu_cam[:3, :3].T
     measured, speed_mps = intervals.v_mps + np.cross(w_imu, T_imu_cam[:3, 3]), np.linalg.norm(seen, axis=1)
-    fast = (speed_mps > 0.0) & (speed_mps >= 0.5 * np.median(speed_mps))
+    fast = (speed_mps > STANDING_MPS) & (speed_mps >= 0.5 * np.median(speed_mps))
     if fast.sum() < LEAST_INTERVALS:
         return Undecided(f"too little motion: {int(fast.sum())} intervals show a scale, {LEAST_INTERVALS} are needed")
     ratio = np.sum(measured * seen, axis=1)[fast] / speed_mps[fast] ** 2

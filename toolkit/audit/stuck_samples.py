@@ -15,6 +15,8 @@ from toolkit.resampling import NS_PER_S
 LEAST_RUN, LEAST_S = 10, 0.1
 # Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
 MOST_REPEATED = 0.2
+# A camera that is slower may stand, and its speed be noise.
+STANDING_MPS = 0.1
 IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
 
@@ -26,6 +28,8 @@ def check(evidence: Evidence) -> Symptom | None:
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
     step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
     least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
+    if sequence.motion_kind == "twist" and not values.any():
+        return _never_moves(evidence)
     if sequence.motion_kind == "twist":
         moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
         repeated = {"odometry": _in_long_runs(values, least) & moves_and_turns}
@@ -46,6 +50,21 @@ def check(evidence: Evidence) -> Symptom | None:
         ),
         remedy=None if too_many else keep_samples(sequence, ~stuck),
         spoils_vision=bool(too_many),
+    )
+
+
+def _never_moves(evidence: Evidence) -> Symptom | None:
+    """Tell of odometry that is zero all along while the camera moves."""
+    camera, count = evidence.camera_motion, evidence.sequence.motion.t_ns.size
+    speed_mps = np.linalg.norm(camera.v_mps[camera.known], axis=1)
+    if speed_mps.size < LEAST_RUN or np.median(speed_mps) < STANDING_MPS:
+        return None
+    return Symptom(
+        count=count,
+        detail=f"all {count} twists are zero while the camera moves at {np.median(speed_mps):.2g} m/s (median)",
+        treatment="odometry was not recorded: look at the driver and the cables",
+        remedy=None,
+        spoils_vision=True,
     )
 
 

@@ -35,6 +35,8 @@ def check(evidence: Evidence) -> Symptom | None:
     suspect = np.isfinite(disparity) & (disparity <= 0.0)
     if suspect.sum() <= SUSPECT_SHARE * max(len(disparity), 1):
         return None
+    if (flat := _flat(sequence, suspect)) is not None:
+        return flat
     count, share = int(suspect.sum()), suspect.mean()
     detail = f"{count} of {len(disparity)} sightings have a disparity <= 0 ({share:.0%})"
     apart_px, noise_px = float(np.nanmedian(np.abs(disparity))), float(np.sqrt(sequence.rig.cov_uv_px2[0, 0]))
@@ -50,6 +52,31 @@ def check(evidence: Evidence) -> Symptom | None:
     words, remedy = explained[0]
     treatment = "exchanged again, and the tracks follow the measured motion"
     return Symptom(count, f"{detail}: {words}", treatment, remedy, spoils_vision=True)
+
+
+def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
+    """Tell of sightings without any disparity: missing ones written as zeros, or one image in the place of both."""
+    observations = sequence.observations
+    uv_px = observations.uv_px
+    zero, same = np.asarray((uv_px == 0.0).all(axis=1)), uv_px[:, 0] == uv_px[:, 1]
+    of_all = f"of {len(observations)} sightings"
+    if zero.sum() > 0.5 * suspect.sum():
+        return Symptom(
+            count=int(zero.sum()),
+            detail=f"{int(zero.sum())} {of_all} are 0 in every coordinate: missing ones, written as zeros",
+            treatment="dropped; a course file has -1 for them, a table no row",
+            remedy=replace(sequence, observations=observations.select(~zero)),
+            harmful=False,
+        )
+    if same.sum() > 0.5 * suspect.sum():
+        return Symptom(
+            count=int(same.sum()),
+            detail=f"{int(same.sum())} {of_all} have a uR that equals uL: one camera's columns stand for both",
+            treatment="without the right image there is no depth: mend the file, or leave uR empty",
+            remedy=None,
+            spoils_vision=True,
+        )
+    return None
 
 
 def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:

@@ -36,8 +36,12 @@ LEAST_OFF_FRAMES = 0.25
 # The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
 # intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
-# With a larger standard error (s) than these nothing is said.
-LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S = 0.0064, 0.0125
+# With a larger standard error (s) than these no offset is ruled out; one that is beyond chance is believed up to twice
+# as much, but where a twist leaves open which interval it describes.
+LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
+# Twists stand a constant time beside the frames where nine in ten do so to this share of their step. Clocks that drift,
+# and rates that differ, have no such constant. What is within so many standard errors the tracks do not exclude.
+CONSTANT_SHARE, CONSTANT_STEPS, NEAR_SIGMAS = 0.9, 0.02, 2.0
 # The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
 MOST_UNEXPLAINED = 0.9
 # Rotations of which one is noise differ by the sum of their variances: a gyro's own noise, in a standstill, has some
@@ -52,15 +56,14 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
     found = camera_offset(sequence, intervals, w_imu)
-    largest_s = LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
-    if found is None or found.error > largest_s:
-        error = "unknown" if found is None else f"known to {1e3 * found.error:.0f} ms"
-        return Undecided(f"too little change of rotation: the offset of camera and gyro is {error}")
+    if found is None:
+        return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
     expected_s, least_s = _expected(sequence)
     offset_s = found.value - expected_s
     beyond_s = found.value if _stamped_at_frames(sequence) else offset_s
-    if abs(beyond_s) < max(least_s, SIGMAS * found.error):
-        return None
+    surely_s = _largest_error_s(sequence) * (1.0 if _stamped_at_frames(sequence) else LARGEST_BEYOND)
+    if abs(beyond_s) < max(least_s, SIGMAS * found.error) or found.error > surely_s:
+        return _as_often(sequence, Scalar(offset_s, found.error)) or _unknown(sequence, found)
     late = "late" if offset_s < 0.0 else "early"
     return Symptom(
         count=1,
@@ -71,6 +74,53 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         treatment="the frames are shifted by it",
         remedy=_shifted(sequence, offset_s),
     )
+
+
+def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
+    """Say how well an offset is known that is no more than chance, where that is badly."""
+    if found.error <= _largest_error_s(sequence):
+        return None
+    known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
+    return Undecided(f"too little change of rotation: {known}")
+
+
+def _largest_error_s(sequence: Sequence) -> float:
+    return LARGEST_TWIST_ERROR_S if isinstance(sequence.motion, TwistSamples) else LARGEST_ERROR_S
+
+
+def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
+    """Tell of twists that come as often as frames and a constant time beside them, if the tracks allow a late clock."""
+    if not isinstance(sequence.motion, TwistSamples) or (late_s := _constant_phase_s(sequence)) is None:
+        return None
+    step_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    near = [shift for shift in (-late_s, step_s - late_s) if abs(offset.value - shift) <= NEAR_SIGMAS * offset.error]
+    if not near:
+        return None
+    told = " or ".join(f"{1e3 * shift:+.0f}" for shift in near)
+    return Symptom(
+        count=1,
+        detail=(
+            f"twists come as often as frames, and each frame {1e3 * late_s:.0f} ms after one: a camera's clock that is "
+            f"to be shifted by {told} ms looks so; by the tracks it is {1e3 * offset.value:+.0f} +- "
+            f"{1e3 * offset.error:.0f} ms, which does not tell that from none"
+        ),
+        treatment="if frames and twists were taken together, give them the same stamps",
+        remedy=None,
+        harmful=False,
+        warns=True,
+    )
+
+
+def _constant_phase_s(sequence: Sequence) -> float | None:
+    """Return how long (s) after a sample frames are stamped, where that is constant, not nothing, at equal rates."""
+    t_ns, frames_t_ns = sequence.motion.t_ns, sequence.frames_t_ns
+    step_ns, tolerance = float(np.median(np.diff(t_ns))), CONSTANT_STEPS * float(np.median(np.diff(t_ns)))
+    since_ns = frames_t_ns - t_ns[np.clip(np.searchsorted(t_ns, frames_t_ns, side="right") - 1, 0, t_ns.size - 1)]
+    phase_ns = float(np.median(since_ns))
+    varies = np.quantile(np.abs(since_ns - phase_ns), CONSTANT_SHARE) > tolerance
+    if varies or abs(float(np.median(np.diff(frames_t_ns))) - step_ns) > tolerance:
+        return None
+    return phase_ns / NS_PER_S if tolerance < phase_ns < step_ns - tolerance else None
 
 
 def _expected(sequence: Sequence) -> tuple[float, float]:

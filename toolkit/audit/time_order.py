@@ -28,8 +28,11 @@ def check(evidence: Evidence) -> Symptom | None:
     frames, samples = _late(sequence.frames_t_ns), _late(sequence.motion.t_ns)
     if frames + samples == 0:
         return None
-    jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
     detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
+    if max(map(_share_back, _streams(sequence))) > MOST_LATE:
+        why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
+    jumps_s = [jump_s for t_ns in _streams(sequence) for jump_s in _jump_lengths_s(t_ns)]
     if jumps_s:
         detail += f": the clock jumps back by {max(jumps_s):.2f} s and goes on from there"
         remedy = _between_jumps(sequence)
@@ -48,6 +51,11 @@ def check(evidence: Evidence) -> Symptom | None:
 
 def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
     return sequence.frames_t_ns, sequence.motion.t_ns
+
+
+def _share_back(t_ns: IntArray) -> float:
+    """Return the share of the steps that lead back in time, or nowhere."""
+    return float(np.mean(np.diff(t_ns) <= 0)) if t_ns.size > 1 else 0.0
 
 
 def _sorted(sequence: Sequence) -> Sequence:

@@ -37,6 +37,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     steps = evidence.one_step
     chi2 = mahalanobis_squared(steps.residual_px, steps.cov_px2)
     scatter, error = _scatter(chi2), jackknife_error(_scatter, chi2)
+    if not np.isfinite(scatter):
+        return evidence.blind
     if scatter < MOST_SCATTER + SIGMAS * error:
         return _tail(chi2)
     sigma_px = " ".join(f"{sigma:.2g}" for sigma in np.sqrt(np.diag(sequence.rig.cov_uv_px2)))

@@ -6,9 +6,9 @@ A share of the depths scales every step of the camera. Odometry shows it in velo
 from toolkit.audit.disagreement import MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 
-# A scale counts from so many standard errors on, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the
-# odometry of cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
-SIGMAS, SYSTEMATIC = 5.0, {"twist": 0.03, "imu": 0.025}
+# A scale counts that is no chance, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the odometry of
+# cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
+SYSTEMATIC = {"twist": 0.03, "imu": 0.025}
 # A scale that is known worse than this is not judged; where a fault must be larger than that to show, it is said.
 LARGEST_ERROR, LARGEST_HIDDEN = 0.02, 0.08
 
@@ -21,11 +21,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if found is None or found.scale.error > LARGEST_ERROR:
         known = "unknown"
         if found is not None:
-            least = SYSTEMATIC[kind] + SIGMAS * found.scale.error
+            least = SYSTEMATIC[kind] + found.scale_by_chance
             known = f"known to {100.0 * found.scale.error:.0f} %, a fault of less than {100.0 * least:.0f} % would hide"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     scale, error = found.scale
-    least = SYSTEMATIC[kind] + SIGMAS * error
+    least = SYSTEMATIC[kind] + found.scale_by_chance
     if kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO:
         return None  # a disagreement, and told as such
     if abs(scale) < least:

@@ -11,13 +11,16 @@ import numpy as np
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, array_names, opened
 from toolkit.datasets.io.sparse import corners_of, sightings
-from toolkit.geometry import se3_inverse
+from toolkit.errors import DataError
+from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.sequence import NO_FEATURES, Observations, Provenance, Sequence, StereoRig
 
 CITES = ("geiger2013kitti",)
 _NOT_SEEN = -1.0
+# Two spellings of one quantity differ by the digits they were written with.
+_ALIKE = 1e-4
 _REQUIRED = (
     "time_stamps",
     "linear_velocity",
@@ -47,6 +50,9 @@ def load(path: Path) -> Sequence:
         seen, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
     w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
+    if "angular_velocity" in fields and "rotational_velocity" in fields:
+        other = fields.array("rotational_velocity", 3, t_ns.size).T
+        _check_alike(fields, "angular_velocity", w_radps, "rotational_velocity", other)
     facts = () if has_features else (NO_FEATURES,)
     return Sequence(
         name=path.stem,
@@ -62,7 +68,15 @@ def load(path: Path) -> Sequence:
 def _rig(fields: Fields) -> StereoRig:
     K = camera_matrix(fields.path, "K", fields.constant("K", 3, 3))
     T_imu_cam = fields.rigid("imu_T_cam") if "imu_T_cam" in fields else se3_inverse(fields.rigid("cam_T_imu"))
+    if "imu_T_cam" in fields and "cam_T_imu" in fields:
+        _check_alike(fields, "imu_T_cam", T_imu_cam, "cam_T_imu", se3_inverse(fields.rigid("cam_T_imu")))
     return StereoRig(K[0, 0], K[1, 1], K[0, 2], K[1, 2], fields.positive("b"), T_imu_cam, pixel_covariance(2))
+
+
+def _check_alike(fields: Fields, one: str, of_one: Array, other: str, of_other: Array) -> None:
+    """Raise DataError where a file has both names of a quantity, and they say different things."""
+    if not np.allclose(of_one, of_other, atol=_ALIKE, equal_nan=True):
+        raise DataError(f"{fields.path}: it has both {one} and {other}, and they differ: delete the one that is wrong")
 
 
 def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> Observations:

@@ -11,7 +11,9 @@ correlated, a mean of equally distributed variables scatters no more than one of
 Shaked and Shanthikumar, "Stochastic orders", 2007, theorem 3.A.36). Over N seeds, which are independent, the mean has
 the band of N. Without such a truth the innovations are judged in the same way: those of one frame share the error of
 its pose and count as one stereo sighting; those of different frames of a consistent filter are independent. Both bands
-are wide on purpose; docs/metrics.md has what simulated consistent runs make of them.
+are wide on purpose; docs/metrics.md has what simulated consistent runs make of them. Innovations that are smaller than
+stated behind a gate that refused many of them are no sign of too large a covariance: few large ones and many small ones
+are of a distribution with heavy tails, of which no covariance is right.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -29,6 +31,7 @@ from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
+from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import DEFAULTS, Settings
 
@@ -40,25 +43,31 @@ if TYPE_CHECKING:
     from toolkit.sequence import Sequence as Recorded
     from toolkit.track_errors import Card
 
-Verdict = Literal["consistent", "overconfident", "timid"]
+Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed"]
 NEES, NIS = "nees_pose_mean", "nis_mean"
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """The mean over runs of a metric, 1 on average where consistent, and the band of 95 % of consistent estimators."""
+    """The mean over runs of a metric, 1 on average where consistent, and the band of 95 % of consistent estimators.
+
+    ``refused_much`` tells that a gate had taken far more from what the mean is of than of a consistent estimator's.
+    """
 
     metric: str
     mean: float
     low: float
     high: float
+    refused_much: bool = False
 
     @property
     def verdict(self) -> Verdict:
         """Return what the mean says of the stated uncertainty."""
         if self.mean > self.high:
             return "overconfident"
-        return "timid" if self.mean < self.low else "consistent"
+        if self.mean >= self.low:
+            return "consistent"
+        return "heavy-tailed" if self.refused_much else "timid"
 
 
 def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
@@ -74,7 +83,10 @@ def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
     if not nis:
         return None
     # A mean of n chi-square variables over their degrees of freedom d_i has the variance 2 sum(1 / d_i) / n^2.
-    return _judged(NIS, [value for value, _ in nis], len(nis) ** 2 / sum(1.0 / dof for _, dof in nis))
+    accepted = [value for one in scored if (value := one.scores.values.get(ACCEPTED)) is not None]
+    refused_much = bool(accepted) and refuses_much(sum(accepted) / len(accepted))
+    judged = _judged(NIS, [value for value, _ in nis], len(nis) ** 2 / sum(1.0 / dof for _, dof in nis))
+    return replace(judged, refused_much=refused_much)
 
 
 def _judged(metric: str, values: list[float], dof: float) -> Consistency:
@@ -190,7 +202,7 @@ class Row:
 
     @property
     def mark(self) -> str:
-        """Return "overconfident" or "timid" where the stated uncertainty is so, else nothing."""
+        """Return "overconfident", "timid" or "heavy-tailed" where the stated uncertainty is so, else nothing."""
         verdict = "consistent" if self.consistency is None else self.consistency.verdict
         return "" if verdict == "consistent" else verdict
 

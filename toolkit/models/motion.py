@@ -10,8 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import gtsam
+import numpy as np
 
-from toolkit.estimate import Estimate
+from toolkit.estimate import Estimate, Trajectory
 from toolkit.geometry import Array
 from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import EliminatedGraph, joint_cov
@@ -108,3 +109,11 @@ def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Beli
     if motion is None:
         return belief
     return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
+
+
+def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
+    """Return a state of the trajectory as a belief; velocity and biases it lacks are zero, and so is its covariance."""
+    d = model.layout.size
+    v_world = np.zeros(3) if trajectory.v_world is None else trajectory.v_world[row]
+    bias = np.zeros(6) if trajectory.bias is None else trajectory.bias[row]
+    return Belief(model.layout, trajectory.T_world_imu[row], v_world, bias, np.zeros((d, d)))

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
-from toolkit.experiment.units import OUTPUTS
+from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
+from toolkit.metrics.held_out_over_motion import RATIO
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
 from toolkit.sequence import Sequence
@@ -20,7 +21,12 @@ _MOSTLY_PERCENT = 80.0
 _MARK = {
     "overconfident": "overconfident, too sure of itself",
     "timid": "timid, less sure of itself than it could be",
+    "heavy-tailed": "heavy-tailed, of innovations that no one covariance describes",
 }
+_TAILS = (
+    "; and yet its gate refused much: most innovations are smaller than stated and some far larger, which no one "
+    "noise of pixels describes"
+)
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
@@ -155,6 +161,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
         yield f"{', '.join(names)}: without {_PARTS[part]} (noise.{part})"
     yield from _marks(comparison)
     yield from _refusals(comparison)
+    yield from _harm_by_vision(comparison)
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -204,15 +211,15 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
 
 
 def _marks(comparison: Comparison) -> Iterator[str]:
-    """Yield a line for each row that is marked overconfident or timid: by which figure, against which band."""
+    """Yield a line for each row whose stated uncertainty is marked: by which figure, against which band."""
     for row in comparison.lines:
         found = row.consistency
         if found is not None and row.mark:
             name = metrics_called((found.metric,))[0].name
-            whose = row.estimator if row.label == "both" else f"{row.estimator} {row.output}"
             yield (
-                f"{whose} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
+                f"{_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
                 f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
+                f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
             )
 
 
@@ -226,6 +233,29 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
             f"the outlier gate refused much of what it tested ({told}): many mismatches, or a model that does not "
             "hold, as of calibration, time stamps or noise"
         )
+
+
+def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
+    """Yield a line for each row that explains withheld tracks worse than the measured motion alone."""
+    for row in comparison.lines:
+        harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
+        if harmed and comparison.over_seeds:
+            under = f"seed{'s' if len(harmed) > 1 else ''} {', '.join(str(seed) for seed, _ in harmed)}"
+            yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {under}"
+        elif harmed:
+            yield f"{_of(row)} {harmed[0][1]}"
+
+
+def _remark_on(key: str, scored: Scored | None) -> str:
+    """Return what a metric remarks on its value; nothing where it has none."""
+    if scored is None or scored.scores.values.get(key) is None:
+        return ""
+    return scored.scores.notes.get(key, "")
+
+
+def _of(row: Row) -> str:
+    """Name a row: by its estimator alone where one line serves for both outputs."""
+    return row.estimator if row.label == "both" else f"{row.estimator} {row.output}"
 
 
 def _figure(value: float) -> str:
@@ -337,8 +367,8 @@ def _whose(affected: list[Row], rows: list[Row]) -> str:
 
 
 def remark_lines(comparison: Comparison) -> Iterator[str]:
-    """Yield what the metrics remark on the values they did compute, without what :func:`truth_lines` says."""
-    return _remarks(comparison, lambda key: not key.startswith(_AGAINST_TRUTH))
+    """Yield what the metrics remark on the values they did compute, without what :func:`note_lines` says."""
+    return _remarks(comparison, lambda key: not key.startswith(_AGAINST_TRUTH) and key != RATIO)
 
 
 def _remarks(comparison: Comparison, wanted: Callable[[str], bool]) -> Iterator[str]:

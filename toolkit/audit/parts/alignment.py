@@ -13,7 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by, subdivided
-from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, jackknife_cov, spread
+from toolkit.audit.parts.robust import (
+    CAUCHY_SIGMAS,
+    INFLATION,
+    ITERATIONS,
+    Scalar,
+    chance_bound,
+    chance_sigmas,
+    in_motion,
+    jackknife_cov,
+    slip_stretches,
+    spread,
+)
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
 from toolkit.models.camera_motion import CameraMotion, camera_motion
@@ -33,12 +44,14 @@ _LEVER, TURN, _COMMON = slice(1, 4), slice(4, 7), 13
 class Alignment(NamedTuple):
     """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m.
 
-    ``lever_cov_m2`` (3, 3) is the covariance of the latter.
+    ``lever_cov_m2`` (3, 3) is the covariance of the latter, ``scale_by_chance`` what the scale is beyond by chance less
+    often than ``robust.LEVEL``.
     """
 
     scale: Scalar
     lever_m: Array
     lever_cov_m2: Array
+    scale_by_chance: float = np.inf
 
     @property
     def lever_error_m(self) -> Array:
@@ -49,11 +62,12 @@ class Alignment(NamedTuple):
 def alignment(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Alignment | None:
     """Regress the camera's translation on the measured motion; None where there is too little to solve for it."""
     if intervals.v_mps is not None:
-        return _with_velocities(intervals, intervals.v_mps, sequence.rig.T_imu_cam)
+        step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+        return _with_velocities(intervals, intervals.v_mps, sequence.rig.T_imu_cam, step_s)
     return _with_accelerations(sequence, camera, intervals)
 
 
-def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> Alignment:
+def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_s: float) -> Alignment:
     """Solve v_imu = (1 - scale) v - turn x v - w x (p + lever), with the camera's v and w in the axes of the IMU.
 
     Noise of the regressor feigns a scale. What the regression of the one on the other and its inverse leave open
@@ -66,7 +80,15 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> Al
     one = 1.0 / (1.0 - float(found[0])) - 1.0
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
     error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
-    return Alignment(Scalar(scale, error), found[_LEVER], cov[_LEVER, _LEVER])
+    by_chance = (1.0 + scale) ** 2 * _by_chance(measured - seen, jacobian, seen, slip_stretches(len(seen) * step_s))
+    return Alignment(Scalar(scale, error), found[_LEVER], cov[_LEVER, _LEVER], by_chance)
+
+
+def _by_chance(response: Array, jacobian: Array, seen: Array, stretches: int) -> float:
+    """Return what the first unknown is beyond by chance, where its errors last as long as slip."""
+    slipping = np.sqrt(jackknife_cov(robust_solution, response, jacobian, stretches=stretches)[:1, 0])
+    formal = np.sqrt(formal_cov(response, jacobian)[:1, 0])
+    return float(chance_bound(slipping, formal, in_motion(seen, stretches), INFLATION["twist"])[0])
 
 
 def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> tuple[Array, Array, Array]:
@@ -105,7 +127,9 @@ def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Int
     prior = np.repeat([0.0, 1.0 / ACCEL_BIAS**2, 1.0 / GYRO_BIAS**2, 0.0], [7, 3, 3, 6 * windows])
     block = np.arange(len(response)) * STRIDE_S // 1.0
     found, cov = _robust_with_cov(response, jacobian, prior, block.astype(int))
-    return Alignment(Scalar(float(found[0]), float(np.sqrt(cov[0, 0]))), found[_LEVER], cov[_LEVER, _LEVER])
+    scale = Scalar(float(found[0]), float(np.sqrt(cov[0, 0])))
+    by_chance = chance_sigmas(np.unique(block).size) * scale.error
+    return Alignment(scale, found[_LEVER], cov[_LEVER, _LEVER], by_chance)
 
 
 def _strides(sequence: Sequence, camera: CameraMotion, kept: IntArray) -> CameraMotion:

@@ -11,39 +11,56 @@ import numpy as np
 
 from toolkit.audit.parts.alignment import TURN, formal_cov, robust_solution, velocity_equations
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import LEAST_STRETCHES, STRETCHES, jackknife_cov
+from toolkit.audit.parts.robust import (
+    INFLATION,
+    STRETCHES,
+    chance_bound,
+    in_motion,
+    jackknife_cov,
+    slip_stretches,
+)
 from toolkit.geometry import Array, skew
 
 # Axes about which the turn is known worse than this many times the best one are not judged: about its own direction a
 # velocity says nothing, and slip feigns something.
 MOST_ERROR_RATIO = 4.0
-# Beside velocities, how long slip lasts (s); chosen with the parts of the recordings at hand in view.
-SLIP_S = 1.5
+# No bound of chance is less (rad): without noise it would be none.
+LEAST_BOUND_RAD = 5e-6
 
 
 class Turn(NamedTuple):
-    """Small rotations (m,) rad about m axes that can be judged, and their standard errors (m,) rad.
+    """Small rotations (m,) rad about m axes that can be judged, their standard errors (m,) rad, and what is no chance.
 
-    Those are of so many ``stretches``: one in which the vehicle stands still does not count.
+    ``by_chance_rad`` (m,) is what they are beyond by chance less often than ``robust.LEVEL``.
     """
 
     rad: Array
     error_rad: Array
-    stretches: float
+    by_chance_rad: Array
 
 
 def turn_of_camera(intervals: Intervals, T_imu_cam: Array, duration_s: float = np.inf) -> Turn:
     """Return the turn that brings the camera's motion onto the measured one, by velocities, or else by rotations."""
     if intervals.v_mps is None:
-        seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+        kind, stretches, seen = "imu", STRETCHES, intervals.w_cam_radps @ T_imu_cam[:3, :3].T
         bias = np.tile(np.eye(3), (len(seen), 1, 1))
-        return _turn(intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2), seen, STRETCHES)
-    measured, seen, jacobian = velocity_equations(intervals, intervals.v_mps, T_imu_cam)
-    turn_first = np.concatenate([jacobian[:, :, TURN], np.delete(jacobian, TURN, axis=2)], axis=2)
-    return _turn(measured - seen, turn_first, seen, int(np.clip(duration_s / SLIP_S, LEAST_STRETCHES, STRETCHES)))
+        found = _turn(intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2), stretches)
+    else:
+        kind, stretches = "twist", slip_stretches(duration_s)
+        measured, seen, jacobian = velocity_equations(intervals, intervals.v_mps, T_imu_cam)
+        turn_first = np.concatenate([jacobian[:, :, TURN], np.delete(jacobian, TURN, axis=2)], axis=2)
+        found = _turn(measured - seen, turn_first, stretches)
+    by_chance_rad = chance_bound(found.error_rad, found.formal_rad, in_motion(seen, stretches), INFLATION[kind])
+    return Turn(found.rad, found.error_rad, np.maximum(by_chance_rad, LEAST_BOUND_RAD))
 
 
-def _turn(response: Array, jacobian: Array, seen: Array, stretches: int) -> Turn:
+class _Found(NamedTuple):
+    rad: Array
+    error_rad: Array
+    formal_rad: Array
+
+
+def _turn(response: Array, jacobian: Array, stretches: int) -> _Found:
     """Solve response (M, 3) = jacobian (M, 3, n) x, the turn being the first three unknowns.
 
     The axes are those of its formal covariance: that of a few stretches has none of its own.
@@ -52,15 +69,8 @@ def _turn(response: Array, jacobian: Array, seen: Array, stretches: int) -> Turn
     cov = jackknife_cov(_first_three, response, jacobian, stretches=stretches)
     error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), formal))
     judged = formal <= MOST_ERROR_RATIO**2 * formal.min()
-    return Turn((axes.T @ _first_three(response, jacobian))[judged], error_rad[judged], _in_motion(seen, stretches))
+    return _Found((axes.T @ _first_three(response, jacobian))[judged], error_rad[judged], np.sqrt(formal[judged]))
 
 
 def _first_three(response: Array, jacobian: Array) -> Array:
     return robust_solution(response, jacobian)[:3]
-
-
-def _in_motion(seen: Array, stretches: int) -> float:
-    """Return how many of the stretches there are by the ways (or angles) gone in them: (sum w)^2 / sum w^2 (Kish)."""
-    stretch = np.arange(len(seen)) * stretches // len(seen)
-    gone = np.bincount(stretch, np.linalg.norm(seen, axis=1), stretches)
-    return float(gone.sum() ** 2 / max(float(np.sum(gone**2)), 1e-12))

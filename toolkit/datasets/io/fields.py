@@ -24,6 +24,8 @@ _MOST_ROWS_APART_PX, _FEWEST_ROWS = 3.0, 30
 _MOST_SKEW = 1e-3
 # No recording lies beyond the year 5000, nor has a sample only every half minute.
 _LATEST_S = 1e11
+# Stamps are finer than this; single precision is not, from 10 000 s on.
+_COARSE_S = 9e-4
 _LONGEST_STEP_S = 30.0
 _UNITS = (
     (1e-9, "nanoseconds: divide by 1e9"),
@@ -124,12 +126,17 @@ def check_frame_count(path: Path, frame_count: int) -> None:
 def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     """Return stamps (N,) given in seconds as int64 nanoseconds.
 
-    Raises DataError naming the first stamp that is not finite, or the unit the stamps are probably in. The
-    order is not checked: a recording may be repaired.
+    Raises DataError naming the first stamp that is not finite, or the unit the stamps are probably in, or where they
+    were rounded to single precision. The order is not checked: a recording may be repaired.
     """
     bad = np.flatnonzero(~np.isfinite(stamps_s))
     if bad.size:
         raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]} ({bad.size} such stamps); remove these samples")
+    coarse_s = float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
+    if coarse_s > _COARSE_S and stamps_s.size > 1 and (stamps_s == stamps_s.astype(np.float32)).all():
+        raise DataError(
+            f"{path}: {key} went through single precision, whose steps are {coarse_s:g} s there: write it in double"
+        )
     unit = probable_unit(stamps_s)
     if unit is not None:
         raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit}")

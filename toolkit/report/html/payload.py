@@ -263,7 +263,7 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
 
 
 def mark_of(judged: Judged | UnsetType) -> str:
-    """Return "overconfident" or "timid" where a run is so, nothing where it is consistent or cannot be judged."""
+    """Return what a run is marked as, nothing where it is consistent or cannot be judged."""
     return "" if judged is UNSET or judged.verdict == "consistent" else judged.verdict
 
 

@@ -62,7 +62,8 @@ class Judged(Struct, frozen=True, kw_only=True):
     """What a run's errors, or its innovations, say of the uncertainty it states."""
 
     verdict: Annotated[
-        Literal["consistent", "overconfident", "timid"], Meta(description="by where the mean is: in, above, below band")
+        Literal["consistent", "overconfident", "timid", "heavy-tailed"],
+        Meta(description="by the mean: in, above, below its band; below, behind a gate that refused much"),
     ]
     metric: Annotated[str, Meta(description="key of the metric it rests on")]
     mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]

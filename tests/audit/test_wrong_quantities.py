@@ -1,0 +1,87 @@
+"""What stands in a file for something else is named for what it is, and blocks or is dropped; nothing is blessed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.audit import Finding, audit
+from toolkit.geometry import Array
+from toolkit.sequence import Observations, Sequence
+from toolkit.simulation import SCENARIOS, simulate
+
+
+@cache
+def drive() -> Sequence:
+    return simulate(replace(SCENARIOS["drive"], duration_s=6.0), 4)
+
+
+def with_pixels(change: Callable[[Array], Array]) -> Sequence:
+    seen = drive().observations
+    return replace(drive(), observations=Observations(seen.frame, seen.track_id, change(seen.uv_px.copy())))
+
+
+def with_twists(values: Array) -> Sequence:
+    return replace(drive(), motion=drive().motion.of(drive().motion.t_ns, values))
+
+
+def found(sequence: Sequence) -> dict[str, Finding]:
+    return {finding.fault: finding for finding in audit(sequence).findings}
+
+
+def test_missing_sightings_written_as_zeros_are_dropped_and_the_rest_stays_sound() -> None:
+    seen = drive().observations
+    frame, track_id = (np.concatenate([part, part]) for part in (seen.frame, seen.track_id))
+    zeros = Observations.sorted(frame, track_id, np.concatenate([seen.uv_px, np.zeros_like(seen.uv_px)]))
+    said = found(replace(drive(), observations=zeros))
+    assert said["swapped-coordinates"].repaired
+    assert not any(finding.blocking for finding in said.values())
+    assert "missing ones, written as zeros" in said["swapped-coordinates"].detail
+    assert "with which the recording is another one" not in said["swapped-coordinates"].detail
+
+
+def test_one_camera_in_the_place_of_both_is_not_called_an_exchange() -> None:
+    finding = found(with_pixels(lambda uv_px: uv_px[:, [0, 0, 2]]))["swapped-coordinates"]
+    assert finding.blocking
+    assert "one camera's columns stand for both" in finding.detail
+    assert "exchanged" not in finding.detail
+
+
+def test_normalised_image_coordinates_are_named() -> None:
+    rig = drive().rig
+    centre = np.array([rig.cx_px, rig.cx_px, rig.cy_px])
+    finding = found(with_pixels(lambda uv_px: (uv_px - centre) / rig.fx_px))["intrinsics"]
+    assert finding.blocking
+    assert "normalised image coordinates" in finding.detail
+
+
+def test_stamps_that_run_backwards_are_never_cut_to_a_few_frames() -> None:
+    """Uneven steps make some of them look like jumps of a clock that goes on."""
+    rng = np.random.default_rng(2)
+    t_ns = drive().frames_t_ns + rng.integers(0, 8_000_000, drive().frame_count)
+    backwards = replace(drive(), frames_t_ns=t_ns[::-1], motion=drive().motion.of(t_ns[::-1], drive().motion.values))
+    finding = found(backwards)["time-order"]
+    assert finding.blocking
+    assert "time runs backwards" in finding.detail
+
+
+def test_velocities_of_the_wrong_sign_block_with_their_angle() -> None:
+    finding = found(with_twists(drive().motion.values * np.repeat([-1.0, 1.0], 3)))["disagreement"]
+    assert finding.blocking
+    assert "velocity points 180 degrees away" in finding.detail or "velocity points 179 degrees" in finding.detail
+
+
+def test_odometry_that_is_zero_all_along_accuses_nothing_else() -> None:
+    said = found(with_twists(np.zeros_like(drive().motion.values)))
+    assert said["stuck-samples"].blocking
+    assert "twists are zero while the camera moves" in said["stuck-samples"].detail
+    assert not said.keys() & {"mixed-axes", "extrinsic-translation", "disagreement", "lever-arm", "conflict"}
+
+
+@pytest.mark.parametrize("factor", [3.45, 3.6])
+def test_a_speed_between_two_units_names_them(factor: float) -> None:
+    said = found(with_twists(drive().motion.values * np.repeat([factor, 1.0], 3)))
+    told = said["units"] if "units" in said else said["disagreement"]
+    assert "km/h" in told.detail
