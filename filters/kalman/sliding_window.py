@@ -59,7 +59,8 @@ class SlidingWindowFilter:
         self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
         self._memory = LandmarkMemory()
         # A twist's noise is measured from its own scatter; where its tracks contradict it, it is the tracks that err.
-        self._matches_noise, self._noise = setup.motion_kind == "imu", MatchedNoise()
+        self._matches_noise = setup.settings.noise.match_imu and setup.motion_kind == "imu"
+        self._noise = MatchedNoise()
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""

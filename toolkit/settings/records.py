@@ -185,6 +185,10 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         bool,
         Meta(description="where frames have no track in common, a measured twist is like those before and after, too"),
     ] = False
+    match_imu: Annotated[
+        bool,
+        Meta(description="windowed filters take an IMU for noisier than stated where tracks contradict it"),
+    ] = True
 
 
 class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):

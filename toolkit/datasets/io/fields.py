@@ -133,7 +133,7 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     if bad.size:
         raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]} ({bad.size} such stamps); remove these samples")
     coarse_s = float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
-    if coarse_s > _COARSE_S and stamps_s.size > 1 and (stamps_s == stamps_s.astype(np.float32)).all():
+    if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s, coarse_s):
         raise DataError(
             f"{path}: {key} went through single precision, whose steps are {coarse_s:g} s there: write it in double"
         )
@@ -141,6 +141,11 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     if unit is not None:
         raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit}")
     return np.rint(stamps_s * NS_PER_S).astype(np.int64)
+
+
+def _is_single_precision(stamps_s: Array, coarse_s: float) -> bool:
+    """Say whether all stamps are numbers of single precision, and some of its finest step: whole seconds are not."""
+    return bool((stamps_s == stamps_s.astype(np.float32)).all() and (stamps_s / coarse_s % 2.0 == 1.0).any())
 
 
 def probable_unit(stamps_s: Array) -> str | None:
