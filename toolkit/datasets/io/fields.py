@@ -144,8 +144,9 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
 
 
 def _is_single_precision(stamps_s: Array, coarse_s: float) -> bool:
-    """Say whether all stamps are numbers of single precision, and some of its finest step: whole seconds are not."""
-    return bool((stamps_s == stamps_s.astype(np.float32)).all() and (stamps_s / coarse_s % 2.0 == 1.0).any())
+    """Say whether all stamps are numbers of single precision, and not only as whole seconds or quarters are."""
+    finest = coarse_s > 1.0 or (stamps_s / coarse_s % 2.0 == 1.0).any()
+    return bool(finest and (stamps_s == stamps_s.astype(np.float32)).all())
 
 
 def probable_unit(stamps_s: Array) -> str | None:
