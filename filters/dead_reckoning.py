@@ -1,6 +1,6 @@
 """Prediction alone: the measured motion integrated from the start, vision unused (Kang, III-A, eqs. 1-2)."""
 
-from filters.kalman.online_output import OnlineOutput
+from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.models.motion import motion_model, predicted
@@ -16,7 +16,7 @@ def build(setup: Setup) -> Estimator:
     return OnlineOutput(DeadReckoning(setup))
 
 
-class DeadReckoning:
+class DeadReckoning(Filter):
     """Integrates the motion; its error grows with time and nothing ever corrects it."""
 
     def __init__(self, setup: Setup) -> None:

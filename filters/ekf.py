@@ -9,7 +9,7 @@ import numpy as np
 from filters.kalman.correction import correct_landmarks_below, correct_pose
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import TrackedMap
-from filters.kalman.online_output import OnlineOutput
+from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.models import left_only
@@ -28,7 +28,7 @@ def build(setup: Setup) -> Estimator:
     return OnlineOutput(DecoupledEkf(setup))
 
 
-class DecoupledEkf:
+class DecoupledEkf(Filter):
     """Predict, correct the pose by the known landmarks, correct the landmarks, start new ones, forget lost ones."""
 
     def __init__(self, setup: Setup) -> None:

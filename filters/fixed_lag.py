@@ -69,7 +69,7 @@ class FixedLag:
         """Return each state as it left the window, and every landmark as last known."""
         for k in range(self._first_in_window, len(self._states)):
             self._complete(k)
-        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
+        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=(*self._builder.log(), *self._log))
 
     def _complete(self, k: int) -> None:
         """Give a state of the window the covariance it has there."""

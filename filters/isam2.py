@@ -79,7 +79,7 @@ class Isam2:
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), motion)
-        return Finished(trajectory, Landmarks.of(points), converged, (*self._log, *log))
+        return Finished(trajectory, Landmarks.of(points), converged, (*self._builder.log(), *self._log, *log))
 
     def _relinearise(self, packet: Packet, estimate: Estimate) -> None:
         """Mark the landmarks in view, refused or not, that are no longer where they are linearised."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from filters.kalman.correction import correct_landmarks_below
 from filters.kalman.landmark_map import TrackedMap
-from filters.kalman.online_output import OnlineOutput
+from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.models import left_only
@@ -21,7 +21,7 @@ def build(setup: Setup) -> Estimator:
     return OnlineOutput(Mapping(setup))
 
 
-class Mapping:
+class Mapping(Filter):
     """Takes the predicted pose for true and corrects every landmark by what is seen from it (Kang, eqs. 3-10).
 
     The report has no gate; here a sighting outside that of the outlier policy corrects nothing.

@@ -12,5 +12,4 @@ RUNG, CHANGE = 60, "+ past poses, tracks used at once but kept at their end; usu
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    window = SlidingWindowFilter(setup, AtLatestEstimates())
-    return Thinned(setup, OnlineOutput(window, window.log))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtLatestEstimates())))

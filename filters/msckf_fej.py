@@ -12,5 +12,4 @@ RUNG, CHANGE = 70, "+ first-estimate Jacobians"
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    window = SlidingWindowFilter(setup, AtFirstEstimates())
-    return Thinned(setup, OnlineOutput(window, window.log))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates())))

@@ -13,5 +13,4 @@ DEFAULT = True
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
-    window = SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks)
-    return Thinned(setup, OnlineOutput(window, window.log))
+    return Thinned(setup, OnlineOutput(SlidingWindowFilter(setup, AtFirstEstimates(), setup.settings.window.landmarks)))

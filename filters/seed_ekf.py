@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.kalman.correction import correct_landmarks, updated_by_pose_sightings
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
-from filters.kalman.online_output import OnlineOutput
+from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
@@ -37,7 +37,7 @@ def build(setup: Setup) -> Estimator:
     return OnlineOutput(SeedEkf(setup))
 
 
-class SeedEkf:
+class SeedEkf(Filter):
     """Equations 1 to 14 in the order the report gives them."""
 
     def __init__(self, setup: Setup) -> None:

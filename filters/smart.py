@@ -16,6 +16,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.thinning import Thinned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera
@@ -47,7 +48,8 @@ class Smart:
         self._camera = RobustCamera.of(setup.rig, outliers.smoother_huber)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._belief = self._motion.initial_belief(setup.prior)
+        self._belief = self._predicted = self._motion.initial_belief(setup.prior)
+        self._noise = MatchedNoise.of(setup)
         self._tracked = TrackedWindow.empty()
         self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
@@ -56,7 +58,7 @@ class Smart:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        tracked = self._extended(packet)
+        tracked = self._extended(self._noise.applied(packet))
         try:
             self._solution = solve_window(tracked.window, self._camera)
         except EstimatorError as refusal:
@@ -72,7 +74,7 @@ class Smart:
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
         self._complete_all()
-        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=tuple(self._log))
+        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=(*self._noise.told, *self._log))
 
     def _extended(self, packet: Packet) -> TrackedWindow:
         """Return the window with the packet's state, predicted, and its sightings."""
@@ -82,7 +84,7 @@ class Smart:
         prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
         expected = relative_to_its_map(self._belief).predicted(prediction)
         sound = self._outlier_check.without_outliers(packet.frame, points, expected)
-        self._belief = self._belief.predicted(prediction)
+        self._belief = self._predicted = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
     def _started(self, packet: Packet) -> TrackedWindow:
@@ -112,6 +114,7 @@ class Smart:
         self._complete([len(window.keys) - 1])
         self._points |= self._tracked.points_by_id()
         self._belief = self._belief.at(self._states[-1])
+        self._noise.learn(packet.frame.t_ns, self._predicted, self._belief)
 
     def _complete(self, places: Iterable[int]) -> None:
         """Give states of the window, by their places in it, the covariance they have there."""

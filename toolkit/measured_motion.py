@@ -178,6 +178,11 @@ class UnmeasuredMotion:
 Motion = TwistMotion | ImuMotion | UnmeasuredMotion
 
 
+def noise_scale_of(motion: TwistMotion | ImuMotion) -> Array:
+    """Return the factors (n, 2) on the noise of a motion's linear and angular samples."""
+    return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale
+
+
 MotionKind = Literal["twist", "imu", "none"]
 _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
     (TwistSamples, TwistNoise, "twist"),

@@ -13,6 +13,7 @@ from filters.kalman import joint_landmarks, multiview
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
+from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.triangulation import triangulate
@@ -51,6 +52,7 @@ class JointEkf:
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
+        self._noise = MatchedNoise.of(setup)
 
     @property
     def joint(self) -> JointBelief:
@@ -59,11 +61,13 @@ class JointEkf:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        propagate(self._joint, self._motion, self._at, packet.motion)
+        propagate(self._joint, self._motion, self._at, self._noise.applied(packet).motion)
+        predicted = self._joint.core
         self._joint.clone(packet.index)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
+        self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
@@ -72,6 +76,10 @@ class JointEkf:
         """Return every landmark there ever was, as last known."""
         self._memory.remember(self._joint.landmark_ids, self._joint.points)
         return self._memory.landmarks()
+
+    def log(self) -> tuple[str, ...]:
+        """Return what a user should know of the run."""
+        return self._noise.told
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""

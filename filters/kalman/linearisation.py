@@ -60,16 +60,10 @@ class AtFirstEstimates:
         return joint.first_points
 
 
-def propagate(
-    joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None, noise_scale: float = 1.0
-) -> None:
-    """Carry a joint belief over the motion between two frames, linearised as chosen; before the first there is none.
-
-    ``noise_scale`` is how many times the variance of the motion's noise is that stated.
-    """
+def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None) -> None:
+    """Carry a joint belief over the motion between two frames, linearised as chosen; before the first there is none."""
     if motion is None:
         return
     increment = model.integrate(motion, joint.core.bias)
     prediction = increment.predict(joint.core)
-    transition = at.transition(joint, increment, prediction)
-    joint.propagate(prediction._replace(noise=noise_scale * prediction.noise), transition)
+    joint.propagate(prediction, at.transition(joint, increment, prediction))

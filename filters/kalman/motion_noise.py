@@ -11,18 +11,25 @@ what is stated. It begins where a correction is one that chance makes once in a 
 bit, what it is without.
 """
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.special import chdtri
 
+from toolkit.estimator import Setup
 from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.measured_motion import ImuMotion, noise_scale_of
 from toolkit.models.state import POSE, Belief
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Packet
 
 # A correction beyond this quantile happens once in a million of a sound filter's frames.
 BY_CHANCE = 1e-6
 # Directions in which a correction takes away less of the variance than this are told by rounding.
 _LEAST_TAKEN = 1e-6
+# What rounds to 1.0 times the stated noise is none to speak of.
+_LEAST_TOLD = 1.05
 
 
 class CorrectionTest(NamedTuple):
@@ -44,11 +51,18 @@ def correction_test(before: Belief, after: Belief) -> CorrectionTest:
 
 
 class MatchedNoise:
-    """Matches the scale of the motion's variance to the corrections of so many latest frames as a window has."""
+    """Matches the variance of an IMU's white noise to the corrections of so many latest seconds as a window has."""
 
-    def __init__(self) -> None:
+    def __init__(self, window_s: float, matches: bool = True) -> None:
+        self._window_ns, self._matches = round(window_s * NS_PER_S), matches
         self._scales = [1.0]
-        self._tests: list[CorrectionTest] = []
+        self._tests: list[tuple[int, CorrectionTest]] = []
+
+    @classmethod
+    def of(cls, setup: Setup) -> Self:
+        """Return that of an estimator; twists, whose noise is measured from their own scatter, are believed."""
+        kind, settings = setup.motion_kind, setup.settings
+        return cls(settings.window.seconds(kind), settings.noise.match_imu and kind == "imu")
 
     @property
     def scale(self) -> float:
@@ -58,27 +72,40 @@ class MatchedNoise:
     @property
     def told(self) -> tuple[str, ...]:
         """Return what a user should know, a line, where the stated noise did not hold."""
-        if max(self._scales) == 1.0:
-            return ()
         most, usual = np.sqrt([max(self._scales), np.median(self._scales)])
+        if most < _LEAST_TOLD:
+            return ()
         return (
             f"the tracks contradict the IMU by more than chance allows: its noise was taken for up to {most:.1f} times "
             f"what is stated ({usual:.1f} at the median); stamps, calibration or the stated noise may not hold",
         )
 
-    def learn(self, test: CorrectionTest, frames: int) -> None:
-        """Take in the correction of one more frame by tracks of so many.
+    def applied(self, packet: Packet) -> Packet:
+        """Return a packet whose motion has the noise that it is taken for now."""
+        if self.scale == 1.0 or not isinstance(packet.motion, ImuMotion):
+            return packet
+        scaled = np.sqrt(self.scale) * noise_scale_of(packet.motion)
+        return replace(packet, motion=replace(packet.motion, noise_scale=scaled))
 
-        The scale follows the ratio of NIS to degrees of freedom as an exponential mean over so many frames does.
+    def learn(self, t_ns: int, predicted: Belief, corrected: Belief) -> None:
+        """Take in what a frame's tracks made of the state that was predicted for it."""
+        if self._matches:
+            self.take(t_ns, correction_test(predicted, corrected))
+
+    def take(self, t_ns: int, test: CorrectionTest) -> None:
+        """Take in the test of one more frame.
+
+        The scale follows the ratio of NIS to degrees of freedom as an exponential mean over a window's frames does.
         """
-        self._tests = [*self._tests, test][-frames:]
+        self._tests = [(t, each) for t, each in self._tests if t >= t_ns - self._window_ns] + [(t_ns, test)]
         scale = self.scale
         if scale > 1.0 or self._beyond_chance():
-            scale = max(1.0, scale * (1.0 + 2.0 / (frames + 1.0) * (test.nis / max(test.dof, 1) - 1.0)))
+            share = 2.0 / (len(self._tests) + 1.0)
+            scale = max(1.0, scale * (1.0 + share * (test.nis / max(test.dof, 1) - 1.0)))
         self._scales.append(scale)
 
     def _beyond_chance(self) -> bool:
-        nis, dof = np.sum(self._tests, axis=0)
+        nis, dof = np.sum([test for _, test in self._tests], axis=0)
         return bool(dof > 0 and nis > chdtri(dof, BY_CHANCE))
 
 

@@ -1,6 +1,5 @@
 """Makes an estimator of a filter, whose final answer is its online output: the estimates it gave frame by frame."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -10,7 +9,7 @@ from toolkit.sequence import Packet
 
 
 class Filter(Protocol):
-    """Answers at every frame and remembers its landmarks."""
+    """Answers at every frame and remembers its landmarks; a class that derives from it may leave out the log."""
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
@@ -18,12 +17,16 @@ class Filter(Protocol):
     def landmarks(self) -> Landmarks:
         """Return every landmark the filter ever had, as last known."""
 
+    def log(self) -> tuple[str, ...]:
+        """Return what a user should know of the run, in lines."""
+        return ()
+
 
 class OnlineOutput:
-    """Keeps the estimates of a filter; ``log`` is asked at the end for what a user should know of the run."""
+    """Keeps the estimates of a filter."""
 
-    def __init__(self, filter_: Filter, log: Callable[[], tuple[str, ...]] = tuple) -> None:
-        self._filter, self._log = filter_, log
+    def __init__(self, filter_: Filter) -> None:
+        self._filter = filter_
         self._estimates: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
@@ -33,7 +36,7 @@ class OnlineOutput:
 
     def finish(self) -> Finished:
         """Return the estimates of every frame and the landmarks as last known."""
-        return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._log())
+        return Finished(Trajectory.of(self._estimates), self._filter.landmarks(), log=self._filter.log())
 
 
 @dataclass

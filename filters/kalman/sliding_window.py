@@ -18,7 +18,7 @@ from filters.kalman import joint_landmarks, multiview, track_error_states
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.motion_noise import MatchedNoise, correction_test
+from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.track_error_states import TrackErrorBelief
@@ -58,13 +58,11 @@ class SlidingWindowFilter:
         self._track_test = track_test(setup.compilation)
         self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
         self._memory = LandmarkMemory()
-        # A twist's noise is measured from its own scatter; where its tracks contradict it, it is the tracks that err.
-        self._matches_noise = setup.settings.noise.match_imu and setup.motion_kind == "imu"
-        self._noise = MatchedNoise()
+        self._noise = MatchedNoise.of(setup)
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        propagate(self._joint, self._motion, self._at, packet.motion, self._noise.scale)
+        propagate(self._joint, self._motion, self._at, self._noise.applied(packet).motion)
         predicted = self._joint.core
         self._joint.clone(packet.index)
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
@@ -74,8 +72,7 @@ class SlidingWindowFilter:
         self._tracks.add_frame(_without(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
-        if self._matches_noise:
-            self._noise.learn(correction_test(predicted, self._joint.core), len(self._joint.clones))
+        self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._forget_clones(leaving)
         now = self._in_view.corrected(self._joint, self._tracks.unused())
         return now.estimate(packet.frame.t_ns, **gate.info())

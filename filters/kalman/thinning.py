@@ -10,8 +10,7 @@ import numpy as np
 
 from toolkit.estimate import Estimate, Finished, Trajectory
 from toolkit.estimator import Estimator, Setup
-from toolkit.geometry import Array
-from toolkit.measured_motion import ImuMotion, Motion, TwistMotion, UnmeasuredMotion
+from toolkit.measured_motion import ImuMotion, Motion, TwistMotion, UnmeasuredMotion, noise_scale_of
 from toolkit.models.motion import motion_model, predicted
 from toolkit.sequence import Packet
 
@@ -69,14 +68,10 @@ def _in_one(first: Motion | None, second: Motion | None) -> Motion | None:
         return UnmeasuredMotion(durations.sum(keepdims=True))
     scale = None
     if first.noise_scale is not None or second.noise_scale is not None:
-        scale = np.concatenate([_noise_scale(first), _noise_scale(second)])
+        scale = np.concatenate([noise_scale_of(first), noise_scale_of(second)])
     if isinstance(first, ImuMotion) and isinstance(second, ImuMotion):
         accel = np.concatenate([first.accel_mps2, second.accel_mps2])
         return ImuMotion(durations, accel, np.concatenate([first.gyro_radps, second.gyro_radps]), scale)
     assert isinstance(first, TwistMotion) and isinstance(second, TwistMotion)
     velocity = np.concatenate([first.v_mps, second.v_mps])
     return TwistMotion(durations, velocity, np.concatenate([first.w_radps, second.w_radps]), scale)
-
-
-def _noise_scale(motion: TwistMotion | ImuMotion) -> Array:
-    return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale

@@ -10,6 +10,7 @@ import gtsam
 import msgspec
 import numpy as np
 
+from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.alignment import aligned
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.refused_tracks import RefusedTracks
@@ -56,11 +57,12 @@ class GraphBuilder:
         self._points: dict[int, Array] = {}
         self.motion: MotionModel = motion_model(setup.noise, setup.gravity_world)
         self.belief: Belief = self.motion.initial_belief(setup.prior)
+        self._noise, self._predicted = MatchedNoise.of(setup), self.belief
 
     def extend(self, packet: Packet) -> GraphExtension:
         """Return what a packet adds, the new state being predicted from the latest known."""
         extension = GraphExtension()
-        expected = self._add_state(packet, extension)
+        expected = self._add_state(self._noise.applied(packet), extension)
         sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
         if self._rig.track_noise is not None:
             sound = self._aligned(sound, expected)
@@ -74,7 +76,12 @@ class GraphBuilder:
     def update(self, newest: Estimate, points: Mapping[int, Array]) -> None:
         """Take over the newest state and landmarks (3,) m as the smoother has them after a packet."""
         self.belief = self.belief.at(newest)
+        self._noise.learn(newest.t_ns, self._predicted, self.belief)
         self._points.update(points)
+
+    def log(self) -> tuple[str, ...]:
+        """Return what a user should know of the motion that was taken in."""
+        return self._noise.told
 
     def contradicted(self) -> set[int]:
         """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
@@ -96,6 +103,7 @@ class GraphBuilder:
             increment = self.motion.integrate(packet.motion, self.belief.bias)
             prediction = increment.predict(self.belief)
             self.belief, expected = self.belief.predicted(prediction), expected.predicted(prediction)
+            self._predicted = self.belief
             extension.factors.push_back(increment.factors(packet.index))
         return expected
 

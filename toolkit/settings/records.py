@@ -187,7 +187,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     ] = False
     match_imu: Annotated[
         bool,
-        Meta(description="windowed filters take an IMU for noisier than stated where tracks contradict it"),
+        Meta(description="causal estimators take an IMU for noisier than stated where tracks contradict it"),
     ] = True
 
 
