@@ -76,8 +76,8 @@ class MatchedNoise:
         if most < _LEAST_TOLD:
             return ()
         return (
-            f"the tracks contradict the IMU by more than chance allows: its noise was taken for up to {most:.1f} times "
-            f"what is stated ({usual:.1f} at the median); stamps, calibration or the stated noise may not hold",
+            f"the tracks contradict the IMU: its noise was taken for up to {most:.1f} times what is stated ({usual:.1f} "
+            "at the median); check stamps, calibration and the stated noise",
         )
 
     def applied(self, packet: Packet) -> Packet:
