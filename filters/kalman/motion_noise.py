@@ -76,8 +76,8 @@ class MatchedNoise:
         if most < _LEAST_TOLD:
             return ()
         return (
-            f"the tracks contradict the IMU: its noise was taken for up to {most:.1f} times what is stated ({usual:.1f} "
-            "at the median); check stamps, calibration and the stated noise",
+            f"the tracks contradict the IMU: its noise was taken for up to {most:.1f} times what is stated "
+            f"({usual:.1f} at the median); check stamps, calibration and the stated noise",
         )
 
     def applied(self, packet: Packet) -> Packet:
