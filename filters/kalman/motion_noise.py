@@ -7,8 +7,8 @@ tilt take most of it, which nothing else measures: gravity is then turned for go
 
 So the variance of the motion's noise is matched to the corrections ("covariance matching": Mehra 1972, "Approaches to
 adaptive filtering"; for process noise Mohamed & Schwarz 1999, "Adaptive Kalman filtering for INS/GPS"), never below
-what is stated. It begins where a correction is one that chance makes once in a million: a sound filter stays, to the
-bit, what it is without.
+what is stated. It begins where the corrections of a window add up to what chance does once in a million: a sound filter
+stays, to the bit, what it is without.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from toolkit.models.state import POSE, Belief
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
-# A correction beyond this quantile happens once in a million of a sound filter's frames.
+# The corrections of a sound filter's window are beyond this quantile once in a million.
 BY_CHANCE = 1e-6
 # Directions in which a correction takes away less of the variance than this are told by rounding.
 _LEAST_TAKEN = 1e-6
