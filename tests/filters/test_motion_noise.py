@@ -70,6 +70,12 @@ def test_the_noise_is_never_taken_for_less_than_stated():
     assert noise.scale == 1.0
 
 
+def test_what_no_noise_explains_is_not_taken_for_noise_without_end():
+    noise = MatchedNoise(WINDOW_S)
+    taken_in(noise, [1e12] * 40)
+    assert noise.scale == 1e4
+
+
 def test_one_correction_within_chance_moves_nothing_and_many_alike_do():
     noise = MatchedNoise(WINDOW_S)
     taken_in(noise, [40.0])  # by chance once in two thousand
