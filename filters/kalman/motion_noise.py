@@ -48,7 +48,8 @@ def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
     taken = per_sigma[:, None] * (before.cov - after.cov) * per_sigma
     shares, axes = np.linalg.eigh(taken)
-    told = shares > _LEAST_TAKEN
+    # What is linearised anew may add to a covariance; less taken away than was added elsewhere tells nothing.
+    told = shares > max(_LEAST_TAKEN, -shares[0])
     moved = axes[:, told].T @ (per_sigma * _change(before, after))
     return CorrectionTest(float((moved**2 / shares[told]).sum()), int(told.sum()))
 
