@@ -18,9 +18,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.measured_motion import ImuMotion, noise_scale_of
-from toolkit.models.state import POSE, Belief
+from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
@@ -50,7 +49,7 @@ def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     shares, axes = np.linalg.eigh(taken)
     # What is linearised anew may add to a covariance; less taken away than was added elsewhere tells nothing.
     told = shares > max(_LEAST_TAKEN, -shares[0])
-    moved = axes[:, told].T @ (per_sigma * _change(before, after))
+    moved = axes[:, told].T @ (per_sigma * before.error_to(after))
     return CorrectionTest(float((moved**2 / shares[told]).sum()), int(told.sum()))
 
 
@@ -112,15 +111,3 @@ class MatchedNoise:
     def _beyond_chance(self) -> bool:
         nis, dof = np.sum([test for _, test in self._tests], axis=0)
         return bool(dof > 0 and nis > chdtri(dof, BY_CHANCE))
-
-
-def _change(before: Belief, after: Belief) -> Array:
-    """Return the error (d,) by which a belief was moved."""
-    change, layout = np.empty(before.layout.size), before.layout
-    change[POSE] = se3_log(se3_inverse(before.T_world_imu) @ after.T_world_imu)
-    if layout.velocity is not None:
-        change[layout.velocity] = before.T_world_imu[:3, :3].T @ (after.v_world - before.v_world)
-    if layout.accel_bias is not None:
-        change[layout.accel_bias] = after.bias[:3] - before.bias[:3]
-    change[layout.gyro_bias] = after.bias[3:] - before.bias[3:]
-    return change

@@ -38,6 +38,14 @@ def some_belief(sequence: Sequence, seed: int = 0) -> Belief:
 
 
 @each_motion
+def test_the_error_to_a_moved_belief_is_what_moved_it(scenario):
+    sequence, _ = recorded(scenario)
+    belief, rng = some_belief(sequence), np.random.default_rng(3)
+    error = 0.3 * rng.standard_normal(len(belief.cov))
+    np.testing.assert_allclose(belief.error_to(belief.moved(error, belief.cov)), error, rtol=0.0, atol=1e-14)
+
+
+@each_motion
 def test_what_is_inserted_is_read(scenario):
     sequence, packet = recorded(scenario)
     model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()

@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from toolkit.estimate import Estimate
-from toolkit.geometry import Array, se3_exp
+from toolkit.geometry import Array, se3_exp, se3_inverse, se3_log
 from toolkit.sequence import Prior
 
 ROTATION, POSITION, POSE = slice(0, 3), slice(3, 6), slice(0, 6)
@@ -83,6 +83,17 @@ class Belief:
             bias[:3] += delta[self.layout.accel_bias]
         bias[3:] += delta[self.layout.gyro_bias]
         return Belief(self.layout, self.T_world_imu @ step, v_world, bias, self.cov)
+
+    def error_to(self, other: "Belief") -> Array:
+        """Return the error (d,) that moves the belief's mean to another's: what :meth:`moved` takes."""
+        error, layout = np.zeros(self.layout.size), self.layout
+        error[POSE] = se3_log(se3_inverse(self.T_world_imu) @ other.T_world_imu)
+        if layout.velocity is not None:
+            error[layout.velocity] = self.T_world_imu[:3, :3].T @ (other.v_world - self.v_world)
+        if layout.accel_bias is not None:
+            error[layout.accel_bias] = other.bias[:3] - self.bias[:3]
+        error[layout.gyro_bias] = other.bias[3:] - self.bias[3:]
+        return error
 
     def predicted(self, prediction: Prediction) -> "Belief":
         """Return the belief at the end of an interval: its mean as predicted, its covariance F P F^T + Q."""

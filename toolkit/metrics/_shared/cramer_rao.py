@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 
 from toolkit.estimate import Output, Trajectory
-from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.consistency import starts_in_the_truths_world
@@ -31,7 +31,7 @@ from toolkit.models import left_only, stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import chi2_bound
 from toolkit.models.motion import MotionModel, motion_model
-from toolkit.models.state import POSE, Belief, Layout
+from toolkit.models.state import Belief, Layout
 from toolkit.models.state_covariances import state_covs
 from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is_left_only
 
@@ -162,7 +162,7 @@ def _motion_chi_square(problem: _Problem) -> float:
     for before, packet in zip(problem.states, problem.packets[1:], strict=False):
         assert packet.motion is not None
         prediction = problem.model.integrate(packet.motion, before.bias).predict(before)
-        error = offset(before.predicted(prediction), problem.states[packet.index])
+        error = before.predicted(prediction).error_to(problem.states[packet.index])
         distances.append(float(error @ np.linalg.solve(prediction.noise, error)) / error.size)
     return float(np.mean(distances)) if distances else 1.0
 
@@ -220,18 +220,6 @@ def _landmarks(packets: tuple[Packet, ...], poses: Array, rig: StereoRig) -> tup
     return track_ids, points
 
 
-def offset(state: Belief, truth: Belief) -> Array:
-    """Return the error (d,) that takes a state to the truth, in the layout's order and in the body frame."""
-    layout, error = state.layout, np.zeros(state.layout.size)
-    error[POSE] = se3_log(se3_inverse(state.T_world_imu) @ truth.T_world_imu)
-    if layout.velocity is not None:
-        error[layout.velocity] = state.T_world_imu[:3, :3].T @ (truth.v_world - state.v_world)
-    if layout.accel_bias is not None:
-        error[layout.accel_bias] = truth.bias[:3] - state.bias[:3]
-    error[layout.gyro_bias] = truth.bias[3:] - state.bias[3:]
-    return error
-
-
 def _causal(problem: _Problem) -> Efficient:
     """Carry the information of state and landmarks forward; a landmark leaves it with its last sighting."""
     last_seen = np.zeros(problem.track_ids.size, dtype=np.int64)
@@ -256,7 +244,7 @@ class _Information:
     def __init__(self, problem: _Problem) -> None:
         self._problem, self._size = problem, problem.prior.layout.size
         self._matrix = np.asarray(np.linalg.inv(problem.prior.cov))
-        self._vector: Array = self._matrix @ offset(problem.states[0], problem.prior)
+        self._vector: Array = self._matrix @ problem.states[0].error_to(problem.prior)
         self._landmarks = np.empty(0, dtype=np.int64)  # rows of the problem's landmarks
 
     def predict(self, packet: Packet) -> None:
@@ -270,7 +258,7 @@ class _Information:
         at_truth = prediction._replace(T_world_imu=now.T_world_imu, v_world=now.v_world)
         transition, precision = increment.transition_between(before, at_truth), np.linalg.inv(prediction.noise)
         # The measured motion says that the next state's offset is F x + r, but for its noise.
-        r = offset(now, before.predicted(prediction))
+        r = now.error_to(before.predicted(prediction))
         weighted = transition.T @ precision
         to_next = np.concatenate([-weighted, self._matrix[:d, d:]], axis=1)
         score = self._vector[:d] - weighted @ r
@@ -339,5 +327,5 @@ def _final(problem: _Problem) -> Efficient:
     poses = np.stack([state.T_world_imu for state in problem.states])
     covs = state_covs(linear, model, poses)
     moved = values.retract(linear.optimize())
-    errors = [offset(state.at(model.read(moved, k, 0)), state) for k, state in enumerate(problem.states)]
+    errors = [state.at(model.read(moved, k, 0)).error_to(state) for k, state in enumerate(problem.states)]
     return Efficient(problem.prior.layout, covs, np.array(errors))
