@@ -34,6 +34,15 @@ def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch: pytest.
     assert lines[-1].startswith("drive: batch, iteration 5 % [")
 
 
+def test_the_time_left_is_not_told_from_the_first_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
+    stream = io.StringIO()
+    with progress.on_stream(stream)("drive") as watched:
+        for done in (1, 2, 20):
+            watched.advance(done, 1000)
+    assert ["left" in line for line in stream.getvalue().splitlines()] == [False, False, True]
+
+
 def test_lines_of_long_work_are_ever_more_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
     clock_s = itertools.count()
     monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock_s)))

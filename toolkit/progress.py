@@ -17,6 +17,9 @@ LOG_EVERY_S = 10.0
 _SELDOM_AFTER_S, _MOST_SELDOM = 200.0, 30.0
 _FORMAT = "{desc} {percentage:3.0f} %|{bar}| {n_fmt}/{total_fmt} [{elapsed}, left {remaining}]"
 _LOG_FORMAT = "{desc} {percentage:.0f} % [{elapsed}, left {remaining}]"
+# The first steps hold what comes once, as reading and compiling: with less than this done, the time left is a guess.
+_LEAST_SHARE = 0.02
+_LOG_FORMAT_BEFORE = "{desc} {percentage:.0f} % [{elapsed}]"
 
 
 class Progress(Protocol):
@@ -109,7 +112,8 @@ class _Log:
         from tqdm import tqdm
 
         label = f"{self._label}, {stage}" if stage else self._label
-        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=_LOG_FORMAT)
+        line = _LOG_FORMAT if done >= _LEAST_SHARE * total else _LOG_FORMAT_BEFORE
+        meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=line)
         self._stream.write(f"{meter}\n")
         self._stream.flush()
         self._told_s = now_s
