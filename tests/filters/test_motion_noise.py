@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.motion_noise import CorrectionTest, MatchedNoise, correction_test
+from filters.kalman.motion_noise import MatchedNoise
 from toolkit.metrics import score_run
+from toolkit.models.corrections import CorrectionTest, correction_test
 from toolkit.models.motion import motion_model
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import Noise, Settings
