@@ -9,8 +9,8 @@ than dead reckoning, or where the audit found something in its recording, repair
 judged do not count. In a sound recording all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third` and
-`fourth` are draws of others yet, with one recording drawn for every fault.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`,
+`fourth` and `fifth` are draws of others yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -84,8 +84,8 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again", "third", "fourth")
-DRAWN = ("fresh", "again", "third", "fourth")
+HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth")
+DRAWN = ("fresh", "again", "third", "fourth", "fifth")
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
