@@ -27,9 +27,9 @@ CAUSAL_ONLY = "corrections from frame to frame belong to the causal output"
 TREND, LIMIT = "correction_trend", "correction_trend_limit"
 # What all tracks of some frames share adds up within it; longer ones lose what biases absorb.
 _STRETCH_S = 1.0
-# A consistent estimator is beyond the limit less than once in a million runs. Linearised filters are not consistent:
-# they count some of their information twice, in simulations up to two thirds of it. Twice what chance allows covers
-# that. Chosen with 36 sound simulated runs of each of ekf, ekf-slam and msckf in view.
+# A consistent estimator is beyond half of the limit less than once in a million runs. The other half is for filters
+# that linearise at estimates they have since corrected, and so count some information twice: chosen with 36 sound
+# simulated runs of each of three filters in view, one of which it leaves beyond the limit (docs/metrics.md).
 _BY_CHANCE, _BY_LINEARISATION = 1e-6, 2.0
 METRICS = (
     Metric(
