@@ -43,7 +43,7 @@ class CorrectionTest(NamedTuple):
 
 def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     """Test what measurements made of a belief against the covariance that they took away."""
-    sigma = np.sqrt(np.diag(before.cov))
+    sigma = np.sqrt(before.cov.diagonal())
     per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
     taken = per_sigma[:, None] * (before.cov - after.cov) * per_sigma
     shares, axes = np.linalg.eigh(taken)
@@ -109,5 +109,5 @@ class MatchedNoise:
         self._scales.append(scale)
 
     def _beyond_chance(self) -> bool:
-        nis, dof = np.sum([test for _, test in self._tests], axis=0)
+        nis, dof = sum(test.nis for _, test in self._tests), sum(test.dof for _, test in self._tests)
         return bool(dof > 0 and nis > chdtri(dof, BY_CHANCE))
