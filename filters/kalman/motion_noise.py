@@ -43,7 +43,7 @@ class CorrectionTest(NamedTuple):
 
 def correction_test(before: Belief, after: Belief) -> CorrectionTest:
     """Test what measurements made of a belief against the covariance that they took away."""
-    sigma = np.sqrt(before.cov.diagonal())
+    sigma = np.sqrt(np.diag(before.cov))
     per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
     taken = per_sigma[:, None] * (before.cov - after.cov) * per_sigma
     shares, axes = np.linalg.eigh(taken)
