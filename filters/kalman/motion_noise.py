@@ -88,5 +88,5 @@ class MatchedNoise:
         self._scales.append(scale)
 
     def _beyond_chance(self) -> bool:
-        nis, dof = np.sum([test for _, test in self._tests], axis=0)
+        nis, dof = sum(test.nis for _, test in self._tests), sum(test.dof for _, test in self._tests)
         return bool(dof > 0 and nis > chdtri(dof, BY_CHANCE))

@@ -101,9 +101,12 @@ class ImuIncrement:
         moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
         accelerated = to_start @ (end.v_world - start.v_world - self.gravity_world * dt_s)
         transition = end.transition.copy()
-        transition[ROTATION, ROTATION] = turned_back
-        transition[POSITION, :9] = turned_back @ np.hstack([-skew(moved), np.eye(3), dt_s * np.eye(3)])
-        transition[_VELOCITY, :9] = turned_back @ np.hstack([-skew(accelerated), np.zeros((3, 3)), np.eye(3)])
+        for block in (ROTATION, POSITION, _VELOCITY):
+            transition[block, block] = turned_back
+        transition[POSITION, ROTATION], transition[_VELOCITY, ROTATION] = -(
+            turned_back @ skew(np.array([moved, accelerated]))
+        )
+        transition[POSITION, _VELOCITY], transition[_VELOCITY, POSITION] = dt_s * turned_back, 0.0
         return transition
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
