@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.association import finite_poses
 from toolkit.metrics._shared.residuals import reprojection_errors_px
 from toolkit.models import left_only
 from toolkit.sequence import Observations, StereoRig
@@ -164,19 +164,20 @@ def _dot(first: Array, second: Array) -> Array:
     return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
-def errors_left_out(observations: Observations, evaluation: Evaluation) -> tuple[IntArray, Array]:
+def errors_left_out(observations: Observations, poses: Array, rig: StereoRig) -> tuple[IntArray, Array]:
     """Return which sightings (M,) have enough views with a pose, and their leave-one-view-out errors (M,) px.
 
-    They are in the order of tracks, each track's by frame.
+    They are in the order of tracks, each track's by frame. ``poses`` (K, 4, 4) T_world_imu are those of all frames, NaN
+    where there is none.
     """
-    posed = np.flatnonzero(evaluation.has_pose[observations.frame])
+    posed = np.flatnonzero(finite_poses(poses)[observations.frame])
     by_track = posed[np.lexsort((observations.frame[posed], observations.track_id[posed]))]
     _, track, views = np.unique(observations.track_id[by_track], return_inverse=True, return_counts=True)
     rows = by_track[views[track] >= FEWEST_VIEWS]
-    enough, rig = observations.select(rows), evaluation.sequence.rig
+    enough = observations.select(rows)
     if not rows.size:
         return rows, np.empty(0)
-    T_world_cam = evaluation.poses_of_frames[enough.frame] @ rig.T_imu_cam
+    T_world_cam = poses[enough.frame] @ rig.T_imu_cam
     predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
     return rows, reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
 
