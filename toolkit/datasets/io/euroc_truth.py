@@ -54,16 +54,18 @@ class Choice:
     reason: str
 
 
-def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
+def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> Choice:
     """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
 
-    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged.
+    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged;
+    ``images`` says why tracks are not made of images, nothing where there are none.
     """
     choice = find_truth(root, mav0, imu)
     if choice is None:
         raise DataError(
             f"{root}: no ground truth in mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it, "
-            "and the stereo tracks are simulated along it; add the truth"
+            "and the stereo tracks are simulated along it where there are no images; add one of them"
+            f"{f': {images}' if images else ''}"
         )
     return choice
 

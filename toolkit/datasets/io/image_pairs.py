@@ -47,8 +47,13 @@ def images_only(path: Path, tracks: Tracks) -> bool:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the image files of a folder by name; none where there is no such folder."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    """Return the image files of a folder by name, without hidden ones; none where there is no such folder.
+
+    A Mac puts a hidden ``._name.png`` beside each image on a disk of another system, which is none.
+    """
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
 
 
 def image_folder(camera: Path) -> Path:
@@ -61,7 +66,7 @@ def image_folder(camera: Path) -> Path:
 def pairs_of_asl(mav0: Path) -> Listed:
     """Pair the images of cam0 and cam1 by their stamps; files that are listed and missing stay in, to be named.
 
-    Raises DataError where a table is damaged.
+    Raises DataError where a table is damaged, or no image of either camera has one of the other of the same instant.
     """
     left, right = (_files(mav0 / camera) for camera in ("cam0", "cam1"))
     remarks = []
@@ -72,6 +77,12 @@ def pairs_of_asl(mav0: Path) -> Listed:
         remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.camera} had the stamp of another; left out")
     partner = _nearest(right.t_ns, t_ns)
     alone = int((partner < 0).sum())
+    if 0 < alone == t_ns.size and right.t_ns.size:
+        off_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0)))
+        raise DataError(
+            f"{mav0}: no image of cam0 has one of cam1 within 1 ms, the nearest is {off_ms:.4g} ms away (median): a "
+            "stereo pair has one trigger; where only the clocks of the cameras differ, mend the stamps of cam1"
+        )
     if alone:
         remarks.append(f"{alone} left images have no right one within 1 ms and are left out")
     pairs = tuple(
@@ -85,10 +96,11 @@ def pairs_of_asl(mav0: Path) -> Listed:
 def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     """Pair images whose names are the same number; ``t_ns`` has the stamp of each number.
 
-    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said.
+    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said. Either
+    camera may write its numbers with other leading zeros or another suffix.
     """
-    numbers = {int(path.stem): path.suffix for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
-    names = {int(path.stem): path.stem for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    lefts, rights = _numbered(left), _numbered(right)
+    numbers = lefts.keys() | rights.keys()
     stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
     remarks = []
     if len(stamped) < len(numbers):
@@ -98,10 +110,11 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     pairs: list[StampedPair] = []
     for stamp, number in stamped:
         if pairs and pairs[-1].t_ns == stamp:
-            remarks.append(f"image {names[number]} has the stamp of another and is left out")
+            remarks.append(f"image {number} has the stamp of another and is left out")
             continue
-        name = f"{names[number]}{numbers[number]}"
-        pairs.append(StampedPair(stamp, left / name, right / name))
+        paths = lefts.get(number), rights.get(number)
+        name = (paths[0] or paths[1] or left).name
+        pairs.append(StampedPair(stamp, paths[0] or left / name, paths[1] or right / name))
     return Listed(tuple(pairs), len(numbers), tuple(remarks))
 
 
@@ -116,13 +129,18 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     in_order = all((np.diff([stamps[n] for n in sorted(stamps)]) > 0).all() for stamps in (t_ns, right_t_ns))
     if not in_order or all(number == other for number, other in partner.items()):
         return pairs_by_name(left, right, t_ns)
-    lefts, rights = ({int(p.stem): p for p in images_in(side) if p.stem.isdecimal()} for side in (left, right))
+    lefts, rights = _numbered(left), _numbered(right)
     paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
     remarks = ["the cameras' images are numbered differently and paired by their stamps"]
     if len(paired) < len(lefts):
         remarks.append(f"{len(lefts) - len(paired)} left images have no right one of the same time and are left out")
     pairs = tuple(StampedPair(stamp, path, rights.get(other, right / path.name)) for stamp, path, other in paired)
     return Listed(pairs, len(lefts), tuple(remarks))
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Return the images of a folder whose names are numbers, by number."""
+    return {int(path.stem): path for path in images_in(folder) if path.stem.isdecimal()}
 
 
 def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:
