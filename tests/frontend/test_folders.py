@@ -425,13 +425,19 @@ def as_rows(key: str, T: Any) -> str:
     return f"  {key}:\n" + "".join(f"  - [{', '.join(f'{x:.12g}' for x in row)}]\n" for row in T)
 
 
+def as_opencv(key: str, T: Any) -> str:
+    numbers = ", ".join(f"{x:.12g}" for x in T.ravel())
+    return f"  {key}: !!opencv-matrix\n    rows: 4\n    cols: 4\n    dt: d\n    data: [{numbers}]\n"
+
+
+@pytest.mark.parametrize("write", [as_rows, as_opencv])
 @pytest.mark.parametrize("key", ["T_cam_imu", "T_cn_cnm1"])
-def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str) -> None:
+def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str, write: Callable[..., str]) -> None:
     before = load_sequence(str(asl))
     T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
     T_right_left = _right_left(asl)
     second = T_right_left if key == "T_cn_cnm1" else T_right_left @ T_left_imu
-    kalibr(asl, lambda c: as_rows("T_cam_imu", T_left_imu) if c == 0 else as_rows(key, second))
+    kalibr(asl, lambda c: write("T_cam_imu", T_left_imu) if c == 0 else write(key, second))
     after = load_sequence(str(asl))
     np.testing.assert_allclose(after.rig.T_imu_cam, before.rig.T_imu_cam, atol=1e-9)
     assert after.rig.baseline_m == pytest.approx(before.rig.baseline_m, rel=1e-9)
