@@ -384,6 +384,14 @@ def test_the_commonest_fault_is_the_one_told(asl: Path, capsys: pytest.CaptureFi
     assert "it is empty" not in told
 
 
+def test_of_a_recording_with_few_of_its_images_these_are_used_where_asked_for(asl: Path) -> None:
+    for path in images(asl, 1)[2:9]:
+        path.unlink()
+    sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert sequence.frame_count == FRAMES - 7
+    assert f"7 of {FRAMES} image pairs lack a file and are left out" in sequence.provenance.facts
+
+
 def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
     for camera in (0, 1):
         for path in reversed(images(asl, camera)):
@@ -392,6 +400,8 @@ def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: 
     (asl / "truth.tum").unlink()
     with pytest.raises(DataError, match=r"no ground truth .* 0\.0 % of the camera's stamps have both images"):
         load_sequence(str(asl))
+    with pytest.raises(DataError, match=r"none of the 10 image pairs .* is there, as 1403.*\.png in cam0/data"):
+        load_sequence(str(asl), 0, Frontend(tracks="images"))
 
 
 def test_hidden_files_beside_images_are_no_images(asl: Path) -> None:

@@ -190,7 +190,7 @@ def _few_images(layout: _Layout) -> Iterator[str]:
         return
     share = _share_with_images(layout.mav0, layout.stamps)
     if share < _NEARLY_ALL:
-        what = "uses those there are" if share > 0.0 else "says why none can be used"
+        what = "uses those there are" if share > 0.0 else "says why"
         yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images {what}"
 
 
@@ -208,7 +208,14 @@ def _filmed(
     """Return the pairs within the IMU's time with their cameras, and what had to be put right."""
     if calibration.cameras is None:
         raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
-    listed = pairs_of_asl(mav0)
+    named = pairs_of_asl(mav0)
+    listed = named.there(_NEARLY_ALL)
+    if named.pairs and not listed.pairs:
+        first = named.pairs[0].left
+        raise DataError(
+            f"{mav0}: none of the {len(named.pairs)} image pairs of the tables is there, as {first.name} in "
+            f"{first.parent.relative_to(mav0)}; take these images' own data.csv, or none, where their names are stamps"
+        )
     check_frame_count(layout.root, len(listed.pairs))
     check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, "the samples of the IMU")
     within = listed.within(imu.t_ns)

@@ -30,6 +30,17 @@ class Listed:
     stamps: int
     remarks: tuple[str, ...] = ()
 
+    def there(self, least: float) -> "Listed":
+        """Return the pairs of which both files are there, with a remark, where their share is below the least.
+
+        Of a recording that has nearly all its files those that are missing stay in, to be named one by one.
+        """
+        pairs = tuple(pair for pair in self.pairs if is_regular(pair.left) and is_regular(pair.right))
+        if len(pairs) >= least * len(self.pairs):
+            return self
+        remark = f"{len(self.pairs) - len(pairs)} of {len(self.pairs)} image pairs lack a file and are left out"
+        return replace(self, pairs=pairs, remarks=(*self.remarks, remark))
+
     def within(self, motion_t_ns: IntArray) -> "Listed":
         """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out."""
         first, last = int(motion_t_ns.min()), int(motion_t_ns.max())
