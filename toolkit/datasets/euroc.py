@@ -26,7 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
 from toolkit.datasets.io.fields import check_frame_count, observations
-from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock
+from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock, check_one_trigger
 from toolkit.datasets.io.image_pairs import facts_of, image_folder, images_in, pairs_of_asl, rig_of
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
@@ -209,6 +209,7 @@ def _filmed(
     if calibration.cameras is None:
         raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
     named = pairs_of_asl(mav0)
+    check_one_trigger(mav0, named)
     listed = named.there(_NEARLY_ALL)
     if named.pairs and not listed.pairs:
         first = named.pairs[0].left
@@ -231,7 +232,9 @@ def _share_with_images(mav0: Path, stamps: Path) -> float:
         count = np.unique(read_stamps(stamps)).size if is_regular(stamps) else 0
         listed = pairs_of_asl(mav0)
     except DataError:
-        return 1.0  # there are images: what is wrong with their table is said when it is read
+        return 1.0  # there are images: what is wrong with their stamps is said when they are read
+    if listed.apart_ms is not None:
+        return 1.0  # as above
     there = sum(is_regular(pair.left) and is_regular(pair.right) for pair in listed.pairs)
     return there / max(count, listed.stamps, 1)
 

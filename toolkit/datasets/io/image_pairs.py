@@ -24,11 +24,15 @@ _NAMED = 10
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """Pairs in order of time, how many stamps the left camera has, and what had to be put right, in words."""
+    """Pairs in order of time, how many stamps the left camera has, and what had to be put right, in words.
+
+    ``apart_ms`` is how far from each left image the nearest right one is (median) where none is of its instant.
+    """
 
     pairs: tuple[StampedPair, ...]
     stamps: int
     remarks: tuple[str, ...] = ()
+    apart_ms: float | None = None
 
     def there(self, least: float) -> "Listed":
         """Return the pairs of which both files are there, with a remark, where their share is below the least.
@@ -77,7 +81,7 @@ def image_folder(camera: Path) -> Path:
 def pairs_of_asl(mav0: Path) -> Listed:
     """Pair the images of cam0 and cam1 by their stamps; files that are listed and missing stay in, to be named.
 
-    Raises DataError where a table is damaged, or no image of either camera has one of the other of the same instant.
+    Raises DataError where a table is damaged.
     """
     left, right = (_files(mav0 / camera) for camera in ("cam0", "cam1"))
     remarks = []
@@ -88,12 +92,6 @@ def pairs_of_asl(mav0: Path) -> Listed:
         remarks.append(f"{left.t_ns.size - t_ns.size} images of {left.camera} had the stamp of another; left out")
     partner = _nearest(right.t_ns, t_ns)
     alone = int((partner < 0).sum())
-    if 0 < alone == t_ns.size and right.t_ns.size:
-        off_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0)))
-        raise DataError(
-            f"{mav0}: no image of cam0 has one of cam1 within 1 ms, the nearest is {off_ms:.4g} ms away (median): a "
-            "stereo pair has one trigger; where only the clocks of the cameras differ, mend the stamps of cam1"
-        )
     if alone:
         remarks.append(f"{alone} left images have no right one within 1 ms and are left out")
     pairs = tuple(
@@ -101,7 +99,9 @@ def pairs_of_asl(mav0: Path) -> Listed:
         for t, i, j in zip(t_ns, first, partner, strict=True)
         if j >= 0
     )
-    return Listed(pairs, t_ns.size, tuple(remarks))
+    none = 0 < alone == t_ns.size and right.t_ns.size > 0
+    apart_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0))) if none else None
+    return Listed(pairs, t_ns.size, tuple(remarks), apart_ms)
 
 
 def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
