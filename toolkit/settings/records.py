@@ -189,6 +189,12 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         bool,
         Meta(description="causal estimators take an IMU for noisier than stated where tracks contradict it"),
     ] = True
+    match_tracks: Annotated[
+        bool,
+        Meta(
+            description="white noise: windowed filters take tracks for less where residuals along them are correlated"
+        ),
+    ] = True
 
 
 class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
