@@ -31,6 +31,7 @@ from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gap_bridge import gap_bridge_for
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
@@ -63,6 +64,7 @@ class SlidingWindowFilter:
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup)
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
@@ -77,9 +79,12 @@ class SlidingWindowFilter:
         self._tracks.add_frame(_without(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
+        self._correct_by_bridge(packet.frame)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._forget_clones(leaving)
         now = self._in_view.corrected(self._joint, self._tracks.unused(), share)
+        if self.bridge is not None:
+            self.bridge.learn(now.T_world_imu)
         return now.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
@@ -131,6 +136,17 @@ class SlidingWindowFilter:
             )
         joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
         self._correlation.learn(accepted.sightings, accepted.points, joint.clones)
+
+    def _correct_by_bridge(self, frame: StereoFrame) -> None:
+        """Correct the last three poses where no track leads from one of them to the next."""
+        if self.bridge is None:
+            return
+        kept, joint = self.bridge.added(frame), self._joint
+        if kept is not None:
+            H = kept.derivatives(self._at.clones(joint)[-3:]) / kept.sigmas[:, None]
+            residual = -kept.change(joint.clones[-3:]) / kept.sigmas
+            end = joint.clone_columns.stop
+            joint.update(H, residual, slice(end - H.shape[1], end))
 
     def _add_landmarks(self, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
         if isinstance(self._joint, TrackErrorBelief):

@@ -1,4 +1,4 @@
-"""Smoothers that bridge gaps between tracks: less error there, no more claimed than they know, no change elsewhere."""
+"""Estimators that bridge gaps between tracks: less error there, no more claimed than they know, no change elsewhere."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ SCENARIO = replace(
 BRIDGED = Noise(bridge_gaps=True)
 
 
-@pytest.mark.parametrize("name", ["fixed-lag", "batch"])
+@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam", "fixed-lag", "batch"])
 def test_the_error_is_lower_and_not_claimed_to_be_lower_still(name, run_estimator):
     """All tracks end before one frame in twelve."""
     errors_m, nees = [], []
