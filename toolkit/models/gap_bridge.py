@@ -26,6 +26,8 @@ _STATED_FOR = 10
 _MOST_SIGMAS = 3.0
 # Measured twists that change by less than so many times the mean square of what the body's does are not noisy.
 _NOISY = 2.0
+# A share of the stated noise that is rounding where twists do not change at all.
+_ROUNDING = 1e-6
 
 
 def gaps(frames: Sequence[StereoFrame]) -> IntArray:
@@ -43,8 +45,8 @@ class TwistChange:
 
     def __init__(self, measured: TwistNoise) -> None:
         self._measured = np.concatenate([measured.gyro_noise_density, measured.velocity_noise_density])
-        self._squares, self._count = np.zeros(6), 0
-        self._measured_squares = np.zeros(6)
+        self._squares, self._measured_squares, self._count = np.zeros(6), np.zeros(6), 0
+        self._stated = np.zeros(6)
 
     def learn(self, t_ns: IntArray, poses: Array, measured: Array) -> None:
         """Take in three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks lead on.
@@ -56,24 +58,28 @@ class TwistChange:
         twists = [se3_log(se3_inverse(poses[i]) @ poses[i + 1]) / dt_s for i, dt_s in ((0, before_s), (1, after_s))]
         change = np.square(twists[1] - twists[0]) / between_s
         if not self._count:
-            self._squares, self._count = _STATED_FOR * 2.0 * np.square(self._measured / between_s), _STATED_FOR
-        self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._squares / self._count)
-        self._count += 1
+            self._stated = 2.0 * np.square(self._measured / between_s)
+        self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._mean_squares)
         self._measured_squares = self._measured_squares + np.square(measured[1] - measured[0]) / between_s
+        self._count += 1
 
     @property
     def is_below_that_measured(self) -> bool:
         """Say whether measured twists change by much more than the body's does, as noisy ones do."""
-        seen = max(self._count - _STATED_FOR, 1)
-        return bool(self._count and (self._measured_squares / seen > _NOISY * self._squares / self._count).any())
+        rounding = _ROUNDING * self._count * self._stated
+        return bool((self._measured_squares > _NOISY * self._squares + rounding).any())
 
     @property
     def noise(self) -> TwistChangeNoise | None:
         """Return the noise on the change; None as long as nothing was seen of it."""
         if not self._count:
             return None
-        density = np.sqrt(self._squares / self._count)
+        density = np.sqrt(self._mean_squares)
         return TwistChangeNoise(density[3:], density[:3])
+
+    @property
+    def _mean_squares(self) -> Array:
+        return np.asarray((self._squares + _STATED_FOR * self._stated) / (self._count + _STATED_FOR))
 
 
 class KeptTwist(NamedTuple):
