@@ -44,7 +44,6 @@ class Batch:
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         noise = setup.settings.noise
-        self._bridges_gaps = noise.bridge_gaps and setup.motion_kind == "twist"
         self._scale = None if noise.disparity_scale is None else ScaleState(noise.disparity_scale)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
@@ -69,8 +68,9 @@ class Batch:
         frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
         start = self._start(known, track_ids)
         factors = self._motion_factors()
-        if self._bridges_gaps:
-            factors.push_back(bridged(frames))
+        bridge = self._causal_pass.bridge
+        if bridge is not None and bridge.noise is not None:
+            factors.push_back(bridged(frames, bridge.noise))
         if self._scale is not None:
             self._scale.add_to(factors, start)
         smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._progress)

@@ -7,6 +7,7 @@ from filters.kalman.thinning import Thinned
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("mourikis2007msckf",)
+RULES = {"bridge_gaps": True}
 RUNG, CHANGE = 60, "+ past poses, tracks used at once but kept at their end; usual errors, one step"
 
 

@@ -14,7 +14,8 @@ from toolkit.models.gating import chi2_bound, huber_threshold, huber_weights, me
 class FrameGate:
     """Accepts innovations below the chi-square quantile of a probability, counts them, and weighs them by Huber's loss.
 
-    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss.
+    ``huber`` is the loss' threshold for three degrees of freedom, in sigma; None for no loss. ``share`` is the share of
+    its information that any accepted innovation counts for.
 
     ``nis`` and ``dof`` are sums over what was accepted, and ``nis_expected`` what the first is expected to be where the
     innovations are as large as their covariance says: less than ``dof``, for the gate took the largest away. Robust
@@ -24,6 +25,7 @@ class FrameGate:
 
     probability: float | None
     huber: float | None = None
+    share: float = 1.0
     nis: float = 0.0
     dof: int = 0
     nis_expected: float = 0.0
@@ -56,10 +58,10 @@ class FrameGate:
         return accepted
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
-        """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] of their norm."""
+        """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] times the share."""
         if self.huber is None:
-            return accepted.astype(float)
-        return np.where(accepted, huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
+            return self.share * accepted.astype(float)
+        return np.where(accepted, self.share * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)
 
     def info(self) -> dict[str, float]:
         """Return the figures by the names an Estimate's info has."""

@@ -7,9 +7,11 @@ than the window reaches, as a state does in the smoothers. With ``landmarks`` th
 the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for
 vision-aided inertial navigation").
 
-Where the rig states noise of tracks, the sightings of a track correct with their whole covariance, and a landmark in
-the state has the error of its track beside it. What is approximated: a track that lives on after it was used starts
-anew at its age, and the error it has come to by then is taken for drawn anew.
+Where residuals along tracks turn out correlated under white noise, tracks count for less
+(:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track correct
+with their whole covariance, and a landmark in the state has the error of its track beside it. What is approximated: a
+track that lives on after it was used starts anew at its age, and the error it has come to by then is taken for drawn
+anew.
 """
 
 import numpy as np
@@ -21,6 +23,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
+from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
 from filters.kalman.tracks_in_view import TracksInView, tell
@@ -28,6 +31,7 @@ from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.models.gap_bridge import gap_bridge_for
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
@@ -59,6 +63,8 @@ class SlidingWindowFilter:
         self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup)
+        self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
@@ -66,15 +72,19 @@ class SlidingWindowFilter:
         predicted = self._joint.core
         self._joint.clone(packet.index)
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
+        share = self._correlation.share
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, share)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct_by_landmarks(packet.frame, gate)
         self._tracks.add_frame(_without(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
+        self._correct_by_bridge(packet.frame)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._forget_clones(leaving)
-        now = self._in_view.corrected(self._joint, self._tracks.unused())
+        now = self._in_view.corrected(self._joint, self._tracks.unused(), share)
+        if self.bridge is not None:
+            self.bridge.learn(now.T_world_imu)
         return now.estimate(packet.frame.t_ns, **gate.info())
 
     def landmarks(self) -> Landmarks:
@@ -84,7 +94,7 @@ class SlidingWindowFilter:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the run."""
-        return self._noise.told
+        return self._noise.told + self._correlation.told
 
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
         if isinstance(self._joint, TrackErrorBelief):
@@ -125,6 +135,18 @@ class SlidingWindowFilter:
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
         joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
+        self._correlation.learn(accepted.sightings, accepted.points, joint.clones)
+
+    def _correct_by_bridge(self, frame: StereoFrame) -> None:
+        """Correct the last three poses where no track leads from one of them to the next."""
+        if self.bridge is None:
+            return
+        kept, joint = self.bridge.added(frame), self._joint
+        if kept is not None:
+            H = kept.derivatives(self._at.clones(joint)[-3:]) / kept.sigmas[:, None]
+            residual = -kept.change(joint.clones[-3:]) / kept.sigmas
+            end = joint.clone_columns.stop
+            joint.update(H, residual, slice(end - H.shape[1], end))
 
     def _add_landmarks(self, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
         if isinstance(self._joint, TrackErrorBelief):

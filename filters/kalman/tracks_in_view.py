@@ -117,14 +117,17 @@ class TracksInView:
         self._at, self._rig, self._outliers, self._tell = at, rig, outliers, tell
         self._known = FollowedTracks.none()
 
-    def corrected(self, joint: JointBelief, sightings: TrackSightings) -> Belief:
-        """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet."""
+    def corrected(self, joint: JointBelief, sightings: TrackSightings, share: float = 1.0) -> Belief:
+        """Return the state now given tracks that the newest of the W poses sees, none of which has corrected yet.
+
+        ``share`` is the share of its information that each counts for.
+        """
         tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         told = self._tell(tracks, Window.of(joint, self._at), self._rig, gate)
         tracks.weights[:, -1] = told.weights
         self._known = tracks._replace(points=told.points).select(told.usable)
-        return _informed(joint, told.matrix, told.vector) if told.usable.any() else joint.core
+        return _informed(joint, share * told.matrix, share * told.vector) if told.usable.any() else joint.core
 
     def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "FollowedTracks":
         """Return the tracks with their landmarks: as last known, or as a first triangulation has them."""

@@ -19,7 +19,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray
 from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, huber_loss
-from toolkit.models.gap_bridge import BridgeBuilder
+from toolkit.models.gap_bridge import gap_bridge_for, kept_twist
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
@@ -48,9 +48,9 @@ class GraphBuilder:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
         self._outlier_check = OutlierCheck(setup.rig, outliers)
-        self._bridge: BridgeBuilder | None = None
-        if setup.settings.noise.bridge_gaps and setup.motion_kind == "twist":
-            self._bridge = BridgeBuilder(setup.settings.window.seconds(setup.motion_kind))
+        self._bridge = None
+        if setup.settings.noise.bridge_gaps:
+            self._bridge = gap_bridge_for(setup.noise, setup.settings.window.seconds(setup.motion_kind))
         self._aligned_check = OutlierCheck(setup.rig, msgspec.structs.replace(outliers, smoother_gate_factor=1.0))
         self._refused_tracks = RefusedTracks(setup.rig, outliers.gate_probability)
         self._refused: tuple[StereoFrame, BoolArray] | None = None
@@ -70,13 +70,17 @@ class GraphBuilder:
         self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
         if self._bridge is not None:
-            extension.factors.push_back(self._bridge.added(sound, packet.index))
+            kept = self._bridge.added(sound)
+            if kept is not None:
+                extension.factors.add(kept_twist(kept, packet.index))
         return extension
 
     def update(self, newest: Estimate, points: Mapping[int, Array]) -> None:
         """Take over the newest state and landmarks (3,) m as the smoother has them after a packet."""
         self.belief = self.belief.at(newest)
         self._noise.learn(newest.t_ns, self._predicted, self.belief)
+        if self._bridge is not None:
+            self._bridge.learn(newest.T_world_imu)
         self._points.update(points)
 
     def log(self) -> tuple[str, ...]:

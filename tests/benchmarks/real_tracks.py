@@ -10,7 +10,8 @@ whose twists are noisy as they are. Each run is one line of the results, and one
 The table has, for each estimator and model, the geometric mean over drives of the ATE over that of dead reckoning (the
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
 parameters, ``correlated:white,walk,offset`` with others, in px, or ``fitted``; ``+scale`` behind it gives the
-disparities a scale of 1 %, ``+gaps`` bridges what has no track, ``+still`` leaves out what moves.
+disparities a scale of 1 %, ``+open`` bridges no gap between tracks, ``+still`` leaves out what moves, ``+full`` has
+white tracks count in full however correlated their residuals are.
 
     python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
 
@@ -94,7 +95,7 @@ def noise_of(model: str) -> Noise:
     """Return the settings of a noise model."""
     tracks, *switches = model.split("+")
     name, _, figures = tracks.partition(":")
-    given: dict[str, Any] = {"bridge_gaps": "gaps" in switches}
+    given: dict[str, Any] = {"bridge_gaps": "open" not in switches, "match_tracks": "full" not in switches}
     if "scale" in switches:
         given["disparity_scale"] = SCALE_SIGMA
     if name == "fitted":

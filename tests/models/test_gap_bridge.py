@@ -1,4 +1,4 @@
-"""The bridge over gaps between tracks: where it stands, and that its factor has the derivatives of its residual."""
+"""The bridge over gaps: where it stands, how sure it is, and that it has the derivatives of its residual."""
 
 from itertools import pairwise
 
@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import se3_exp
-from toolkit.measured_motion import TwistChangeNoise
+from toolkit.measured_motion import TwistChangeNoise, TwistNoise
 from toolkit.models.factors import X
-from toolkit.models.gap_bridge import bridged, gaps, kept_twist
+from toolkit.models.gap_bridge import GapBridge, KeptTwist, TwistChange, bridged, gaps, kept_twist
 from toolkit.sequence import StereoFrame
 
 NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
+MEASURED = TwistNoise(np.full(3, 0.2), np.full(3, 0.02), np.full(3, 1e-5))
 STEP = 1e-6
 
 
@@ -37,12 +38,12 @@ def test_a_gap_is_where_no_track_leads_on():
 
 def test_a_bridge_stands_at_a_gap_and_its_neighbours_alone():
     frames = frames_of([1], [1], [1], [1], [2], [2], [2], [2])
-    graph = bridged(frames)
+    graph = bridged(frames, NOISE)
     assert [tuple(graph.at(i).keys()) for i in range(graph.size())] == [(X(2), X(3), X(4)), (X(3), X(4), X(5))]
-    assert bridged(frames_of([1], [1], [1])).size() == 0
+    assert bridged(frames_of([1], [1], [1]), NOISE).size() == 0
     # At the ends there is a neighbour on one side, or none.
-    assert bridged(frames_of([1], [2])).size() == 0
-    assert bridged(frames_of([1], [2], [2])).size() == 1
+    assert bridged(frames_of([1], [2]), NOISE).size() == 0
+    assert bridged(frames_of([1], [2], [2]), NOISE).size() == 1
 
 
 def test_a_body_that_keeps_its_twist_costs_nothing():
@@ -50,7 +51,7 @@ def test_a_body_that_keeps_its_twist_costs_nothing():
     poses = [np.eye(4)]
     for dt_s in (0.1, 0.25):
         poses.append(poses[-1] @ se3_exp(dt_s * twist))
-    assert kept_twist(0.1, 0.25, NOISE, 2).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
+    assert kept_twist(KeptTwist(0.1, 0.25, NOISE), 2).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
 
 
 def test_a_change_of_the_twist_is_whitened_by_the_noise_over_the_time_between():
@@ -59,7 +60,7 @@ def test_a_change_of_the_twist_is_whitened_by_the_noise_over_the_time_between():
     for dt_s, twist in zip((0.1, 0.2), twists, strict=True):
         poses.append(poses[-1] @ se3_exp(dt_s * twist))
     expected = 0.5 * (0.2 / 0.7) ** 2 / 0.15
-    assert kept_twist(0.1, 0.2, NOISE, 2).error(values_of(poses)) == pytest.approx(expected, rel=1e-9)
+    assert kept_twist(KeptTwist(0.1, 0.2, NOISE), 2).error(values_of(poses)) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -67,7 +68,7 @@ def test_the_factor_has_the_derivatives_of_its_residual(seed):
     rng = np.random.default_rng(seed)
     steps = [se3_exp(rng.normal(0.0, 0.8, 6)), *(se3_exp(rng.normal(0.0, 0.3, 6)) for _ in range(2))]
     poses = [steps[0], steps[0] @ steps[1], steps[0] @ steps[1] @ steps[2]]
-    factor = kept_twist(0.1, 0.15, NOISE, 2)
+    factor = kept_twist(KeptTwist(0.1, 0.15, NOISE), 2)
 
     def whitened(at):
         return -factor.linearize(values_of(at)).jacobian()[1]
@@ -89,4 +90,53 @@ def test_intervals_are_as_long_as_their_stamps_say():
     twist = np.array([0.0, 0.0, 0.3, 8.0, 0.0, 0.0])
     poses = [np.eye(4), se3_exp(0.1 * twist), se3_exp(0.2 * twist)]
     assert all(later.t_ns - sooner.t_ns == 100_000_000 for sooner, later in pairwise(frames))
-    assert bridged(frames).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
+    assert bridged(frames, NOISE).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
+
+
+def driven(bridge, ids_of_frames, sigma, seed=0):
+    """Drive on with a twist that changes by white noise of this size, and return what the bridge says at each frame."""
+    rng, said, pose = np.random.default_rng(seed), [], np.eye(4)
+    twist = np.array([0.0, 0.0, 0.1, 8.0, 0.0, 0.0])
+    for frame in frames_of(*ids_of_frames):
+        said.append(bridge.added(frame))
+        bridge.learn(pose)
+        twist = twist + sigma * rng.normal(size=6)
+        pose = pose @ se3_exp(0.1 * twist)
+    return said
+
+
+def test_a_bridge_is_as_sure_as_the_twist_was_seen_to_stay():
+    sigma = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
+    frames = [[1]] * 600 + [[2]] * 3
+    said = driven(GapBridge(1.0, MEASURED), frames, sigma)
+    assert [kept is not None for kept in said] == [False] * 600 + [True, True, False]
+    stated = np.sqrt(2.0 / 0.1) * np.array([0.02] * 3 + [0.2] * 3)
+    expected = np.sqrt((598.0 * np.square(sigma) + 10.0 * np.square(stated)) / 608.0)
+    # Of so many changes the standard deviation is known to three percent.
+    np.testing.assert_allclose(said[600].sigmas, expected, rtol=0.09)
+
+
+def test_at_first_a_bridge_tells_no_more_than_the_twists_that_are_measured():
+    """Two of them, of intervals of a tenth of a second, differ by their white noise."""
+    said = driven(GapBridge(1.0, MEASURED), [[1], [1], [1], [2]], np.zeros(6))
+    stated = np.sqrt(2.0 / 0.1) * np.array([0.02] * 3 + [0.2] * 3)
+    np.testing.assert_allclose(said[3].sigmas, stated * np.sqrt(10.0 / 11.0))
+    # Before three poses were tied by tracks nothing is known of the change.
+    assert driven(GapBridge(1.0, MEASURED), [[1], [1], [2]], np.zeros(6)) == [None] * 3
+
+
+def test_the_change_is_not_learnt_over_gaps_nor_from_one_pose_that_is_far_off():
+    sigma = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
+    one, other = TwistChange(MEASURED), TwistChange(MEASURED)
+    poses = [np.eye(4)]
+    for _ in range(300):
+        poses.append(poses[-1] @ se3_exp(0.1 * sigma))
+    for k in range(298):
+        for change, off in ((one, 0.0), (other, 50.0 if k == 200 else 0.0)):
+            three = np.array(poses[k : k + 3])
+            three[2, 0, 3] += off
+            change.learn(100_000_000 * np.arange(k, k + 3), three)
+    np.testing.assert_allclose(other.noise.velocity_change_density, one.noise.velocity_change_density, rtol=0.05)
+    bridge = GapBridge(1.0, MEASURED)
+    driven(bridge, [[k] for k in range(50)], sigma)
+    assert bridge.noise is None

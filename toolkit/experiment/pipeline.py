@@ -6,6 +6,8 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from toolkit.datasets import built_ins, is_drawn_from_a_seed, load_references
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
@@ -19,7 +21,6 @@ from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepa
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
 from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
-from toolkit.measured_motion import MotionKind
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
@@ -281,7 +282,7 @@ def _comparison(
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
         white={} if sequence.rig.track_noise is None else _told_white(entries),
-        lacking=lacking(entries, plan.settings.noise, sequence.motion_kind),
+        lacking=lacking(entries, plan.settings.noise, to_bridge(sequence)),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
@@ -294,16 +295,22 @@ def _told_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
 
-def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, motion_kind: MotionKind) -> dict[str, tuple[str, ...]]:
+def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, to_bridge: bool) -> dict[str, tuple[str, ...]]:
     """Return, for each optional part of the noise model that is asked for, the estimators that do without.
 
-    Gaps are bridged between measured twists: where there are none, by nobody.
+    ``to_bridge`` says whether there is a gap that could be bridged.
     """
-    asked = {"disparity_scale": noise.disparity_scale is not None, "bridge_gaps": noise.bridge_gaps}
-    parts = {part: [name for name, entry in entries.items() if not entry.obeys(part)] for part in asked}
-    if motion_kind != "twist":
-        parts["bridge_gaps"] = list(entries)
-    return {part: tuple(names) for part, names in parts.items() if asked[part] and names}
+    asked = {"disparity_scale": noise.disparity_scale is not None, "bridge_gaps": noise.bridge_gaps and to_bridge}
+    parts = {part: tuple(name for name, entry in entries.items() if not entry.obeys(part)) for part in asked}
+    return {part: names for part, names in parts.items() if asked[part] and names}
+
+
+def to_bridge(sequence: Recorded) -> bool:
+    """Say whether a sequence has measured twists and an interval without a common track, as a bridge wants it."""
+    seen, count = sequence.visible, sequence.frame_count
+    key = seen.track_id * (count + 1) + seen.frame
+    tied = np.unique(seen.frame[np.isin(key + 1, key)])
+    return sequence.motion_kind == "twist" and bool(tied.size < count - 1)
 
 
 def _check_seeds(plan: Plan, source: str | Recorded) -> None:

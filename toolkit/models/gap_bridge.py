@@ -9,19 +9,21 @@ tracks tell the motion better than such a prior, which would hold all turns and 
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from toolkit.geometry import Array, IntArray
-from toolkit.measured_motion import TwistChangeNoise
+from toolkit.geometry import Array, IntArray, se3_adjoint, se3_inverse, se3_log, se3_right_jacobian
+from toolkit.measured_motion import MotionNoise, TwistChangeNoise, TwistNoise
 from toolkit.models.factors import X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import StereoFrame
 
-# How a car's twist changes from one tenth of a second to the next: 0.06, 0.06, 0.03 rad/s and 0.2, 0.1, 0.2 m/s
-# (roll, pitch, yaw; forward, left, up). Twice the figures found on drives of KITTI, with which errors were too small.
-CAR = TwistChangeNoise(np.array([0.2, 0.1, 0.2]) / np.sqrt(0.1), np.array([0.06, 0.06, 0.03]) / np.sqrt(0.1))
+# As many intervals the measured twists' own scatter counts for before anything was seen of the change itself.
+_STATED_FOR = 10
+# A change of so many standard deviations counts for no more: where an answer was revised it is no motion.
+_MOST_SIGMAS = 3.0
 
 
 def gaps(frames: Sequence[StereoFrame]) -> IntArray:
@@ -30,55 +32,134 @@ def gaps(frames: Sequence[StereoFrame]) -> IntArray:
     return 1 + np.flatnonzero(np.array(common, dtype=np.int64) == 0)
 
 
-def bridged(frames: Sequence[StereoFrame], noise: TwistChangeNoise = CAR) -> gtsam.NonlinearFactorGraph:
+class TwistChange:
+    """Learns from the poses where tracks lead on how much the twist changes from one interval to the next.
+
+    At first it is what the white noise of two measured twists makes of it: a bridge then tells little. Errors of the
+    poses count as change as well, so that it is rather too much.
+    """
+
+    def __init__(self, measured: TwistNoise) -> None:
+        self._measured = np.concatenate([measured.gyro_noise_density, measured.velocity_noise_density])
+        self._squares, self._count = np.zeros(6), 0
+
+    def learn(self, t_ns: IntArray, poses: Array) -> None:
+        """Take in three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks lead on."""
+        before_s, after_s = (np.diff(t_ns) / NS_PER_S).tolist()
+        between_s = 0.5 * (before_s + after_s)
+        twists = [se3_log(se3_inverse(poses[i]) @ poses[i + 1]) / dt_s for i, dt_s in ((0, before_s), (1, after_s))]
+        change = np.square(twists[1] - twists[0]) / between_s
+        if not self._count:
+            self._squares, self._count = _STATED_FOR * 2.0 * np.square(self._measured / between_s), _STATED_FOR
+        self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._squares / self._count)
+        self._count += 1
+
+    @property
+    def noise(self) -> TwistChangeNoise | None:
+        """Return the noise on the change; None as long as nothing was seen of it."""
+        if not self._count:
+            return None
+        density = np.sqrt(self._squares / self._count)
+        return TwistChangeNoise(density[3:], density[:3])
+
+
+class KeptTwist(NamedTuple):
+    """That the twist of an interval is that of the one before, which last some seconds each, but for noise.
+
+    The noise is white noise on the change over the time between the middles of the intervals.
+    """
+
+    before_s: float
+    after_s: float
+    noise: TwistChangeNoise
+
+    @property
+    def sigmas(self) -> Array:
+        """Return the standard deviations (6,) of the change [rad/s, m/s]."""
+        density = np.concatenate([self.noise.turn_change_density, self.noise.velocity_change_density])
+        return np.asarray(density * np.sqrt(0.5 * (self.before_s + self.after_s)))
+
+    def change(self, poses: Array) -> Array:
+        """Return the twist (6,) [rad/s, m/s] from the second to the third of three poses, less that to the second."""
+        before, after = (se3_log(step) / dt_s for step, dt_s in self._steps(poses))
+        return np.asarray(after - before)
+
+    def derivatives(self, poses: Array) -> Array:
+        """Return those (6, 18) of the change by three poses (3, 4, 4), each moved in its own frame."""
+        (by_first, by_second), (by_second_too, by_third) = (_by_ends(*step) for step in self._steps(poses))
+        return np.hstack([-by_first, by_second_too - by_second, by_third])
+
+    def _steps(self, poses: Array) -> list[tuple[Array, float]]:
+        moved = se3_inverse(poses[:2]) @ poses[1:]
+        return [(moved[0], self.before_s), (moved[1], self.after_s)]
+
+
+class GapBridge:
+    """Says frame by frame where a twist is to be kept, as surely as it was seen to stay the same before.
+
+    For estimators that keep so many seconds of states.
+    """
+
+    def __init__(self, window_s: float, measured: TwistNoise) -> None:
+        self._window_s, self._change = window_s, TwistChange(measured)
+        self._frames: list[StereoFrame] = []
+        self._poses: list[Array] = []
+
+    @property
+    def noise(self) -> TwistChangeNoise | None:
+        """Return the noise on the twist's change so far."""
+        return self._change.noise
+
+    def added(self, frame: StereoFrame) -> KeptTwist | None:
+        """Return what a frame adds: that over the last three poses the twist is kept, or nothing."""
+        self._frames = [*self._frames[-2:], frame]
+        noise = self.noise
+        if noise is None or len(self._frames) < 3 or not gaps(self._frames).size:
+            return None
+        before_s, after_s = _durations_s(self._frames)
+        # Of two states further apart the first had left when the second came.
+        return KeptTwist(before_s, after_s, noise) if before_s <= self._window_s else None
+
+    def learn(self, T_world_imu: Array) -> None:
+        """Take in the pose (4, 4) that was found for the last frame."""
+        self._poses = [*self._poses[-2:], T_world_imu]
+        if len(self._poses) == 3 and not gaps(self._frames).size:
+            self._change.learn(np.array([frame.t_ns for frame in self._frames]), np.array(self._poses))
+
+
+def gap_bridge_for(measured: MotionNoise, window_s: float) -> GapBridge | None:
+    """Return the bridge of an estimator that keeps so many seconds of states; None where no twists are measured."""
+    return GapBridge(window_s, measured) if isinstance(measured, TwistNoise) else None
+
+
+def bridged(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> gtsam.NonlinearFactorGraph:
     """Return the factors over the gaps of frames (K,), of which frame k has the pose X(k)."""
-    graph, builder = gtsam.NonlinearFactorGraph(), BridgeBuilder(np.inf, noise)
-    for k, frame in enumerate(frames):
-        graph.push_back(builder.added(frame, k))
+    graph, places = gtsam.NonlinearFactorGraph(), gaps(frames)
+    for k in sorted({k for place in places.tolist() for k in (place, place + 1) if 2 <= k < len(frames)}):
+        graph.add(kept_twist(KeptTwist(*_durations_s(frames[k - 2 : k + 1]), noise), k))
     return graph
 
 
-class BridgeBuilder:
-    """Yields the factors over gaps frame by frame, for a smoother that keeps so many seconds of states."""
-
-    def __init__(self, window_s: float, noise: TwistChangeNoise = CAR) -> None:
-        self._window_s, self._noise = window_s, noise
-        self._frames: list[StereoFrame] = []
-
-    def added(self, frame: StereoFrame, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what frame k, that of X(k), adds: the factor on the last three poses, or nothing."""
-        self._frames = [*self._frames[-2:], frame]
-        graph = gtsam.NonlinearFactorGraph()
-        if len(self._frames) == 3 and gaps(self._frames).size:
-            before_s, after_s = (np.diff([one.t_ns for one in self._frames]) / NS_PER_S).tolist()
-            # Of two states further apart the first had left when the second came.
-            if before_s <= self._window_s:
-                graph.add(kept_twist(before_s, after_s, self._noise, k))
-        return graph
-
-
-def kept_twist(before_s: float, after_s: float, noise: TwistChangeNoise, k: int) -> gtsam.NonlinearFactor:
-    """Return the factor on X(k - 2), X(k - 1), X(k), whose intervals last some seconds each.
-
-    The residual (6,) is the twist [rad/s, m/s] that leads from the second pose to the third, less that from the first
-    to the second. Its covariance is that of noise over the time between the middles of the intervals.
-    """
-    density = np.concatenate([noise.turn_change_density, noise.velocity_change_density])
-    covariance = gtsam.noiseModel.Diagonal.Sigmas(density * np.sqrt(0.5 * (before_s + after_s)))
+def kept_twist(kept: KeptTwist, k: int) -> gtsam.NonlinearFactor:
+    """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist."""
 
     def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        first, second, third = (values.atPose3(key) for key in this.keys())  # noqa: SIM118 - not a mapping
-        moved = (first.between(second), before_s), (second.between(third), after_s)
-        before, after = (gtsam.Pose3.Logmap(step) / dt_s for step, dt_s in moved)
+        poses = np.array([values.atPose3(key).matrix() for key in this.keys()])  # noqa: SIM118 - not a mapping
         if jacobians is not None:
-            (by_first, by_second), (by_second_too, by_third) = (_by_ends(step, dt_s) for step, dt_s in moved)
-            jacobians[0], jacobians[1], jacobians[2] = -by_first, by_second_too - by_second, by_third
-        return np.asarray(after - before)
+            jacobians[0], jacobians[1], jacobians[2] = np.hsplit(kept.derivatives(poses), 3)
+        return kept.change(poses)
 
+    covariance = gtsam.noiseModel.Diagonal.Sigmas(kept.sigmas)
     return gtsam.CustomFactor(covariance, [X(k - 2), X(k - 1), X(k)], residual)
 
 
-def _by_ends(step: gtsam.Pose3, dt_s: float) -> tuple[Array, Array]:
+def _durations_s(frames: Sequence[StereoFrame]) -> tuple[float, float]:
+    """Return how many seconds the two intervals of three frames last."""
+    before_s, after_s = (np.diff([one.t_ns for one in frames]) / NS_PER_S).tolist()
+    return before_s, after_s
+
+
+def _by_ends(step: Array, dt_s: float) -> tuple[Array, Array]:
     """Return the derivatives (6, 6) of a step's twist by the pose at its start and at its end."""
-    by_end = gtsam.Pose3.LogmapDerivative(step) / dt_s
-    return -by_end @ step.inverse().AdjointMap(), by_end
+    by_end = np.asarray(np.linalg.inv(dt_s * se3_right_jacobian(se3_log(step))), dtype=np.float64)
+    return -by_end @ se3_adjoint(se3_inverse(step)), by_end

@@ -104,10 +104,10 @@ def _track_noise(noise: Noise) -> str:
 
 
 def _optional_parts(noise: Noise) -> str:
-    """Say what is taken into account besides, where it is."""
+    """Say what is taken into account besides, where it is not as by default."""
     sigma = noise.disparity_scale
     scale = "" if sigma is None else f"; disparities scaled by 0 +- {100.0 * sigma:g} %, a state"
-    return f"{scale}{'; gaps between tracks bridged' if noise.bridge_gaps else ''}"
+    return f"{scale}{'' if noise.bridge_gaps else '; gaps between tracks not bridged'}"
 
 
 def _left_out(sequence: Sequence, window: Window) -> int:

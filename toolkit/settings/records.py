@@ -184,10 +184,16 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     bridge_gaps: Annotated[
         bool,
         Meta(description="where frames have no track in common, a measured twist is like those before and after, too"),
-    ] = False
+    ] = True
     match_imu: Annotated[
         bool,
         Meta(description="causal estimators take an IMU for noisier than stated where tracks contradict it"),
+    ] = True
+    match_tracks: Annotated[
+        bool,
+        Meta(
+            description="white noise: windowed filters take tracks for less where residuals along them are correlated"
+        ),
     ] = True
 
 

@@ -1,0 +1,131 @@
+"""Tracks count for less where residuals along them are correlated, by as much as that costs, and in full where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from filters.kalman.gate import FrameGate
+from filters.kalman.multiview import TrackSightings
+from filters.kalman.residual_correlation import ResidualCorrelation, residuals_left
+from filters.kalman.triangulation import triangulate
+from toolkit.geometry import se3_exp
+from toolkit.metrics import score_run
+from toolkit.models import stereo
+from toolkit.settings import Noise, Settings
+from toolkit.simulation import DRIVE, DRIVE_REALISTIC, simulate
+from toolkit.track_noise import TrackNoise
+
+WINDOW, TRACKS = 30, 60
+FULL = Settings(noise=Noise(match_tracks=False))
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Return four seconds of a drive whose tracks err as stated."""
+    return simulate(replace(DRIVE, duration_s=4.0), 4)
+
+
+@pytest.fixture(scope="module")
+def walking():
+    """Return a drive whose tracks walk and are matched wrong for life, stated to be white noise of half a pixel."""
+    sequence = simulate(replace(DRIVE_REALISTIC, duration_s=6.0), 4)
+    return replace(sequence, rig=replace(sequence.rig, cov_uv_px2=0.25 * np.eye(3)))
+
+
+def tracks_of(rig, correlation, seed):
+    """Return tracks seen from exact poses with errors of stated size, autoregressive of first order, and the points."""
+    rng = np.random.default_rng(seed)
+    poses = np.array([se3_exp(np.array([0.0, 0.0, 0.01 * k, 0.3 * k, 0.0, 0.0])) for k in range(WINDOW)])
+    ahead = np.stack([rng.uniform(18, 30, TRACKS), rng.uniform(-4, 4, TRACKS), rng.uniform(-2, 2, TRACKS)], axis=1)
+    errors = np.empty((TRACKS, WINDOW, 3))
+    errors[:, 0] = rng.normal(size=(TRACKS, 3))
+    for k in range(1, WINDOW):
+        drawn = rng.normal(size=(TRACKS, 3))
+        errors[:, k] = correlation * errors[:, k - 1] + np.sqrt(1.0 - correlation**2) * drawn
+    exact_px = np.stack([stereo.predict(ahead, T, rig).uv_px for T in poses], axis=1)
+    uvs_px = exact_px + errors @ np.linalg.cholesky(rig.cov_uv_px2).T
+    seen, ages = np.ones((TRACKS, WINDOW), dtype=bool), np.tile(np.arange(WINDOW), (TRACKS, 1))
+    return TrackSightings(np.arange(TRACKS), uvs_px, seen, ages), ahead, poses
+
+
+def learnt(rig, correlation, seed=0):
+    found = ResidualCorrelation(rig)
+    found.learn(*tracks_of(rig, correlation, seed))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_white_errors_count_in_full(drive, seed):
+    found = learnt(drive.rig, 0.0, seed)
+    assert found.share == 1.0
+    assert found.told == ()
+
+
+def test_correlated_errors_count_for_as_much_as_their_mean_is_worth(drive):
+    """That of an autoregression, of which the landmarks take a part: less correlation is left, never more."""
+    correlation = 0.6
+    lags = np.abs(np.subtract.outer(np.arange(1000), np.arange(1000)))
+    worth = 1000.0 / (correlation**lags).mean() / 1000.0**2
+    found = learnt(drive.rig, correlation)
+    assert worth == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.01)
+    assert worth < found.share < 1.6 * worth
+    assert f"{found.correlation:.2f} from frame to frame" in found.told[0]
+
+
+def test_a_handful_of_residuals_that_happen_to_agree_proves_nothing(drive):
+    sightings, points, poses = tracks_of(drive.rig, 0.9, 0)
+    found = ResidualCorrelation(drive.rig)
+    found.learn(sightings.select(np.arange(1))._replace(seen=np.arange(WINDOW)[None] < 4), points[:1], poses)
+    assert found.share == 1.0
+
+
+def test_what_is_left_of_residuals_is_what_the_best_points_leave(drive):
+    sightings, points, poses = tracks_of(drive.rig, 0.5, 1)
+    best, reliable = triangulate(sightings.uvs_px, sightings.seen, poses, drive.rig)
+    assert reliable.all()
+    left = residuals_left(sightings, points, poses, drive.rig)
+    # The points are a few hundredths of their depth off, and what is left of second order is below a tenth of a sigma.
+    np.testing.assert_allclose(left, residuals_left(sightings, best, poses, drive.rig), atol=0.1)
+    assert np.abs(left).max() > 2.0
+
+
+def test_a_share_scales_what_is_accepted_and_not_what_is_tested():
+    nis, dof = np.array([1.0, 3.0, 40.0]), 3
+    for huber in (None, 1.5):
+        whole, part = FrameGate(0.95, huber), FrameGate(0.95, huber, 0.2)
+        passed = [gate.accepts(nis, dof) for gate in (whole, part)]
+        np.testing.assert_array_equal(*passed)
+        assert whole.info() == part.info()
+        np.testing.assert_allclose(part.weights(nis, dof, passed[1]), 0.2 * whole.weights(nis, dof, passed[0]))
+
+
+@pytest.mark.parametrize("name", ["msckf", "msckf-fej", "msckf-slam"])
+def test_a_drive_whose_noise_is_as_stated_is_answered_as_without_to_the_bit(name, drive, run_estimator):
+    with_it, without = run_estimator(name, drive), run_estimator(name, drive, settings=FULL)
+    np.testing.assert_array_equal(with_it.causal.T_world_imu, without.causal.T_world_imu)
+    assert not tells(with_it)
+
+
+@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam"])
+def test_tracks_that_walk_are_found_and_claimed_to_tell_less(name, walking, run_estimator):
+    run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
+    assert tells(run)
+    assert not tells(full)
+    found, believed = (score_run(each, "causal", walking).values for each in (run, full))
+    for metric in ("nees_pose_mean", "ate_none_m", "ate_se3_m"):
+        assert found[metric] < 0.9 * believed[metric]
+
+
+def test_where_noise_of_tracks_is_stated_they_count_as_it_says(walking, run_estimator):
+    stated = replace(
+        walking,
+        rig=replace(walking.rig, track_noise=TrackNoise(np.full(3, 0.03), np.full(3, 0.13), np.array([0.0, 0.7, 0.0]))),
+    )
+    runs = [run_estimator("msckf-slam", stated, settings=each) for each in (Settings(), FULL)]
+    np.testing.assert_array_equal(runs[0].causal.T_world_imu, runs[1].causal.T_world_imu)
+
+
+def tells(run):
+    """Say whether the log of a run says that tracks do not count in full."""
+    return any("residuals along tracks are correlated" in line for line in run.log)
