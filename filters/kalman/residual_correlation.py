@@ -65,7 +65,12 @@ class ResidualCorrelation:
         sightings = sightings.select(long_enough)
         left = residuals_left(sightings, points[long_enough], poses, self._rig)
         both = sightings.seen[:, 1:] & sightings.seen[:, :-1]
-        before, after = left[:, :-1][both], left[:, 1:][both]
+        self.add(left[:, :-1][both], left[:, 1:][both])
+
+    def add(self, before: Array, after: Array) -> None:
+        """Take in whitened residuals (n, 3) of n sightings, and those of the same tracks a frame later."""
+        if not self._matches:
+            return
         self._products += float((before * after).sum())
         self._squares += 0.5 * float(np.square(before).sum() + np.square(after).sum())
         self._pairs += 3 * len(before)

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.smoothing.discounted_tracks import discounted, successive_residuals
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
@@ -49,13 +51,15 @@ def solve_robustly(
     rig: StereoRig,
     start: gtsam.Values,
     outliers: Outliers,
+    correlation: ResidualCorrelation,
     progress: Progress,
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
-    A scale of disparities among the values stays as it is until what is an outlier has been decided.
+    A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
+    tracks count for the share that the correlation of their residuals leaves them by then.
     """
     values = start
     for robust, stopping, stage in _stages(outliers):
@@ -69,11 +73,13 @@ def solve_robustly(
     frames = _placed_by_stereo(frames)
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
+    correlation.add(*successive_residuals(frames, values, rig))
+    rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
     if values.exists(SCALE):
-        sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
+        sightings = ChainedSightings.of(frames, rig)
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
         return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
-    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
+    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(huber)))
     last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
     return Smoothed(last, graph, frames)
 
