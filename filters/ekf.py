@@ -4,17 +4,13 @@ What it approximates: pose and landmarks are kept as if independent. A frame the
 landmark, and the filter is too sure of itself: its covariance does not grow with the distance driven.
 """
 
-import numpy as np
-
-from filters.kalman.correction import correct_landmarks_below, correct_pose
+from filters.kalman.decoupled import steps
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Estimator, Setup
-from toolkit.models import left_only
-from toolkit.models.motion import motion_model, predicted
-from toolkit.models.state import POSE
+from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
@@ -33,21 +29,19 @@ class DecoupledEkf(Filter):
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._outliers = setup.rig, setup.settings.outliers
-        self._motion = motion_model(setup.noise, setup.gravity_world)
-        self._belief = self._motion.initial_belief(setup.prior)
-        self._map = TrackedMap(setup.rig)
+        model = motion_model(setup.noise, setup.gravity_world)
+        self._belief = model.initial_belief(setup.prior)
+        self._steps = steps(model, setup.noise, setup.compilation)
+        self._map = TrackedMap(setup.rig, self._steps.start)
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
-        self._belief = predicted(self._belief, self._motion, packet.motion)
+        if packet.motion is not None:
+            self._belief = self._steps.predict(self._belief, packet.motion)
         seen, uvs_px = self._map.seen_again(packet.frame)
-        gate = FrameGate(self._outliers.gate_probability)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.filter_huber)
         if len(seen):
-            huber = self._outliers.filter_huber
-            self._belief, accepted = correct_pose(self._belief, seen, uvs_px, self._rig, gate, huber)
-            nis_bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
-            pose, pose_cov = self._belief.T_world_imu, self._belief.cov[POSE, POSE]
-            seen = correct_landmarks_below(seen, uvs_px, pose, pose_cov, self._rig, nis_bound)
+            self._belief, seen = self._steps.correct(self._belief, seen, uvs_px, self._rig, gate)
         self._map.keep(seen, packet.frame, self._belief.T_world_imu)
         return self._belief.estimate(packet.frame.t_ns, **gate.info())
 

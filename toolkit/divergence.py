@@ -7,7 +7,6 @@ that are rare in a filter that works and common in one that has diverged.
 """
 
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,7 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
-from toolkit.measured_motion import Motion
-from toolkit.models.motion import belief_at, integrated, motion_model
+from toolkit.models.predicted_steps import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.sequence import Sequence
 from toolkit.track_noise import TrackNoise
@@ -97,26 +95,11 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
 
 
 def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:
-    model = motion_model(sequence.noise, sequence.gravity_world)
-    intervals = list(_intervals(trajectory, sequence))
-    motions = [motion for *_, motion in intervals]
-    beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
-    increments = integrated(model, motions, [belief.bias for belief in beliefs])
-    for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
-        prediction = increment.predict(belief)
+    for start, end, belief, dt_s, prediction in predicted_steps(trajectory, sequence):
         noise = prediction.noise[POSE, POSE]
-        if model.layout.velocity is not None:
-            noise = noise + np.diag(_slack(trajectory, float(motion.dt_s.sum())))
+        if belief.layout.velocity is not None:
+            noise = noise + np.diag(_slack(trajectory, dt_s))
         yield _Step(start, end, prediction.T_world_imu, prediction.transition[POSE], noise)
-
-
-def _intervals(trajectory: Trajectory, sequence: Sequence) -> Iterator[tuple[int, int, Motion]]:
-    """Yield the motions between neighbouring frames of which the trajectory has both, with the rows of these."""
-    row_of = {int(t_ns): row for row, t_ns in enumerate(trajectory.t_ns)}
-    for before, packet in pairwise(sequence.packets()):
-        start, end = row_of.get(before.frame.t_ns), row_of.get(packet.frame.t_ns)
-        if start is not None and end is not None and packet.motion is not None:
-            yield start, end, packet.motion
 
 
 def _slack(trajectory: Trajectory, dt_s: float) -> Array:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
@@ -25,6 +24,7 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
+from toolkit.linear_algebra import on_one_thread
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, Sequence
 from toolkit.settings import DEFAULTS, Settings
@@ -86,7 +86,7 @@ def run(
     runs. An error inside the estimator ends its run, not the comparison: the run's status is ``failed`` and its
     log says why. Raises DataError where the sequence itself cannot be run.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    with on_one_thread():
         return _run(name, build, sequence, prior, progress, settings)
 
 

@@ -38,7 +38,8 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     points, reliable, nis, worst, ends, H, residuals = kernel.test_tracks(
         given((sightings.uvs_px, sightings.seen, sightings.ages)), given(window), camera_of(rig), _RULES, bounds
     )
-    rows = np.diff(ends[reliable], prepend=0)
+    rows = ends[reliable]
+    rows[1:] -= rows[:-1].copy()
     count = int(rows.sum())
     return TestedTracks(
         sightings.select(reliable),

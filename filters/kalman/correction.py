@@ -19,6 +19,24 @@ from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoFrame, StereoRig
 
 
+class FrameCorrection(NamedTuple):
+    """The corrected belief, and the landmarks corrected by it."""
+
+    belief: Belief
+    landmarks: LandmarkMap
+
+
+def corrected(
+    belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
+) -> FrameCorrection:
+    """Correct the pose by sightings (N, 3) px of N landmarks, then each landmark whose sighting passed by the pose."""
+    belief, accepted = correct_pose(belief, landmarks, uvs_px, rig, gate)
+    nis_bound = np.where(accepted, gate.bound(left_only.degrees_of_freedom(uvs_px)), 0.0)
+    pose_cov = belief.cov[POSE, POSE]
+    landmarks = correct_landmarks_below(landmarks, uvs_px, belief.T_world_imu, pose_cov, rig, nis_bound)
+    return FrameCorrection(belief, landmarks)
+
+
 class PoseCorrection(NamedTuple):
     """The corrected belief, and which sightings (N,) passed the gate."""
 
@@ -32,11 +50,10 @@ def correct_pose(
     uvs_px: Array,
     rig: StereoRig,
     gate: FrameGate,
-    huber: float | None,
 ) -> PoseCorrection:
     """Correct the pose by sightings (N, 3) px of N landmarks, each with its own uncertainty in the innovation.
 
-    A sighting outside the gate is left out; the others are weighed by Huber's loss of the norm of their residual,
+    A sighting outside the gate is left out; the others are weighed by the gate's loss, of the norm of their residual
     whitened by the noise of sighting and landmark.
     """
     residual_px, H_pose, H_point, depth_m = _compared(landmarks, uvs_px, belief.T_world_imu, rig)
@@ -46,12 +63,11 @@ def correct_pose(
     accepted = gate.accepts(nis, dof, depth_m > 0.0)
     weights = accepted.astype(float)
     informed = np.linalg.solve(own_cov, np.concatenate([H_pose, residual_px[..., None]], axis=2))
-    if huber is not None:
-        threshold = huber if isinstance(dof, int) else huber_threshold(dof, huber)
+    if gate.huber is not None:
+        threshold = gate.huber if isinstance(dof, int) else huber_threshold(dof, gate.huber)
         weights *= huber_weights(np.einsum("ni,ni->n", residual_px, informed[..., 6]), threshold)
     weighted = weights[:, None, None] * informed[..., :6]
-    corrected = updated_by_pose_sightings(belief, residual_px, H_pose, weighted)
-    return PoseCorrection(corrected, accepted)
+    return PoseCorrection(updated_by_pose_sightings(belief, residual_px, H_pose, weighted), accepted)
 
 
 def _compared(landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> stereo.StereoPrediction:
@@ -112,16 +128,16 @@ def correct_landmarks(
     nis = np.einsum("ni,ni->n", residual_px, weighted[..., 3])
     update = transposed(carried) @ weighted
     points, covs = landmarks.points + update[..., 3], landmarks.covs - update[..., :3]
-    corrected = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
-    return LandmarkCorrection(corrected, nis, depth_m)
+    after = LandmarkMap(landmarks.track_ids, points, 0.5 * (covs + np.swapaxes(covs, 1, 2)))
+    return LandmarkCorrection(after, nis, depth_m)
 
 
 def correct_landmarks_below(
     landmarks: LandmarkMap, uvs_px: Array, T_world_imu: Array, pose_cov: Array, rig: StereoRig, nis_bound: Array
 ) -> LandmarkMap:
     """Correct those landmarks whose sightings have a NIS below a bound (N,); leave the others as they are."""
-    corrected, nis, depth_m = correct_landmarks(landmarks, uvs_px, T_world_imu, pose_cov, rig)
-    return landmarks.corrected((nis < nis_bound) & (depth_m > 0.0), corrected.points, corrected.covs)
+    after, nis, depth_m = correct_landmarks(landmarks, uvs_px, T_world_imu, pose_cov, rig)
+    return landmarks.corrected((nis < nis_bound) & (depth_m > 0.0), after.points, after.covs)
 
 
 class KnownPoseMapper:

@@ -43,9 +43,13 @@ class FrameGate:
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
         """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
-        table = self._table(dof)
-        accepted = np.asarray((nis < table.bound[dof]) & in_front)
-        count = int(np.count_nonzero(accepted))
+        accepted = np.asarray((nis < self._table(dof).bound[dof]) & in_front)
+        self.count(nis, dof, accepted)
+        return accepted
+
+    def count(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> None:
+        """Count N innovations, some of which have passed."""
+        table, count = self._table(dof), int(np.count_nonzero(accepted))
         self.nis += float(nis[accepted].sum())
         if isinstance(dof, int):
             self.dof += dof * count
@@ -55,7 +59,6 @@ class FrameGate:
             self.nis_expected += float(table.expected[dof][accepted].sum())
         self.tested += accepted.size
         self.accepted += count
-        return accepted
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
         """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] times the share."""

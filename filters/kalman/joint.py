@@ -34,9 +34,9 @@ class JointBelief:
     @property
     def core(self) -> Belief:
         """Return the belief of the IMU now, everything else marginalised."""
-        d = self._core.layout.size
+        core, d = self._core, self._core.layout.size
         # A copy: whoever keeps a part of it would keep the whole.
-        return replace(self._core, cov=self._cov[:d, :d].copy())
+        return Belief(core.layout, core.T_world_imu, core.v_world, core.bias, self._cov[:d, :d].copy())
 
     @property
     def cov(self) -> Array:

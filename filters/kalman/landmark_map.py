@@ -1,5 +1,6 @@
 """The map of the decoupled filters: one small Gaussian per tracked landmark, and an archive of those that left."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -57,27 +58,36 @@ class LandmarkMap:
         )
 
 
-def first_sighting(frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig) -> LandmarkMap:
-    """Start the landmarks of the given rows of a frame where stereo sees them (Kang, eqs. 3-5).
+# Says where stereo sees landmarks, as :func:`started` does.
+Start = Callable[[Array, Array, StereoRig], tuple[Array, Array]]
 
-    Their covariance is the measurement's, carried through the triangulation; rows of too little disparity
-    are left for a later frame.
+
+def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Return where stereo sees N landmarks from a pose (4, 4): points (N, 3), covariances (N, 3, 3) (Kang, eqs. 3-5).
+
+    The covariance is that of the measurements (N, 3) px, carried through the triangulation.
     """
-    uvs_px = frame.uvs_px[rows]
-    near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
-    ids, uvs_px = frame.track_ids[rows][near], uvs_px[near]
     points_cam = stereo.triangulate(uvs_px, rig)
     T_world_cam = T_world_imu @ rig.T_imu_cam
     d_point_d_uv = T_world_cam[:3, :3] @ np.linalg.inv(stereo.projection_jacobian(points_cam, rig))
     points = points_cam @ T_world_cam[:3, :3].T + T_world_cam[:3, 3]
-    return LandmarkMap(ids, points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2))
+    return points, d_point_d_uv @ rig.cov_uv_px2 @ np.swapaxes(d_point_d_uv, 1, 2)
+
+
+def first_sighting(
+    frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig, start: Start = started
+) -> LandmarkMap:
+    """Start the landmarks of the given rows of a frame; those of too little disparity are left for a later frame."""
+    uvs_px = frame.uvs_px[rows]
+    near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
+    return LandmarkMap(frame.track_ids[rows][near], *start(uvs_px[near], T_world_imu, rig))
 
 
 class TrackedMap:
     """The landmarks in view, kept frame by frame: lost ones leave the state for an archive, new ones start."""
 
-    def __init__(self, rig: StereoRig) -> None:
-        self._rig = rig
+    def __init__(self, rig: StereoRig, start: Start = started) -> None:
+        self._rig, self._start = rig, start
         self._in_view = LandmarkMap.empty()
         self._left: list[LandmarkMap] = []
 
@@ -91,8 +101,8 @@ class TrackedMap:
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
         """Keep the landmarks seen again, with their new values, and start the frame's other tracks."""
-        new = ~is_among(frame.track_ids, seen.track_ids)
-        self._in_view = seen.merged(first_sighting(frame, np.flatnonzero(new), T_world_imu, self._rig))
+        new = np.flatnonzero(~is_among(frame.track_ids, seen.track_ids))
+        self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig, self._start))
 
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""

@@ -64,6 +64,7 @@ def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion:
     """Carry a joint belief over the motion between two frames, linearised as chosen; before the first there is none."""
     if motion is None:
         return
-    increment = model.integrate(motion, joint.core.bias)
-    prediction = increment.predict(joint.core)
+    core = joint.core
+    increment = model.integrate(motion, core.bias)
+    prediction = increment.predict(core)
     joint.propagate(prediction, at.transition(joint, increment, prediction))

@@ -12,45 +12,24 @@ stays, to the bit, what it is without.
 """
 
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimator import Setup
 from toolkit.measured_motion import ImuMotion, noise_scale_of
+from toolkit.models.corrections import CorrectionTest, correction_test
 from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 # The corrections of a sound filter's window are beyond this quantile once in a million.
 BY_CHANCE = 1e-6
-# Directions in which a correction takes away less of the variance than this are told by rounding, and in smoothers by
-# what is linearised anew: of six tests that made a sound IMU doubtful all had their length from shares below 4e-4.
-_LEAST_TAKEN = 1e-3
 # An IMU that errs a hundred times as much as it says is none: what lies behind is for status to tell.
 _MOST = 1e4
 # What rounds to 1.0 times the stated noise is none to speak of.
 _LEAST_TOLD = 1.05
-
-
-class CorrectionTest(NamedTuple):
-    """The squared Mahalanobis length of a correction and its degrees of freedom: of what was corrected at all."""
-
-    nis: float
-    dof: int
-
-
-def correction_test(before: Belief, after: Belief) -> CorrectionTest:
-    """Test what measurements made of a belief against the covariance that they took away."""
-    sigma = np.sqrt(np.diag(before.cov))
-    per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
-    taken = per_sigma[:, None] * (before.cov - after.cov) * per_sigma
-    shares, axes = np.linalg.eigh(taken)
-    # What is linearised anew may add to a covariance; less taken away than was added elsewhere tells nothing.
-    told = shares > max(_LEAST_TAKEN, -shares[0])
-    moved = axes[:, told].T @ (per_sigma * before.error_to(after))
-    return CorrectionTest(float((moved**2 / shares[told]).sum()), int(told.sum()))
 
 
 class MatchedNoise:
@@ -109,5 +88,5 @@ class MatchedNoise:
         self._scales.append(scale)
 
     def _beyond_chance(self) -> bool:
-        nis, dof = np.sum([test for _, test in self._tests], axis=0)
+        nis, dof = sum(test.nis for _, test in self._tests), sum(test.dof for _, test in self._tests)
         return bool(dof > 0 and nis > chdtri(dof, BY_CHANCE))

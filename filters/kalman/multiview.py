@@ -5,6 +5,7 @@ Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter fo
 navigation", eqs. 17-26; the stereo measurement replaces their monocular one.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -232,5 +233,11 @@ def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:
     system = np.empty((columns + 1, count))
     system[:-1], system[-1] = H.T, residuals
     packed = dgeqrf(system.T, lwork=32 * (columns + 1), overwrite_a=1)[0]
-    triangle = np.triu(packed[:columns])
+    triangle = np.where(_upper(columns), packed[:columns], 0.0)
     return triangle[:, :-1], triangle[:, -1]
+
+
+@lru_cache(maxsize=64)
+def _upper(count: int) -> BoolArray:
+    """Return which elements (n, n + 1) stand on or above the diagonal."""
+    return np.asarray(np.triu(np.ones((count, count + 1), dtype=bool)))

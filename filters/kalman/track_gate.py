@@ -165,13 +165,12 @@ class TrackGate:
         dof = tracks.sightings.degrees_of_freedom
         accepted = gate.accepts(tracks.nis, dof)
         weights = gate.weights(tracks.nis, dof, accepted)
-        roots = np.sqrt(weights)[tracks.track]
+        H, residuals = tracks.H, tracks.residuals
+        if gate.huber is not None:
+            roots = np.sqrt(weights)[tracks.track]
+            H, residuals = roots[:, None] * H, roots * residuals
         passed = AcceptedTracks(
-            tracks.sightings.select(accepted),
-            tracks.points[accepted],
-            weights[accepted],
-            roots[:, None] * tracks.H,
-            roots * tracks.residuals,
+            tracks.sightings.select(accepted), tracks.points[accepted], weights[accepted], H, residuals
         )
         mismatched = tracks.worst >= 0
         less = tracks.sightings.select(mismatched)

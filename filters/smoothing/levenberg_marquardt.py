@@ -75,8 +75,10 @@ def solve(
     progress: Progress = SILENT,
     stage: str = "solving",
     beside: Beside | None = None,
+    ordering: gtsam.Ordering | None = None,
 ) -> Solution:
     """Minimise the error of a graph from a start; ``progress`` is called at every iteration with the stage's name.
+    ``ordering`` is that of elimination where nothing is beside the graph, COLAMD's by default.
 
     Where no step, however short, lowers the error, the start is a minimum. Raises EstimatorError where the error at the
     start is not finite: some measurement or initial value is NaN.
@@ -86,7 +88,7 @@ def solve(
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
     advance = partial(progress.advance, total=stopping.max_iterations, stage=stage)
     if beside is None:
-        return _solved(_GraphSolver(graph, start), start, error, stopping, advance)
+        return _solved(_GraphSolver(graph, start, ordering), start, error, stopping, advance)
     return _solved(_LandmarkSolver(graph, start, beside), start, error, stopping, advance)
 
 
@@ -170,9 +172,9 @@ class _OfGtsam(NamedTuple):
 class _GraphSolver:
     """Takes the steps of a solve of factors alone, each by GTSAM's optimizer."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> None:
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, ordering: gtsam.Ordering | None) -> None:
         self._graph = _MixedGraph(graph, start)
-        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph) if ordering is None else ordering
 
     def started(self, values: gtsam.Values, error: float) -> _OfGtsam:
         """Return where the solve begins."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.smoothing.discounted_tracks import discounted, successive_residuals
+from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
@@ -61,10 +62,11 @@ def solve_robustly(
     A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
     tracks count for the share that the correlation of their residuals leaves them by then.
     """
-    values = start
+    values, order_of = start, cheaper_order(motion, frames)
     for robust, stopping, stage in _stages(outliers):
         graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
-        values = solve(graph, _only_seen(values, frames), stopping, progress, stage).values
+        values = _only_seen(values, frames)
+        values = solve(graph, values, stopping, progress, stage, ordering=order_of(graph, frames)).values
         frames = _without_those_behind(frames, values, rig)
     frames = [
         frame.select(distance < _cut_bound(outliers, left_only.degrees_of_freedom(frame.uvs_px)))
@@ -80,7 +82,8 @@ def solve_robustly(
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
         return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
     graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(huber)))
-    last = solve(graph, _only_seen(values, frames), _LAST_STOPPING, progress, "solving without outliers")
+    values, stage = _only_seen(values, frames), "solving without outliers"
+    last = solve(graph, values, _LAST_STOPPING, progress, stage, ordering=order_of(graph, frames))
     return Smoothed(last, graph, frames)
 
 

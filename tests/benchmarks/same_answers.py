@@ -4,7 +4,7 @@ Every estimator runs on four sequences in both trees, the revision's in a tempor
 path of its processes. Poses, covariances, landmarks, velocities, biases, status and every metric that is no cost are
 compared; one line a sequence and estimator names the largest difference of each kind. A difference is measured
 over max(1, |value|), that of a covariance over the two standard deviations it belongs to. The exit status is 1 where
-one exceeds the tolerance, 2 where a tree could not be run.
+one exceeds the tolerance or an estimator failed, 2 where a tree could not be run.
 
     python tests/benchmarks/same_answers.py REVISION                  both trees, about two runs' time
     python tests/benchmarks/same_answers.py REVISION --save FILE.npz  run the revision only and keep its answers
@@ -146,9 +146,10 @@ def print_comparison(old: Answers, new: Answers, wanted: argparse.Namespace) -> 
                 raise UnrunnableError(f"{sequence} {estimator}: the saved answers have none of it")
             kinds = dict(compared(before, answers_of(new, sequence, estimator)))
             beyond = [kind for kind, found in kinds.items() if not found.relative <= wanted.tolerance]
-            agree = agree and not beyond
+            failed = str(before.get("status")) == "failed"  # then there is nothing to compare
+            agree = agree and not beyond and not failed
             told = [f"{kind} {d.absolute:.1e} ({d.relative:.1e})" for kind, d in kinds.items() if d.absolute > 0.0]
-            verdict = "DIFFERS" if beyond else "agrees " if told else "same   "
+            verdict = "FAILED " if failed else "DIFFERS" if beyond else "agrees " if told else "same   "
             print(f"{verdict} {sequence:<10} {estimator:<15} {', '.join(told)}", flush=True)
             for key in [k for k in before if "/metrics/" in k] if "metrics" in beyond else []:
                 now = answers_of(new, sequence, estimator).get(key, "absent")

@@ -34,7 +34,7 @@ class _Unwatched:
     def __exit__(self, *_error: object) -> None:
         return None
 
-    def advance(self, *_done_of_total: object) -> None:
+    def advance(self, *_done_of_total: object, **_stage: object) -> None:
         """Take no note."""
 
 

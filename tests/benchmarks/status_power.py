@@ -4,13 +4,13 @@ A scenario is a fault of toolkit.simulation.faults in a stretch of a simulated r
 away. The recording is audited and run as a user would; then the truth is put back for the error: the RMS of the
 position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
 that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
-overconfident, where a note says that its gate refused much or that it explains withheld tracks worse than dead
-reckoning, or where the audit found something in its recording, repaired or not; faults that could not be judged do not
-count. In a sound recording all of that is a false alarm, and so is the mark timid.
+overconfident or contradicted, where a note says that its gate refused much or that it explains withheld tracks worse
+than dead reckoning, or where the audit found something in its recording, repaired or not; faults that could not be
+judged do not count. In a sound recording all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
-thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again` and `third` are
-draws of others yet, with one recording drawn for every fault.
+thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`,
+`fourth` and `fifth` are draws of others yet, with one recording drawn for every fault.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -84,8 +84,8 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again", "third")
-DRAWN = ("fresh", "again", "third")
+HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth")
+DRAWN = ("fresh", "again", "third", "fourth", "fifth")
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
@@ -93,6 +93,7 @@ CHEAP = ("dead-reckoning", "ekf", "ekf-slam", "mapping", "msckf", "msckf-fej", "
 DEAR = ("batch", "fixed-lag", "smart", "isam2", "batch", "fixed-lag", "smart", "iekf")
 SOUND = ""
 LIMIT = 3.0
+TELLING_MARKS = ("overconfident", "contradicted")
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,8 @@ class Ended:
     @property
     def is_told(self) -> bool:
         """Say whether its status, its mark, a note on its gate or withheld tracks, or the audit tells of a fault."""
-        by_notes = self.refuses or self.harms
-        return bool(self.found) or self.status != "ok" or self.mark == "overconfident" or by_notes
+        by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms
+        return bool(self.found) or self.status != "ok" or by_mark or by_notes
 
     @property
     def is_alarm(self) -> bool:
@@ -301,9 +302,7 @@ def print_table(lines: list[Ended]) -> bool:
     print(f"{len(sound)} sound runs: {len(alarms)} raise a false alarm ({_percent(alarms, sound)})")
     warned = [one for one in harmless if one.is_told]
     print(f"{len(harmless)} runs that a fault cost less: {len(warned)} tell of it ({_percent(warned, harmless)})")
-    by = Counter(
-        "audit" if one.found else "status" if one.status != "ok" else "mark" if one.mark else "gate" for one in told
-    )
+    by = Counter(_first_to_tell(one) for one in told)
     print(f"the bad say so by the audit, else by the status, else by the mark, else by the gate: {dict(by)}")
     for key in ("estimator", "fault"):
         for name in sorted({getattr(one, key) for one in bad}):
@@ -322,7 +321,7 @@ def _first_to_tell(run: Ended) -> str:
         return "audit"
     if run.status != "ok":
         return "status"
-    return "mark" if run.mark == "overconfident" else "gate"
+    return "mark" if run.mark in TELLING_MARKS else "gate"
 
 
 def _percent(part: Sized, whole: Sized) -> str:

@@ -47,7 +47,7 @@ _BLOCKS = ("variance", "pose", "vel", "bias")
 ADDED = {
     "heldout_reproj_rmse_px": ["heldout_over_motion", "heldout_over_motion_error"],
     "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"],
-    "nis_mean": ["gate_accepted_percent"],
+    "nis_mean": ["gate_accepted_percent", "correction_trend", "correction_trend_limit"],
     "pairs": [
         "efficiency_percent",
         "bound_position_m",

@@ -269,6 +269,30 @@ def test_opencv_yaml_is_read_with_its_nesting_lists_and_comments(tmp_path: Path)
     assert (fields.number("T.rows"), fields.number("rate"), str(fields.arrays["name"])) == (1.0, 20.0, "a")
 
 
+def test_a_matrix_of_opencv_has_its_rows(tmp_path: Path) -> None:
+    path = tmp_path / "chain.yaml"
+    path.write_text("%YAML:1.0\ncam0:\n  T: !!opencv-matrix\n    rows: 2\n    cols: 3\n    data: [1, 2, 3, 4, 5, 6]\n")
+    np.testing.assert_array_equal(read_fields(path).constant("cam0.T", 2, 3), [[1, 2, 3], [4, 5, 6]])
+    path.write_text(path.read_text().replace("cols: 3", "cols: 4"))
+    assert "cam0.T" not in read_fields(path)
+
+
+def test_a_truth_of_a_sensor_needs_no_file_of_the_imu_beside_a_camchain(recording: Path) -> None:
+    before = load_sequence(str(recording)).truth
+    imu = recording / "mav0/imu0/sensor.yaml"
+    chain = "".join(
+        f"cam{c}:\n  T_cam_imu: [[1, 0, 0, {-0.1 * c}], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+        "  intrinsics: [458.0, 457.0, 367.0, 248.0]\n  resolution: [752, 480]\n"
+        for c in (0, 1)
+    )
+    (recording / "camchain.yaml").write_text(chain)
+    imu.rename(recording / "imu0.yaml")
+    after = load_sequence(str(recording)).truth
+    assert before is not None
+    assert after is not None
+    np.testing.assert_array_equal(after.T_world_imu, before.T_world_imu)
+
+
 def replace_in(recording: Path, name: str, old: str, new: str) -> None:
     path = recording / "mav0" / name
     assert old in path.read_text()

@@ -114,6 +114,16 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
+def only(drive: Path, left: str) -> None:
+    (drive / "image_0").rename(drive / left)
+    shutil.rmtree(drive / "image_1")
+
+
+def rename(drive: Path, name: Callable[[Path], str]) -> None:
+    for path in list(drive.glob("image_?/*.png")):
+        path.rename(path.with_name(name(path)))
+
+
 def renumber(drive: Path, first: int) -> None:
     for path in sorted(drive.glob("image_?/*.png"), reverse=True):
         path.rename(path.with_name(f"{first + int(path.stem):06d}.png"))
@@ -139,7 +149,21 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("no times", lambda d: (d / "times.txt").write_text(""), "numbered 0 to 7, and times.txt has 0"),
     ("numbered from 50", lambda d: renumber(d, 50), "numbered 50 to 57, and times.txt has 8"),
     ("images halved", halve, "principal point, 160 100, is not that of images of 160x100 px"),
-    ("no right images", lambda d: shutil.rmtree(d / "image_1"), "8 of 8 image pairs cannot be used"),
+    ("no right images", lambda d: shutil.rmtree(d / "image_1"), "image_0 has images and image_1 has none, and stereo"),
+    (
+        "colour left only",
+        lambda d: only(d, "image_2"),
+        "image_2 has images and image_3 has none",
+    ),
+    ("an empty folder", lambda d: [p.unlink() for p in d.glob("image_0/*")], "image_1 has images and image_0 has none"),
+    ("rows alike", lambda d: edit(d / "calib.txt", "-100.0", "0"), "P0 and P1 are the same, so there is no baseline"),
+    (
+        "times alike",
+        lambda d: (d / "times.txt").write_text("0.5\n" * FRAMES),
+        "all 8 images have one and the",
+    ),
+    ("names", lambda d: rename(d, lambda p: f"frame_{p.name}"), "image_0: frame_000000.png is no number; name"),
+    ("web page", lambda d: [p.write_text("<html>") for p in d.glob("image_?/*")], "000000.png: no image, damaged"),
     (
         "exchanged",
         lambda d: [(d / a).rename(d / b) for a, b in (("image_0", "x"), ("image_1", "image_0"), ("x", "image_1"))],
@@ -156,6 +180,26 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(
     with pytest.raises(DataError, match=complaint) as raised:
         load_sequence(str(drive))
     assert "\n" not in str(raised.value)
+
+
+def test_of_two_pairs_the_one_with_both_cameras_is_read(drive: Path) -> None:
+    before = load_sequence(str(drive))
+    shutil.copytree(drive / "image_0", drive / "image_2")
+    (drive / "image_1").rename(drive / "image_3")
+    text = (drive / "calib.txt").read_text()
+    (drive / "calib.txt").write_text(text + text.replace("P1", "P3").replace("P0", "P2"))
+    (drive / "image_0").rename(drive / "image_l")
+    np.testing.assert_array_equal(load_sequence(str(drive)).observations.uv_px, before.observations.uv_px)
+
+
+def test_cameras_may_name_and_store_their_images_each_in_its_own_way(drive: Path) -> None:
+    before = load_sequence(str(drive)).observations.uv_px
+    for path in sorted((drive / "image_1").iterdir()):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path.with_name(f"{int(path.stem)}.bmp")), image)
+        path.unlink()
+    np.testing.assert_array_equal(load_sequence(str(drive)).observations.uv_px, before)
 
 
 def test_tracks_cannot_be_simulated(drive: Path) -> None:

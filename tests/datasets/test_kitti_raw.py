@@ -168,10 +168,23 @@ def test_images_of_a_camera_that_dropped_one_are_paired_by_their_stamps(drive: P
     assert any("1 left images have no right one" in fact for fact in sequence.provenance.facts)
 
 
+def test_images_need_not_be_in_a_folder_called_data(drive: Path) -> None:
+    before = load_sequence(str(drive))
+    for side in (0, 1):
+        for path in list((drive / f"image_0{side}/data").iterdir()):
+            path.rename(drive / f"image_0{side}" / path.name)
+        (drive / f"image_0{side}/data").rmdir()
+    np.testing.assert_array_equal(load_sequence(str(drive)).observations.uv_px, before.observations.uv_px)
+
+
 def edit(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
+
+
+def another_day(stamps: Path) -> None:
+    stamps.write_text(stamps.read_text().replace("2011-09-26", "2011-09-30"))
 
 
 CAMS = "calib_cam_to_cam.txt"
@@ -186,6 +199,18 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("packet nan", lambda d: edit(d / "oxts/data/0000000003.txt", "1.1", "nan"), "could not convert|finite"),
     ("no packets", lambda d: shutil.rmtree(d / "oxts/data"), "0 packets with a stamp"),
     ("other size", lambda d: edit(d.parent / CAMS, f"S_rect_00: {numbers([320, 200])}", "S_rect_00: 9 9"), "neither"),
+    ("one camera", lambda d: shutil.rmtree(d / "image_01"), "image_00/data has images and image_01/data has none"),
+    (
+        "two pairs' halves",
+        lambda d: (d / "image_00").rename(d / "image_02"),
+        "image_01/data has images and",
+    ),
+    (
+        "decimal comma",
+        lambda d: edit(d / "oxts/timestamps.txt", ".", ","),
+        "line 1 is no date and time; write",
+    ),
+    ("other day", lambda d: another_day(d / "oxts/timestamps.txt"), "in the time of the oxts packets.*two recordings"),
     ("mirrored", lambda d: edit(d.parent / "calib_imu_to_velo.txt", "R: 1.0", "R: -1.0"), "a reflection"),
 ]
 

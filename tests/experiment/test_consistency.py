@@ -34,6 +34,13 @@ def run_of(nees: float | None = None, nis: float | None = None, nis_dof: float |
     return Scored(Scores({"nees_pose_mean": nees, "nis_mean": nis}), NOTHING, NOTHING, nis_dof)
 
 
+def leaning(trend: float, limit: float, **values: float) -> Scored:
+    """Return a run whose corrections have a trend, and its limit."""
+    return Scored(
+        Scores({"correction_trend": trend, "correction_trend_limit": limit, **values}), NOTHING, NOTHING, 900.0
+    )
+
+
 def verdict(*runs: Scored) -> str | None:
     found = consistency_of(runs)
     return None if found is None else found.verdict
@@ -62,6 +69,20 @@ def test_the_errors_decide_where_there_are_any_and_else_the_innovations() -> Non
     assert verdict(run_of(nis=1.05, nis_dof=900.0)) == "consistent"
     assert verdict(run_of(nis=1.5, nis_dof=6.0)) == "consistent"
     assert verdict(run_of()) is None
+
+
+def test_corrections_that_lean_one_way_are_told_unless_errors_tell_of_too_much_certainty() -> None:
+    assert verdict(leaning(5.1, 4.0)) == "contradicted"
+    assert verdict(leaning(5.1, 4.0, nees_pose_mean=1.0)) == "contradicted"
+    assert verdict(leaning(5.1, 4.0, nis_mean=0.5)) == "contradicted"
+    assert verdict(leaning(5.1, 4.0, nees_pose_mean=3.0)) == "overconfident"
+    assert verdict(leaning(3.9, 4.0, nis_mean=0.5)) == "timid"
+    assert verdict(leaning(3.9, 4.0)) is None
+
+
+def test_over_seeds_the_mean_trend_is_held_against_the_mean_limit() -> None:
+    assert verdict(leaning(5.0, 4.0), leaning(2.0, 4.0)) is None
+    assert verdict(leaning(7.0, 4.0), leaning(2.0, 4.0)) == "contradicted"
 
 
 @pytest.mark.parametrize("alike", [1, 10, 100])

@@ -114,8 +114,8 @@ def test_three_rows_with_half_the_variance_of_v_are_the_reports_four_rows(layout
 def test_pose_correction_is_that_update_with_the_weights_and_gates_it_reports():
     belief, landmarks, uvs_px = scene(TWIST_LAYOUT)
     uvs_px[::7] += 80.0
-    gate = FrameGate(PROBABILITY)
-    corrected = correct_pose(belief, landmarks, uvs_px, RIG, gate, HUBER)
+    gate = FrameGate(PROBABILITY, HUBER)
+    corrected = correct_pose(belief, landmarks, uvs_px, RIG, gate)
     assert not corrected.accepted[::7].any()
     predicted = stereo.predict(landmarks.points, belief.T_world_imu, RIG)
     residual_px = uvs_px - predicted.uv_px

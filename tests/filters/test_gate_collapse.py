@@ -30,7 +30,7 @@ def recording():
 
 def test_the_decoupled_filter_that_ran_off_is_said_to_have_diverged(recording, run_estimator):
     run = run_estimator("ekf", recording)
-    assert score_run(run, "causal", recording).values["ate_yaw_m"] > 1.0
+    assert score_run(run, "causal", recording, only=["ate_yaw_m"]).values["ate_yaw_m"] > 1.0
     assert run.status == "diverged"
     assert "passed its own gate: its covariance does not cover its error" in run.log[-1]
 
@@ -45,4 +45,4 @@ def test_the_decoupled_filter_that_ran_off_is_said_to_have_diverged(recording, r
 def test_the_others_stay_within_centimetres(name, output, recording, run_estimator):
     run = run_estimator(name, recording)
     assert run.status == "ok"
-    assert score_run(run, output, recording).values["ate_yaw_m"] < CENTIMETRES
+    assert score_run(run, output, recording, only=["ate_yaw_m"]).values["ate_yaw_m"] < CENTIMETRES

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.motion_noise import CorrectionTest, MatchedNoise, correction_test
+from filters.kalman.motion_noise import MatchedNoise
 from toolkit.metrics import score_run
-from toolkit.models.motion import motion_model
+from toolkit.models.corrections import CorrectionTest
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
@@ -30,27 +30,6 @@ def shaken(sound):
     accel = motion.accel_mps2 + rng.normal(0.0, per_sample * noise.accel_noise_density, motion.accel_mps2.shape)
     gyro = motion.gyro_radps + rng.normal(0.0, per_sample * noise.gyro_noise_density, motion.gyro_radps.shape)
     return replace(sound, motion=replace(motion, accel_mps2=accel, gyro_radps=gyro))
-
-
-def test_a_consistent_correction_has_a_chi_square_length(sound):
-    model, rng = motion_model(sound.noise, sound.gravity_world), np.random.default_rng(5)
-    before = model.initial_belief(sound.prior)
-    d, m, count = len(before.cov), 6, 400
-    H = rng.normal(size=(m, d)) / np.sqrt(np.diag(before.cov))
-    S = H @ before.cov @ H.T + np.eye(m)
-    gain = np.linalg.solve(S, H @ before.cov).T
-    root, found = np.linalg.cholesky(S), []
-    for _ in range(count):
-        after = before.moved(gain @ root @ rng.normal(size=m), before.cov - gain @ S @ gain.T)
-        found.append(correction_test(before, after))
-    assert {test.dof for test in found} == {m}
-    # The mean of so many chi-square variables is within four of its standard errors.
-    assert abs(np.mean([test.nis for test in found]) - m) < 4.0 * np.sqrt(2.0 * m / count)
-
-
-def test_what_nothing_corrected_is_not_tested(sound):
-    belief = motion_model(sound.noise, sound.gravity_world).initial_belief(sound.prior)
-    assert correction_test(belief, belief) == CorrectionTest(0.0, 0)
 
 
 def tells(run):

@@ -112,15 +112,15 @@ class Filmed:
         return np.asarray(points_rect @ rig.R_rect_cam - along(k)[:3, 3])
 
 
-def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3) -> list[Pair]:
-    """Return the images of both cameras along the motion."""
+def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed: int = 3, every: int = 1) -> list[Pair]:
+    """Return the images of both cameras along the motion, of one frame in so many."""
     shown = scene(seed)
     return [
         (
             shown.seen(cameras[0], along(k), seed=2 * k),
             shown.seen(cameras[1], T_right_left @ along(k), seed=2 * k + 1),
         )
-        for k in range(frames)
+        for k in range(0, every * frames, every)
     ]
 
 
@@ -128,6 +128,12 @@ def film(cameras: tuple[Camera, Camera], T_right_left: Array, frames: int, seed:
 def plain() -> Filmed:
     """Return a film of cameras without distortion that are mounted perfectly."""
     return Filmed(already_rectified(PLAIN.pinhole_px, BASELINE_M, SIZE), film((PLAIN, PLAIN), RECTIFIED, 10))
+
+
+@pytest.fixture(scope="session")
+def hasty() -> Filmed:
+    """Return a film whose rows move by ten pixels from pair to pair."""
+    return Filmed(already_rectified(PLAIN.pinhole_px, BASELINE_M, SIZE), film((PLAIN, PLAIN), RECTIFIED, 5, every=8))
 
 
 @pytest.fixture(scope="session")
@@ -162,8 +168,8 @@ def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pa
 
 
 @pytest.fixture(autouse=True)
-def _shared_cache(shared_cache: None) -> None:
-    """Leave the user's own cache alone."""
+def _shared_cache(shared_cache: None, one_process: None) -> None:
+    """Leave the user's own cache alone, and start no process: a folder that is refused needs none."""
 
 
 def write_images(folder: Path, images: list[Image], names: list[str]) -> None:

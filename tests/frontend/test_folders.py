@@ -14,6 +14,7 @@ from toolkit.cli import main
 from toolkit.datasets import is_drawn_from_a_seed, load_sequence
 from toolkit.datasets.io.euroc_calibration import read_calibration
 from toolkit.datasets.io.image_pairs import pairs_of_asl
+from toolkit.errors import DataError
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.frontend import rectified, track_images, tracking
 from toolkit.frontend.cameras import Image
@@ -147,14 +148,39 @@ def reverse_rows(path: Path) -> None:
     path.write_text("\n".join([head, *rows[::-1]]) + "\n")
 
 
+def matrix_of(path: Path) -> tuple[Any, str]:
+    """Return T_BS (4, 4) of a sensor.yaml, and as it stands there."""
+    data = re.search(r"data: \[([^]]*)\]", path.read_text())
+    assert data is not None
+    return np.array([float(x) for x in data[1].split(",")]).reshape(4, 4), data[1]
+
+
+def invert_extrinsic(path: Path) -> None:
+    T_body_sensor, data = matrix_of(path)
+    edit(path, data, ", ".join(f"{x:.12g}" for x in np.linalg.inv(T_body_sensor).ravel()))
+
+
+def restamp(table: Path, change: Callable[[int], int]) -> None:
+    head, *rows = table.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    table.write_text("\n".join([head, *(f"{change(int(t))},{name}" for t, name in cells)]) + "\n")
+
+
+def one_instant(imu: Path) -> None:
+    head, *rows = imu.read_text().splitlines()
+    stamp = rows[0].partition(",")[0]
+    imu.write_text("\n".join([head, *(f"{stamp},{row.partition(',')[2]}" for row in rows)]) + "\n")
+
+
+def point_to_lfs(path: Path) -> None:
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+
+
 def turn_extrinsic(path: Path) -> None:
     """Turn a camera by a right angle about its optical axis, in its calibration alone."""
-    text = path.read_text()
-    data = re.search(r"data: \[([^]]*)\]", text)
-    assert data is not None
-    T_body_sensor = np.array([float(x) for x in data[1].split(",")]).reshape(4, 4)
+    T_body_sensor, data = matrix_of(path)
     T_body_sensor[:3, :3] = T_body_sensor[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    path.write_text(text.replace(data[1], ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel())))
+    edit(path, data, ", ".join(f"{x:.12g}" for x in T_body_sensor.ravel()))
 
 
 LEFT_OUT: list[tuple[str, Callable[[Path], object], str]] = [
@@ -278,8 +304,8 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("all truncated", lambda d: [p.write_bytes(p.read_bytes()[:99]) for p in images(d, 0)], "image pairs cannot be"),
     ("all black", lambda d: [every(d, c, lambda i: i * 0) for c in (0, 1)], "9 of 10 .* those of the pair before"),
     ("all of another size", lambda d: every(d, 1, lambda i: i[::2, ::2]), "160x120 px, expected 320x240"),
-    ("no left images", lambda d: shutil.rmtree(d / IMAGES.format(0)), "missing or cannot be read"),
-    ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam1/sensor.yaml: cannot be read"),
+    ("no left images", lambda d: shutil.rmtree(d / IMAGES.format(0)), "cam1/data has images and .*cam0/data has none"),
+    ("no right camera", lambda d: shutil.rmtree(d / "mav0/cam1"), "cam0/data has images and .*cam1/data has none"),
     ("no extrinsic", lambda d: edit(d / YAML.format(1), "T_BS", "T_SB"), "T_BS"),
     ("one turned", lambda d: turn_extrinsic(d / YAML.format(1)), "deg apart|not to the right of cam0"),
     ("empty imu yaml", lambda d: (d / "mav0/imu0/sensor.yaml").write_text("%YAML:1.0\n"), "imu0/sensor.yaml"),
@@ -287,7 +313,44 @@ REFUSED: list[tuple[str, Callable[[Path], object], str]] = [
     ("names with folders", lambda d: edit(d / "mav0/cam0/data.csv", ",14", ",../14"), "the name of an image"),
     ("stamps in seconds", lambda d: edit(d / "mav0/cam0/data.csv", "\n14", "\n1.4"), "not in whole nanoseconds"),
     ("wrong tilt", lambda d: [every(d, 1, lambda i: np.roll(i, 25, axis=0))], "the calibration is not that of these"),
-    ("same images", lambda d: [every(d, 1, lambda i: i[::-1, ::-1])], "the calibration is not that of these"),
+    ("right turned", lambda d: [every(d, 1, lambda i: i[::-1, ::-1])], "the calibration is not that of these"),
+    ("one yaml for both", lambda d: shutil.copy(d / YAML.format(0), d / YAML.format(1)), "stand at one place"),
+    ("poses inverted", lambda d: [invert_extrinsic(d / YAML.format(c)) for c in (0, 1)], "the inverse of one: invert"),
+    (
+        "nine intrinsics",
+        lambda d: edit(d / YAML.format(0), ", 118.0]", ", 118.0, 0, 0, 0, 0, 1]"),
+        "has 9 values",
+    ),
+    (
+        "late trigger",
+        lambda d: restamp(d / "mav0/cam1/data.csv", lambda t: t + 20_000_000),
+        "nearest is 20 ms",
+    ),
+    (
+        "microseconds",
+        lambda d: [restamp(d / f"mav0/cam{c}/data.csv", lambda t: t // 1000) for c in (0, 1)],
+        "look like microseconds: multiply by 1e3",
+    ),
+    (
+        "imu of one instant",
+        lambda d: one_instant(d / "mav0/imu0/data.csv"),
+        "IMU are all of one instant",
+    ),
+    (
+        "pointers",
+        lambda d: [point_to_lfs(p) for c in (0, 1) for p in images(d, c)],
+        "images with git lfs pull",
+    ),
+    (
+        "left copied",
+        lambda d: [shutil.copy(a, b) for a, b in zip(images(d, 0), images(d, 1), strict=True)],
+        "left and right images are the same ones",
+    ),
+    (
+        "all halved",
+        lambda d: [every(d, c, lambda i: i[::2, ::2]) for c in (0, 1)],
+        "expected 320x240.; where images were scaled, cut or turned, do the same to the calibration",
+    ),
 ]
 
 
@@ -309,6 +372,45 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(
 
 def test_there_are_forty_faulty_folders() -> None:
     assert len(LEFT_OUT) + len(USED) + len(REFUSED) >= 40
+
+
+def test_the_commonest_fault_is_the_one_told(asl: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images(asl, 0)[0].write_bytes(b"")
+    for path in images(asl, 0)[1:]:
+        point_to_lfs(path)
+    assert main(["compare", str(asl), "--tracks", "images", "--out", str(asl.parent / "run")]) == 3
+    told = capsys.readouterr().err
+    assert "git lfs pull" in told
+    assert "it is empty" not in told
+
+
+def test_of_a_recording_with_few_of_its_images_these_are_used_where_asked_for(asl: Path) -> None:
+    for path in images(asl, 1)[2:9]:
+        path.unlink()
+    sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))
+    assert sequence.frame_count == FRAMES - 7
+    assert f"7 of {FRAMES} image pairs lack a file and are left out" in sequence.provenance.facts
+
+
+def test_images_that_are_not_used_are_spoken_of_where_tracks_are_simulated(asl: Path) -> None:
+    for camera in (0, 1):
+        for path in reversed(images(asl, camera)):
+            path.rename(path.with_stem(str(int(path.stem) + 7)))
+    assert load_sequence(str(asl)).provenance.facts[-1].startswith("0.0 % of the camera's stamps have both images")
+    (asl / "truth.tum").unlink()
+    with pytest.raises(DataError, match=r"no ground truth .* 0\.0 % of the camera's stamps have both images"):
+        load_sequence(str(asl))
+    with pytest.raises(DataError, match=r"none of the 10 image pairs .* is there, as 1403.*\.png in cam0/data"):
+        load_sequence(str(asl), 0, Frontend(tracks="images"))
+
+
+def test_hidden_files_beside_images_are_no_images(asl: Path) -> None:
+    before = load_sequence(str(asl))
+    for camera in (0, 1):
+        (asl / f"mav0/cam{camera}/data.csv").unlink()
+        for path in images(asl, camera):
+            path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    np.testing.assert_array_equal(load_sequence(str(asl)).observations.uv_px, before.observations.uv_px)
 
 
 def kalibr(root: Path, rows: Callable[[int], str], model: str = "radtan") -> None:
@@ -333,19 +435,42 @@ def as_rows(key: str, T: Any) -> str:
     return f"  {key}:\n" + "".join(f"  - [{', '.join(f'{x:.12g}' for x in row)}]\n" for row in T)
 
 
+def as_opencv(key: str, T: Any) -> str:
+    numbers = ", ".join(f"{x:.12g}" for x in T.ravel())
+    return f"  {key}: !!opencv-matrix\n    rows: 4\n    cols: 4\n    dt: d\n    data: [{numbers}]\n"
+
+
+@pytest.mark.parametrize("write", [as_rows, as_opencv])
 @pytest.mark.parametrize("key", ["T_cam_imu", "T_cn_cnm1"])
-def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str) -> None:
+def test_kalibrs_camchain_is_the_same_calibration(asl: Path, key: str, write: Callable[..., str]) -> None:
     before = load_sequence(str(asl))
     T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
     T_right_left = _right_left(asl)
     second = T_right_left if key == "T_cn_cnm1" else T_right_left @ T_left_imu
-    kalibr(asl, lambda c: as_rows("T_cam_imu", T_left_imu) if c == 0 else as_rows(key, second))
+    kalibr(asl, lambda c: write("T_cam_imu", T_left_imu) if c == 0 else write(key, second))
     after = load_sequence(str(asl))
     np.testing.assert_allclose(after.rig.T_imu_cam, before.rig.T_imu_cam, atol=1e-9)
     assert after.rig.baseline_m == pytest.approx(before.rig.baseline_m, rel=1e-9)
     # twelve printed digits move a rectified pixel by nothing that shows
     np.testing.assert_allclose(np.sort(after.observations.uv_px[:, 0])[::50], _left_columns(before)[::50], atol=0.05)
     assert any("camchain-imucam.yaml" in fact for fact in after.provenance.facts)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("  T_cam_imu", "  T_imu_body", "is of cameras alone; take the camchain"),
+        ("camera_model: pinhole", "camera_model: omni", "camera_model omni; images are rectified of pinhole"),
+        ("cam1:", "cam2:", "holds one camera, and stereo needs two"),
+    ],
+)
+def test_a_camchain_that_is_of_no_use_says_why(asl: Path, old: str, new: str, complaint: str) -> None:
+    T_left_imu = se3_inverse(load_sequence(str(asl), 0, Frontend(tracks="simulated")).rig.T_imu_cam)
+    T_right_left = _right_left(asl)
+    kalibr(asl, lambda c: as_rows("T_cam_imu", T_left_imu) if c == 0 else as_rows("T_cn_cnm1", T_right_left))
+    edit(asl / "camchain-imucam.yaml", old, new)
+    with pytest.raises(DataError, match=complaint):
+        load_sequence(str(asl))
 
 
 def _right_left(root: Path) -> Any:

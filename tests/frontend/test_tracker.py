@@ -1,6 +1,7 @@
 """Stereo tracks on images whose geometry is known: places, depths, ids, and what each gate keeps out."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -8,7 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from toolkit.frontend import rigidity
+from toolkit.errors import DataError
+from toolkit.frontend import StampedPair, rigidity, track_images
 from toolkit.frontend.corners import corners, count_in_cells
 from toolkit.frontend.tracker import Sightings, Tracker
 from toolkit.geometry import Array
@@ -134,6 +136,19 @@ def test_a_right_image_of_another_instant_is_refused_and_the_tracks_go_on(plain:
     assert before is not None
     assert after is not None
     assert np.isin(before.track_ids, after.track_ids).mean() > 0.6
+
+
+@pytest.mark.parametrize(("late", "which"), [(-1, "after"), (1, "before")])
+def test_of_a_right_camera_that_is_one_pair_late_or_early_the_partner_is_told(
+    hasty: Filmed, tmp_path: Path, late: int, which: str
+) -> None:
+    last = len(hasty.images) - 1
+    pairs = [StampedPair(100 * k, *(tmp_path / f"{k}{side}.png" for side in "lr")) for k in range(1, last)]
+    for k, pair in enumerate(pairs, start=1):
+        cv2.imwrite(str(pair.left), hasty.images[k][0])
+        cv2.imwrite(str(pair.right), hasty.images[k + late][1])
+    with pytest.raises(DataError, match=f"left images match the right images of the pair {which} theirs"):
+        track_images(pairs, hasty.rig, Frontend())
 
 
 def test_images_without_texture_have_no_tracks(plain: Filmed) -> None:

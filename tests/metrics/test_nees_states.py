@@ -49,7 +49,7 @@ def drawn(sequence, make_run, scale=1.0, T_new_old=None):
 
 
 def values(run, sequence):
-    scores = score_run(run, "final", sequence)
+    scores = score_run(run, "final", sequence, only=KEYS)
     return [scores.values[key] for key in KEYS], [scores.notes.get(key, "") for key in KEYS]
 
 

@@ -56,6 +56,16 @@ def state() -> State:
     return State(se3_exp(np.array([0.4, -0.8, 1.1, 3.0, -2.0, 5.0])), np.array([3.0, -1.0, 0.5]), BIAS + 0.01)
 
 
+def test_intervals_integrated_together_are_each_integrated_by_itself(motion: ImuMotion) -> None:
+    model = imu.ImuModel(FLIGHT.motion.noise, np.array(GRAVITY_WORLD))
+    half = ImuMotion(motion.dt_s[:10], motion.accel_mps2[:10], motion.gyro_radps[:10])
+    motions, biases = [motion, half, motion], [BIAS, 2.0 * BIAS, -BIAS]
+    for one, bias, together in zip(motions, biases, model.integrate_each(motions, biases), strict=True):
+        alone = model.integrate(one, bias)
+        assert together.dt_s == alone.dt_s
+        assert together.preintegration.equals(alone.preintegration, 1e-15)
+
+
 def test_noise_over_a_bridge_is_scaled_and_the_motion_is_not(motion: ImuMotion) -> None:
     noise = FLIGHT.motion.noise
     model = imu.ImuModel(noise, np.array(GRAVITY_WORLD))

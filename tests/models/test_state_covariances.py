@@ -87,7 +87,8 @@ def test_every_state_of_a_run_has_gtsams_marginal(scenario, smoothed):
 
 
 @pytest.mark.parametrize(
-    ("scenario", "in_time", "most_tied"), [("drive", True, 5), ("flight", True, 5), ("drive", False, 50)]
+    ("scenario", "in_time", "most_tied"),
+    [("drive", True, 5), ("flight", True, 5), ("drive", False, 50), ("flight", False, 50)],
 )
 def test_every_state_has_gtsams_marginal_in_any_order(scenario, in_time, most_tied, smoothed, monkeypatch):
     """In the order of time, landmarks among the states or before them, and by nested dissection where it is no good."""
@@ -109,14 +110,6 @@ def test_the_newest_state_of_a_window_that_never_leaves_has_the_batchs_covarianc
     smoothed = run_estimator("batch", sequence).final.cov[-1]
     sigma_ratio = np.sqrt(np.diag(newest)[:6] / np.diag(smoothed)[:6])
     np.testing.assert_allclose(sigma_ratio, 1.0, atol=0.25)
-
-
-def test_a_dissection_that_loses_its_digits_over_an_imu_is_not_shown(smoothed, monkeypatch):
-    problem = smoothed("flight")
-    monkeypatch.setattr(state_covariances, "_eliminated", _only_dissected(state_covariances._eliminated))
-    cov, log = problem.covariances()
-    assert cov is None
-    assert log == ("no covariances of the final states: not in the order of time",)
 
 
 def test_covariances_that_rounding_spoils_are_not_shown(run_estimator, monkeypatch):

@@ -97,6 +97,24 @@ def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimato
     assert mark(76.0) == "heavy-tailed"
 
 
+def test_a_run_whose_tracks_turn_its_state_one_way_is_told_with_trend_and_limit(
+    comparison: Comparison, rescored: Rescored
+) -> None:
+    trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
+    leaning = rescored(comparison, lambda row: Scores(row.scores.values | trend, {}))
+    built = json.loads(to_text(metrics_document(leaning)))
+    assert parse(to_text(metrics_document(leaning)), Metrics) == metrics_document(leaning)
+    assert built["runs"][0]["consistency"] == {
+        "verdict": "contradicted",
+        "metric": "correction_trend",
+        "mean": 5.25,
+        "band": [0.0, 4.0],
+    }
+    words = [line for line in note_lines(leaning) if "contradicted" in line]
+    assert words[0].startswith("steady is contradicted: its tracks turn its state one way, 5.2")
+    assert "by chance at most 4.00" in words[0]
+
+
 def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
     comparison: Comparison, rescored: Rescored
 ) -> None:

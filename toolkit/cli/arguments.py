@@ -247,7 +247,7 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-fast",
         action="store_true",
-        help="NumPy throughout, where the extra 'fast' would have the windowed filters run compiled code",
+        help="NumPy throughout, where the extra 'fast' would have filters run compiled code",
     )
     parser.add_argument(
         "--set",

@@ -26,6 +26,7 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
 from toolkit.datasets.io.fields import check_frame_count, observations
+from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock, check_one_trigger
 from toolkit.datasets.io.image_pairs import facts_of, image_folder, images_in, pairs_of_asl, rig_of
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.tracks_along import tracks_in_a_room
@@ -143,7 +144,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     layout = _whole(path)
     imu = _imu(layout)
     calibration = published() if layout.mav0 is None else read_calibration(layout.root, layout.mav0)
-    choice = choose_truth(layout.root, layout.mav0, imu)
+    choice = choose_truth(layout.root, layout.mav0, imu, "; ".join(_few_images(layout)))
     stamps = read_stamps(layout.stamps)
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
@@ -185,14 +186,19 @@ def _imu(layout: _Layout) -> ImuSamples:
 
 def _few_images(layout: _Layout) -> Iterator[str]:
     """Yield why the images that a folder holds were not used, where it holds too few."""
-    share = 0.0 if layout.mav0 is None else _share_with_images(layout.mav0, layout.stamps)
-    if 0.0 < share < _NEARLY_ALL:
-        yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images uses those there are"
+    if layout.mav0 is None or not _has_images(layout.mav0):
+        return
+    share = _share_with_images(layout.mav0, layout.stamps)
+    if share < _NEARLY_ALL:
+        what = "uses those there are" if share > 0.0 else "says why"
+        yield f"{100.0 * share:.1f} % of the camera's stamps have both images; --tracks images {what}"
 
 
 def _with_images(layout: _Layout) -> Path:
     if layout.mav0 is None:
         raise DataError(f"{layout.root}: a lean recording has no images; its tracks can be simulated")
+    if _has_images(layout.mav0):
+        check_both_cameras(layout.root, *(image_folder(layout.mav0 / camera) for camera in ("cam0", "cam1")))
     return layout.mav0
 
 
@@ -202,29 +208,39 @@ def _filmed(
     """Return the pairs within the IMU's time with their cameras, and what had to be put right."""
     if calibration.cameras is None:
         raise DataError(f"{layout.root}: the calibration lacks distortion_model or intrinsics of a camera; add them")
-    listed = pairs_of_asl(mav0)
-    within = listed.within(imu.t_ns)
-    if listed.pairs and not within.pairs:
-        spans = [f"{int(t.min())} to {int(t.max())} ns" for t in (np.array([p.t_ns for p in listed.pairs]), imu.t_ns)]
+    named = pairs_of_asl(mav0)
+    check_one_trigger(mav0, named)
+    listed = named.there(_NEARLY_ALL)
+    if named.pairs and not listed.pairs:
+        first = named.pairs[0].left
         raise DataError(
-            f"{layout.root}: none of the {len(listed.pairs)} image pairs, {spans[0]}, lies in the time of the IMU, "
-            f"{spans[1]}; they are of two clocks or two recordings"
+            f"{mav0}: none of the {len(named.pairs)} image pairs of the tables is there, as {first.name} in "
+            f"{first.parent.relative_to(mav0)}; take these images' own data.csv, or none, where their names are stamps"
         )
+    check_frame_count(layout.root, len(listed.pairs))
+    check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, "the samples of the IMU")
+    within = listed.within(imu.t_ns)
     check_frame_count(layout.root, len(within.pairs))
     return ImageRecording(within.pairs, rectified(*calibration.cameras, calibration.T_right_left)), within.remarks
 
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:
     """Return which share of the camera's stamps have both images; 0 where nothing can be read."""
-    if not any(images_in(image_folder(mav0 / camera)) for camera in ("cam0", "cam1")):
+    if not _has_images(mav0):
         return 0.0
     try:
         count = np.unique(read_stamps(stamps)).size if is_regular(stamps) else 0
         listed = pairs_of_asl(mav0)
     except DataError:
-        return 1.0  # there are images: what is wrong with their table is said when it is read
+        return 1.0  # there are images: what is wrong with their stamps is said when they are read
+    if listed.apart_ms is not None:
+        return 1.0  # as above
     there = sum(is_regular(pair.left) and is_regular(pair.right) for pair in listed.pairs)
     return there / max(count, listed.stamps, 1)
+
+
+def _has_images(mav0: Path) -> bool:
+    return any(images_in(image_folder(mav0 / camera)) for camera in ("cam0", "cam1"))
 
 
 def _layout(path: Path) -> _Layout | None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.image_checks import check_both_cameras, check_several_stamps
 from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_name, rig_of
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
@@ -98,12 +99,16 @@ def _whole(path: Path) -> _Layout:
     layout = _layout(path)
     if layout is None:
         raise DataError(f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images")
+    check_both_cameras(layout.root, layout.left, layout.right)
     return layout
 
 
 def _pair(layout: _Layout) -> RectifiedPair:
     left, right = _projections(layout)
     baseline_m = (left[0, 3] - right[0, 3]) / left[0, 0]
+    if baseline_m == 0.0:
+        rows = f"P{layout.row} and P{layout.row + 1}"
+        raise DataError(f"{layout.root / 'calib.txt'}: {rows} are the same, so there is no baseline; give each its own")
     if not baseline_m > 0.0:
         raise DataError(f"{layout.root / 'calib.txt'}: the right camera is not to the right of the left; exchange rows")
     fx_px, fy_px, cx_px, cy_px = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
@@ -133,21 +138,24 @@ def _aside(pair: RectifiedPair) -> tuple[str, ...]:
 def _listed(layout: _Layout, stamps: IntArray) -> Listed:
     listed = pairs_by_name(layout.left, layout.right, dict(enumerate(stamps.tolist())))
     if not listed.pairs:
-        numbers = _numbers(layout) or [0]
+        numbers = _numbers(layout)
+        if not numbers:
+            name = images_in(layout.left)[0].name
+            raise DataError(f"{layout.left}: {name} is no number; name the images of an instant alike, as 000000.png")
         raise DataError(
             f"{layout.root}: no image has a stamp: they are numbered {numbers[0]} to {numbers[-1]}, and times.txt has "
             f"{stamps.size}, from number 0 on; cut both or neither"
         )
-    check_frame_count(layout.root, len(listed.pairs))
+    check_several_stamps(layout.root / "times.txt", listed)
     return listed
 
 
 def _layout(path: Path) -> _Layout | None:
+    """Return the first pair of folders that both have images, else the first of which one has."""
     root = path.resolve()
-    for left, right, row in _FOLDERS:
-        if images_in(root / left) or images_in(root / right):
-            return _Layout(root, root / left, root / right, row)
-    return None
+    layouts = [_Layout(root, root / left, root / right, row) for left, right, row in _FOLDERS]
+    there = [(bool(images_in(one.left)), bool(images_in(one.right))) for one in layouts]
+    return next((one for how in (all, any) for one, both in zip(layouts, there, strict=True) if how(both)), None)
 
 
 def _projections(layout: _Layout) -> tuple[Array, Array]:
@@ -221,7 +229,10 @@ def _truth(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
         return None
     T_world_cam = read_poses(file).T_world_imu
     if len(T_world_cam) not in (stamps.size, _count(layout)):
-        raise DataError(f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence")
+        raise DataError(
+            f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence, or not cut "
+            "as the images are"
+        )
     T_cam_flu = np.linalg.inv(T_FLU_CAM)
     used = np.flatnonzero(np.isin(stamps[: len(T_world_cam)], t_ns))
     return Truth(stamps[used], T_FLU_CAM @ T_world_cam[used] @ T_cam_flu)

@@ -13,7 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, observations
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_stamps, rig_of
+from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock, check_several_stamps
+from toolkit.datasets.io.image_pairs import (
+    Listed,
+    facts_of,
+    image_folder,
+    images_in,
+    images_only,
+    pairs_by_stamps,
+    rig_of,
+)
 from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
 from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
@@ -44,7 +53,10 @@ class _Layout:
     sides: tuple[str, str]
 
     def images(self, side: int) -> Path:
-        return self.root / f"image_{self.sides[side]}" / "data"
+        return image_folder(self.camera(side))
+
+    def camera(self, side: int) -> Path:
+        return self.root / f"image_{self.sides[side]}"
 
 
 uses_images = images_only
@@ -76,6 +88,8 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     tracks = track_images(listed.pairs, mounted.pair, frontend, progress)
     check_frame_count(layout.root, tracks.t_ns.size)
     packets = read_packets(layout.root / "oxts")
+    if packets is not None:
+        check_one_clock(layout.root, tracks.t_ns, packets.t_ns, "the oxts packets")
     motion, noise, how = _motion(packets, tracks.t_ns)
     facts = (how, *facts_of(tracks, len(listed.pairs)), *listed.remarks, mounted.source)
     return Sequence(
@@ -91,27 +105,26 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
 
 
 def _layout(path: Path) -> _Layout | None:
-    root = path.resolve()
-    for sides in _SIDES:
-        layout = _Layout(root, sides)
-        if images_in(layout.images(0)) or images_in(layout.images(1)):
-            return layout
-    return None
+    """Return the first pair of cameras that both have images, else the first of which one has."""
+    layouts = [_Layout(path.resolve(), sides) for sides in _SIDES]
+    there = [tuple(bool(images_in(one.images(side))) for side in (0, 1)) for one in layouts]
+    return next((one for how in (all, any) for one, both in zip(layouts, there, strict=True) if how(both)), None)
 
 
 def _whole(path: Path) -> _Layout:
     layout = _layout(path)
     if layout is None:
         raise DataError(f"{path}: no image_00/data and image_01/data, or image_02 and image_03, with images")
+    check_both_cameras(layout.root, layout.images(0), layout.images(1))
     return layout
 
 
 def _listed(layout: _Layout) -> Listed:
-    stamps = read_stamps(layout.images(0).parent / "timestamps.txt")
-    right = layout.images(1).parent / "timestamps.txt"
+    left, right = (layout.camera(side) / "timestamps.txt" for side in (0, 1))
+    stamps = read_stamps(left)
     right_stamps = read_stamps(right) if is_regular(right) else stamps
     listed = pairs_by_stamps(layout.images(0), layout.images(1), stamps, right_stamps)
-    check_frame_count(layout.root, len(listed.pairs))
+    check_several_stamps(left, listed)
     return listed
 
 

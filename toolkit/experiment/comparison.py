@@ -31,6 +31,7 @@ from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
+from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.resampling import NS_PER_S
 from toolkit.settings import DEFAULTS, Settings
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from toolkit.sequence import Sequence as Recorded
     from toolkit.track_errors import Card
 
-Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed"]
+Verdict = Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"]
 NEES, NIS = "nees_pose_mean", "nis_mean"
 
 
@@ -64,7 +65,7 @@ class Consistency:
     def verdict(self) -> Verdict:
         """Return what the mean says of the stated uncertainty."""
         if self.mean > self.high:
-            return "overconfident"
+            return "contradicted" if self.metric == TREND else "overconfident"
         if self.mean >= self.low:
             return "consistent"
         return "heavy-tailed" if self.refused_much else "timid"
@@ -73,9 +74,26 @@ class Consistency:
 def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
     """Judge one kind of output of an estimator over one run or several: by NEES where there is one, else by NIS.
 
-    Returns None where neither can be had: no covariance stated, or a final output without an independent truth.
+    Unless these tell of too much certainty, corrections that lean one way beyond their limit decide. Returns None where
+    none of it can be had: no covariance stated, or a final output without an independent truth.
     """
     scored = list(runs)
+    by_errors = _by_errors(scored)
+    if by_errors is not None and by_errors.verdict == "overconfident":
+        return by_errors
+    return _contradicted(scored) or by_errors
+
+
+def _contradicted(scored: Sequence[Scored]) -> Consistency | None:
+    """Return by what the corrections of runs lean one way, on average beyond the average of their limits, or None."""
+    trends = [one.scores.values for one in scored if one.scores.values.get(TREND) is not None]
+    if not trends:
+        return None
+    mean, limit = (float(np.mean([values[key] for values in trends])) for key in (TREND, LIMIT))
+    return Consistency(TREND, mean, 0.0, limit) if mean > limit else None
+
+
+def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
     nees = [value for one in scored if (value := one.scores.values.get(NEES)) is not None]
     if nees:
         return _judged(NEES, nees, float(POSE_DOF * len(nees)))
@@ -202,7 +220,7 @@ class Row:
 
     @property
     def mark(self) -> str:
-        """Return "overconfident", "timid" or "heavy-tailed" where the stated uncertainty is so, else nothing."""
+        """Return "overconfident", "timid", "heavy-tailed" or "contradicted" where a run is so, else nothing."""
         verdict = "consistent" if self.consistency is None else self.consistency.verdict
         return "" if verdict == "consistent" else verdict
 

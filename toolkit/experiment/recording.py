@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from toolkit.audit import Audit, Finding, audit
 from toolkit.audit.parts.subsets import keep_frames
@@ -16,6 +15,7 @@ from toolkit.datasets import load_sequence
 from toolkit.datasets.io.truth_file import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
+from toolkit.linear_algebra import on_one_thread
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
@@ -105,7 +105,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
 
     Raises DataError where the source or the truth cannot be used, VislamError where ``keep`` names no fault.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    with on_one_thread():
         audited = audited_recording(recording, progress)
         whole = _with_noise(audited.sequence, recording.noise)
         card = None
@@ -168,7 +168,7 @@ def recording_card(recording: Recording, progress: Progress = SILENT) -> tuple[S
 
     Raises as :func:`prepare`, and DataError where the tracks are too few.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    with on_one_thread():
         sequence = _cut(audited_recording(recording, progress).sequence, recording)
         return sequence, card_of(sequence, fit_track_noise(sequence))
 

@@ -20,6 +20,7 @@ from toolkit.frontend.cameras import Image
 from toolkit.inputs import read_input
 
 _PNG = b"\x89PNG\r\n\x1a\n"
+_LFS_POINTER = b"version https://git-lfs"
 _AHEAD = 3
 _Asked = TypeVar("_Asked")
 _Given = TypeVar("_Given")
@@ -36,10 +37,11 @@ class StampedPair:
 
 @dataclass(frozen=True)
 class Unusable:
-    """An image that cannot be used, and why."""
+    """An image that cannot be used, why, and what to do where all are so."""
 
     path: Path
     reason: str
+    remedy: str = "copy the images again"
 
     def __str__(self) -> str:
         return f"{'/'.join(self.path.parts[-3:])} ({self.reason})"
@@ -55,7 +57,11 @@ def read_image(path: Path, bits: int, size_px: tuple[int, int] | None = None) ->
         return raw
     height, width = raw.shape
     if size_px is not None and (width, height) != size_px:
-        return Unusable(path, f"{width}x{height} px, expected {size_px[0]}x{size_px[1]}")
+        return Unusable(
+            path,
+            f"{width}x{height} px, expected {size_px[0]}x{size_px[1]}",
+            "where images were scaled, cut or turned, do the same to the calibration",
+        )
     if raw.dtype == np.uint16:
         return np.asarray(np.minimum(raw >> max(bits - 8, 0), 255), dtype=np.uint8)
     return np.asarray(raw, dtype=np.uint8)
@@ -75,7 +81,7 @@ def size_of(path: Path) -> tuple[int, int]:
     """Return width and height of an image; raises DataError where it cannot be used."""
     raw = _decoded(path)
     if isinstance(raw, Unusable):
-        raise DataError(f"{path}: {raw.reason}; copy it again")
+        raise DataError(f"{path}: {raw.reason}; {raw.remedy}")
     return raw.shape[1], raw.shape[0]
 
 
@@ -85,10 +91,9 @@ def _decoded(path: Path) -> npt.NDArray[np.uint8 | np.uint16] | Unusable:
         content = read_input(path)
     except DataError:
         return Unusable(path, "it is missing or cannot be read")
-    if not content:
-        return Unusable(path, "it is empty")
-    if content.startswith(_PNG) and not _is_whole_png(content):
-        return Unusable(path, "damaged or truncated")
+    fault = _fault_of(path, content)
+    if fault is not None:
+        return fault
     import cv2
 
     # A damaged image is named in the report; OpenCV would complain on the terminal as well.
@@ -100,8 +105,19 @@ def _decoded(path: Path) -> npt.NDArray[np.uint8 | np.uint16] | Unusable:
     if raw is None:
         return Unusable(path, "no image, damaged or truncated")
     if raw.dtype not in (np.uint8, np.uint16):
-        return Unusable(path, f"pixels of {raw.dtype}, expected 8 or 16 bits")
+        return Unusable(path, f"pixels of {raw.dtype}, expected 8 or 16 bits", "convert the images to 8 or 16 bits")
     return np.asarray(raw)
+
+
+def _fault_of(path: Path, content: bytes) -> Unusable | None:
+    """Return what is wrong with the bytes of a file before they are decoded, None where nothing is seen."""
+    if not content:
+        return Unusable(path, "it is empty")
+    if content.startswith(_LFS_POINTER):
+        return Unusable(path, "a pointer of Git LFS and no image", "fetch the images with git lfs pull")
+    if content.startswith(_PNG) and not _is_whole_png(content):
+        return Unusable(path, "damaged or truncated")
+    return None
 
 
 def _is_whole_png(content: bytes) -> bool:

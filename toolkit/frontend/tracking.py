@@ -5,7 +5,7 @@ left and right are what they are called, and that the calibration is theirs.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from toolkit.settings import Frontend
 _LOOKED_AT = 5
 # Of the wanted corners a sound pair finds a third or more in the right image; one that is no pair hardly any.
 _LEAST_MATCHED, _MOST_SWAPPED = 0.08, 2.0
-_MISPAIRED = "left and right image are not of the same instant"
+_MISPAIRED = "left and right image are not of the same instant", "pair the images by when they were taken"
 _REPEATED = "it and its partner are those of the pair before"
 
 
@@ -101,14 +101,18 @@ def read_pairs(recording: ImageRecording, pairs: Sequence[StampedPair]) -> Itera
 
 def _bits_of(pairs: Sequence[StampedPair]) -> int:
     """Return the bits that the images' values fill, by the first, the middle and the last pair."""
-    some = [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
-    return bit_depth(path for pair in some for path in (pair.left, pair.right))
+    return bit_depth(path for pair in _some(pairs) for path in (pair.left, pair.right))
+
+
+def _some(pairs: Sequence[StampedPair]) -> list[StampedPair]:
+    """Return the first, the middle and the last pair."""
+    return [pairs[i] for i in sorted({0, len(pairs) // 2, len(pairs) - 1})]
 
 
 def _tracked(
     pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int, progress: Progress
 ) -> ImageTracks:
-    tracker, skipped = Tracker(rig, settings), []
+    tracker, skipped = Tracker(rig, settings), list[Unusable]()
     seen: list[tuple[int, Sightings]] = []
     stalled = 0
     for i, images in enumerate(_without_repeats(read_ahead(pairs, lambda pair: read_pair(pair, rig, bits)), pairs)):
@@ -117,20 +121,27 @@ def _tracked(
         if sightings is not None:
             seen.append((pairs[i].t_ns, sightings))
         else:
-            skipped.append(str(images if isinstance(images, Unusable) else Unusable(pairs[i].right, _MISPAIRED)))
+            skipped.append(images if isinstance(images, Unusable) else Unusable(pairs[i].right, *_MISPAIRED))
         progress.advance(i + 1, len(pairs), "tracking")
     if 2 * (len(skipped) - stalled) >= len(pairs) or len(seen) < 2 <= len(pairs):
+        often = _commonest(skipped)
         raise DataError(
-            f"{pairs[0].left.parent}: {len(skipped)} of {len(pairs)} image pairs cannot be used, as {skipped[0]}; "
-            "copy the images again"
+            f"{often.path.parent}: {len(skipped)} of {len(pairs)} image pairs cannot be used, as {often}; "
+            f"{often.remedy}"
         )
     return ImageTracks(
         np.array([t_ns for t_ns, _ in seen], dtype=np.int64),
         np.repeat(np.arange(len(seen)), [len(s.track_ids) for _, s in seen]),
         np.concatenate([s.track_ids for _, s in seen]),
         np.concatenate([s.corners_px for _, s in seen]),
-        tuple(skipped),
+        tuple(map(str, skipped)),
     )
+
+
+def _commonest(skipped: Sequence[Unusable]) -> Unusable:
+    """Return the first of those that have the commonest reason."""
+    reasons = [one.reason for one in skipped]
+    return max(skipped, key=lambda one: reasons.count(one.reason))
 
 
 def _without_repeats(
@@ -153,17 +164,21 @@ def _without_repeats(
 
 
 class _Matches(NamedTuple):
-    """Corners of a few pairs that were looked for, found, and found where left and right are exchanged."""
+    """Corners of a few pairs that were looked for, and found: in the partner, where left and right are exchanged, and
+    in the right images of the pairs before and after.
+    """
 
     wanted: int
     matched: int
     swapped: int
+    before: int
+    after: int
 
 
 def _looked_at(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> _Matches:
     """Match the corners of a few pairs, each by itself."""
     places = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
-    matched = swapped = wanted = 0
+    matched = swapped = wanted = before = after = 0
     for place in places.tolist():
         images = read_pair(pairs[place], rig, bits)
         exchanged = read_pair(pairs[place], rig, bits, (1, 0))
@@ -173,23 +188,56 @@ def _looked_at(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Front
         matched += _count(as_called, *images)
         swapped += _count(Tracker(rig, settings), exchanged[1], exchanged[0])
         wanted += as_called.tried
-    return _Matches(wanted, matched, swapped)
+        before += _matched_with(pairs, place, -1, rig, settings, bits)
+        after += _matched_with(pairs, place, 1, rig, settings, bits)
+    return _Matches(wanted, matched, swapped, before, after)
+
+
+def _matched_with(
+    pairs: Sequence[StampedPair], place: int, offset: int, rig: RectifiedPair, settings: Frontend, bits: int
+) -> int:
+    """Return how many corners of a left image are found in the right image of a pair so many pairs away."""
+    if not 0 <= place + offset < len(pairs):
+        return 0
+    images = read_pair(replace(pairs[place], right=pairs[place + offset].right), rig, bits)
+    return 0 if isinstance(images, Unusable) else _count(Tracker(rig, settings), *images)
 
 
 def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> None:
     """Raise DataError where a few pairs, each by itself, match better exchanged, or do not match at all."""
-    wanted, matched, swapped = _looked_at(pairs, rig, settings, bits)
     folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
-    if swapped > _MOST_SWAPPED * matched and swapped > _LEAST_MATCHED * wanted:
+    if _all_alike(pairs, rig, bits):
+        raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
+    wanted, matched, swapped, before, after = _looked_at(pairs, rig, settings, bits)
+    least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
+    if swapped > least:
         raise DataError(
-            f"{folders}: left and right images are exchanged; exchange the two folders, or turn the images if all are "
-            "upside down"
+            f"{folders}: left and right images are exchanged; exchange the two folders, or turn the images back if all "
+            "are upside down or mirrored"
+        )
+    if max(before, after) > least:
+        which = "before" if before > after else "after"
+        raise DataError(
+            f"{folders}: left images match the right images of the pair {which} theirs: one camera began earlier or "
+            "dropped an image; pair them by when they were taken"
         )
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "
             "ones; the calibration is not that of these images, or they are no pairs"
         )
+
+
+def _all_alike(pairs: Sequence[StampedPair], rig: RectifiedPair, bits: int) -> bool:
+    """Say whether left and right image are one and the same in a few pairs, before any rectification."""
+    return all(_alike(pair, rig, bits) for pair in _some(pairs))
+
+
+def _alike(pair: StampedPair, rig: RectifiedPair, bits: int) -> bool:
+    left, right = (read_image(path, bits, rig.raw_size_px) for path in (pair.left, pair.right))
+    if isinstance(left, Unusable) or isinstance(right, Unusable):
+        return False
+    return bool(np.ptp(left) > 0) and np.array_equal(left, right)
 
 
 def _count(tracker: Tracker, left: Image, right: Image) -> int:

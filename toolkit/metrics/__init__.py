@@ -133,18 +133,26 @@ def requests_of(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted({switch for switch in switches if switch}))
 
 
-def score_run(run: Run, output: Output, sequence: Sequence, requested: Collection[str] = ()) -> Scores:
+def score_run(
+    run: Run,
+    output: Output,
+    sequence: Sequence,
+    requested: Collection[str] = (),
+    only: Collection[str] | None = None,
+) -> Scores:
     """Score one output of a run against its sequence, with every key of :func:`describe`.
 
-    ``requested`` names the switches of metrics that are computed on request alone. A metric that cannot be computed, or
-    is not finite, is None and has its reason in the notes. Raises ValueError where the run has no output of that kind;
-    an error inside a metric is a defect and passes through.
+    ``requested`` names the switches of metrics that are computed on request alone; with ``only``, the keys, names or
+    groups of some metrics, no other file's are computed, and the scores have the keys of these files alone. A metric
+    that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where the run
+    has no output of that kind, VislamError where ``only`` names a metric that does not exist; an error inside a metric
+    is a defect and passes through.
     """
     evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
     notes: dict[str, str] = {}
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
-        for file in _found().files:
+        for file in _files_of(only):
             scores = _score_file(file, evaluation, requested)
             declared = [metric.key for metric in file.METRICS]
             if list(scores.values) != declared:
@@ -152,6 +160,14 @@ def score_run(run: Run, output: Output, sequence: Sequence, requested: Collectio
             values |= scores.values
             notes |= scores.notes
     return Scores(values, notes)
+
+
+def _files_of(names: Collection[str] | None) -> tuple[MetricFile, ...]:
+    """Return the files that declare the metrics of the given keys, names or groups; every file where they are None."""
+    if names is None:
+        return _found().files
+    wanted = {metric.key for metric in metrics_called(names)}
+    return tuple(file for file in _found().files if any(metric.key in wanted for metric in file.METRICS))
 
 
 def repeated(causal: Scores) -> Scores:

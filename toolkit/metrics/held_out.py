@@ -5,7 +5,7 @@ Needs no ground truth, and overfitting does not lower it: the points come from t
 
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS, errors_left_out
+from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS
 from toolkit.metrics._shared.residuals import median_px, rmse_px, scored_remark
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 
@@ -45,7 +45,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 def errors(evaluation: Evaluation) -> Array:
     """Return the leave-one-view-out error (N,) px of every sighting of a withheld track with enough posed views."""
-    _, errors_px = errors_left_out(evaluation.sequence.held_out, evaluation)
+    _, errors_px = evaluation.held_out_errors
     if not errors_px.size:
         raise Unavailable(f"no withheld track has {FEWEST_VIEWS} views from frames with a pose")
     return errors_px

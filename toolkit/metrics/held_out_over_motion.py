@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.estimate import Landmarks, Run, Trajectory
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS, errors_left_out
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
-from toolkit.models.motion import belief_at, motion_model, predicted
+from toolkit.models.motion import belief_at, integrated, motion_model
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Observations, Sequence
+from toolkit.sequence import Sequence
 
 ORDER = 61
 RATIO, ERROR = "heldout_over_motion", "heldout_over_motion_error"
@@ -74,16 +74,18 @@ def _paired(evaluation: Evaluation) -> _Paired:
     """Return the errors of withheld tracks over those by the measured motion alone."""
     sequence = evaluation.sequence
     motion = _motion_alone(evaluation.estimate, sequence)
-    tracks = _some_tracks(sequence.held_out.select(evaluation.has_pose[sequence.held_out.frame]))
-    seen, errors_px = errors_left_out(tracks, evaluation)
-    _, by_motion_px = errors_left_out(tracks.select(seen), Evaluation(motion, "causal", sequence))
-    ids, track, count = np.unique(tracks.track_id[seen], return_inverse=True, return_counts=True)
+    seen, errors_px = evaluation.held_out_errors
+    drawn = _of_some_tracks(sequence.held_out.track_id[seen])
+    tracks, errors_px = sequence.held_out.select(seen[drawn]), errors_px[drawn]
+    poses_by_motion = Evaluation(motion, "causal", sequence).poses_of_frames
+    _, by_motion_px = errors_left_out(tracks, poses_by_motion, sequence.rig)
+    ids, track, count = np.unique(tracks.track_id, return_inverse=True, return_counts=True)
     if ids.size < _FEWEST_TRACKS or by_motion_px.size != errors_px.size:
         raise Unavailable(
             f"{ids.size} withheld tracks have {FEWEST_VIEWS} views from frames with a pose; {_FEWEST_TRACKS} are needed"
         )
     apart = 0.5 * np.log((errors_px**2 + _FLOOR_PX**2) / (by_motion_px**2 + _FLOOR_PX**2))
-    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0])[tracks.frame[seen]] / NS_PER_S
+    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0])[tracks.frame] / NS_PER_S
     return _Paired(np.bincount(track, apart) / count, np.bincount(track, t_s) / count)
 
 
@@ -93,26 +95,25 @@ def _motion_alone(estimate: Trajectory, sequence: Sequence) -> Run:
         raise Unavailable("no motion was measured")
     if sequence.motion_kind == "imu" and estimate.v_world is None:
         raise Unavailable("the output states no velocity that the motion of an IMU could be integrated from")
-    if not len(estimate):
+    packets = [packet for packet in sequence.packets() if len(estimate) and packet.frame.t_ns >= estimate.t_ns[0]]
+    if not packets:
         raise Unavailable("there is no pose to integrate the motion from")
     model = motion_model(sequence.noise, sequence.gravity_world)
-    belief, stamps, poses = belief_at(estimate, 0, model), list[int](), list[Array]()
-    for packet in sequence.packets():
-        if packet.frame.t_ns < estimate.t_ns[0]:
-            continue
-        belief = predicted(belief, model, packet.motion) if stamps else belief
-        stamps.append(packet.frame.t_ns)
+    motions = [packet.motion for packet in packets[1:] if packet.motion is not None]
+    belief = belief_at(estimate, 0, model)
+    poses = [belief.T_world_imu]
+    for increment in integrated(model, motions, [belief.bias] * len(motions)):
+        belief = belief.predicted(increment.predict(belief))
         poses.append(belief.T_world_imu)
-    motion = Trajectory(np.array(stamps, dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
+    motion = Trajectory(np.array([packet.frame.t_ns for packet in packets], dtype=np.int64), np.array(poses))
     return Run("the measured motion", "ok", motion, None, Landmarks.none(), timings=None)
 
 
-def _some_tracks(observations: Observations) -> Observations:
-    """Return the sightings of at most so many tracks that have views enough, evenly drawn."""
-    ids, count = np.unique(observations.track_id, return_counts=True)
-    enough = ids[count >= FEWEST_VIEWS]
-    some = enough[np.linspace(0, enough.size - 1, min(enough.size, _MOST_TRACKS)).round().astype(int)]
-    return observations.select(np.isin(observations.track_id, some))
+def _of_some_tracks(track_ids: IntArray) -> BoolArray:
+    """Say which sightings (N,) are of at most so many tracks, evenly drawn."""
+    ids = np.unique(track_ids)
+    some = ids[np.linspace(0, ids.size - 1, min(ids.size, _MOST_TRACKS)).round().astype(int)]
+    return np.isin(track_ids, some)
 
 
 def _harm(paired: _Paired, kind: str) -> str:

@@ -52,7 +52,7 @@ def noise_px2(uvs_px: Array, rig: StereoRig) -> Array:
 
     The row of uR is to be taken with those of :func:`residuals_px` and :func:`seen_rows`, which are zero.
     """
-    return _each(uvs_px, rig.cov_uv_px2, _left_noise_px2, rig)
+    return _each(uvs_px, rig.cov_uv_px2, left_noise_px2, rig)
 
 
 def whitener(uvs_px: Array, rig: StereoRig) -> Array:
@@ -66,7 +66,7 @@ def whitener(uvs_px: Array, rig: StereoRig) -> Array:
 def left_whitener(rig: StereoRig) -> Array:
     """Return what whitens a sighting that lacks the right image (3, 3), the row and column of uR zero."""
     result = np.zeros((3, 3))
-    result[_SEEN] = np.linalg.inv(np.linalg.cholesky(_left_noise_px2(rig)[_SEEN]))
+    result[_SEEN] = np.linalg.inv(np.linalg.cholesky(left_noise_px2(rig)[_SEEN]))
     return result
 
 
@@ -82,10 +82,10 @@ def applied(matrix: Array, values: Array) -> Array:
 
 def left_cov_px2(rig: StereoRig) -> Array:
     """Return the covariance (2, 2) px^2 of (uL, v) in a sighting by the left image alone."""
-    return np.asarray(_left_noise_px2(rig)[_SEEN])
+    return np.asarray(left_noise_px2(rig)[_SEEN])
 
 
-def _left_noise_px2(rig: StereoRig) -> Array:
+def left_noise_px2(rig: StereoRig) -> Array:
     """Return the noise (3, 3) with uR apart. Where v is the mean of two rows, one row alone errs more: as uL does."""
     cov_px2 = rig.cov_uv_px2.copy()
     cov_px2[_U_RIGHT, [0, 2]] = cov_px2[[0, 2], _U_RIGHT] = 0.0

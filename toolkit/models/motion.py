@@ -90,8 +90,8 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
 
 
 def integrated(model: MotionModel, motions: Sequence[Motion], biases: Sequence[Array]) -> Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,): twists all at once."""
-    if isinstance(model, TwistModel) and motions:
+    """Return the motions between frames, each integrated about its own bias (6,): what can be, all at once."""
+    if isinstance(model, TwistModel | ImuModel) and motions:
         return model.integrate_each(motions, biases)
     return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
 

@@ -5,14 +5,17 @@ and those are together in what was recovered for the first of them (Golub & Plem
 "Covariance recovery from a square root information matrix for data association"). GTSAM's Marginals traverses its
 Bayes tree anew for each state, which takes a hundred times as long.
 
-Two orders are tried, for each loses digits where the other keeps them. In the order of time every state is recovered
-from the next, from the last to the first: with an IMU all are right to 1e-7 of a standard deviation, but where steps
-between states are known far better than the states, as where the errors of sightings are correlated, rounding grows on
-the way: on a drive of 125 frames a standard deviation of the first came out wrong by 5 % of itself. Nested dissection
-cuts the graph in halves again and again, and what cuts it comes last (George 1973, "Nested dissection of a regular
-finite element mesh"): from the root to any state it is some tens of variables, and on that drive all were right to
-1e-9; with an IMU it loses all digits within seconds. An order counts where it gives states the covariance that each has
-by itself: in time the first, where rounding ends up, else some.
+Variables that depend on the same later ones, as pose, velocity and biases of one state do, are recovered together:
+one by one, in the second order below, all digits are lost within seconds of an IMU.
+
+Two orders are tried. In the order of time every state is recovered from the next, from the last to the first: with an
+IMU all are right to 1e-7 of a standard deviation, but where steps between states are known far better than the states,
+as where the errors of sightings are correlated, rounding grows on the way: on a drive of 125 frames a standard
+deviation of the first came out wrong by 5 % of itself. Nested dissection cuts the graph in halves again and again, and
+what cuts it comes last (George 1973, "Nested dissection of a regular finite element mesh"): from the root to any state
+it is some tens of variables, and on that drive all were right to 1e-9; on a minute of an IMU both agree to 2e-7. An
+order counts where it gives states the covariance that each has by itself: in time the first, where rounding ends up,
+else some.
 
 Where neither does, landmarks are looked at. Of one that went thousands of baselines away the measurements tell the
 depth in metres so badly that GTSAM refuses it, or that its rounding is the states', though its disparity is told as
@@ -40,6 +43,8 @@ _MOST_TIED = 50
 # A direction of a variable of which less is said than this share of what is said of the best is lost in the sixteen
 # digits of the Jacobians: a landmark's depth beyond ten thousand million baselines.
 _LEAST_TOLD = 1e-10
+# So many rows may be added to a joint covariance before it is copied, without those that are not needed any more.
+_ROOM = 100
 
 
 class RoundingError(RuntimeError):
@@ -200,35 +205,91 @@ def _eliminated(graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> l
     return [net.at(i) for i in range(net.size())]
 
 
-class _Joint(NamedTuple):
-    """The joint covariance of some variables, and the rows of each."""
+class _Clique(NamedTuple):
+    """Variables, eliminated one after the other, that depend on the same later ones: x = gain @ x_later + n.
 
-    rows: dict[int, range]
+    ``sizes`` are theirs (f in all) by key, ``later`` the keys of those that they depend on (m in all), ``gain`` (f, m)
+    is in that order, and ``cov`` (f, f) that of n.
+    """
+
+    sizes: dict[int, int]
+    later: list[int]
+    gain: Array
     cov: Array
 
-    def of(self, keys: Sequence[int]) -> "_Joint":
+
+def _cliques(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Clique]:
+    """Return some variables, each given later ones, as cliques in the order of elimination."""
+    sizes = {one.firstFrontalKey(): len(one.R()) for one in conditionals}
+    parts, later = list[list[gtsam.GaussianConditional]](), frozenset[int]()
+    for conditional in conditionals:
+        key, *after = conditional.keys()
+        if parts and later == {key, *after}:
+            parts[-1].append(conditional)
+        else:
+            parts.append([conditional])
+        later = frozenset(after)
+    return [_clique(part, sizes) for part in parts]
+
+
+def _clique(conditionals: Sequence[gtsam.GaussianConditional], sizes: Mapping[int, int]) -> _Clique:
+    """Return conditionals, each on the next and on what that depends on, as one: R x = -S x_later + e."""
+    own = {one.firstFrontalKey(): sizes[one.firstFrontalKey()] for one in conditionals}
+    later = list(conditionals[-1].keys())[1:]
+    columns = _rows(own | {key: sizes[key] for key in later})
+    size = sum(own.values())
+    terms = np.zeros((size, sum(map(len, columns.values()))))
+    for conditional in conditionals:
+        key, *after = conditional.keys()
+        terms[np.ix_(columns[key], columns[key])] = conditional.R()
+        terms[np.ix_(columns[key], _together(columns, after))] = conditional.S()
+    root = np.linalg.inv(terms[:, :size])
+    return _Clique(own, later, -root @ terms[:, size:], root @ root.T)
+
+
+class _Joint:
+    """The joint covariance of some variables, in a matrix with room for more: what is added leaves the rest in place.
+
+    What is not needed any more stays until the room is used up.
+    """
+
+    def __init__(self, rows: dict[int, range], cov: Array, room: int) -> None:
+        self._rows, self._size = rows, len(cov)
+        self._matrix = np.empty((self._size + room, self._size + room))
+        self._matrix[: self._size, : self._size] = cov
+
+    def of(self, keys: Sequence[int]) -> Array:
         """Return the joint covariance of some of the variables, in the order of the keys."""
-        if list(keys) == list(self.rows):
-            return self
-        rows = np.concatenate([self.rows[key] for key in keys])
-        return _Joint(_rows({key: len(self.rows[key]) for key in keys}), self.cov[np.ix_(rows, rows)])
+        rows = _together(self._rows, keys)
+        return np.asarray(self._matrix[np.ix_(rows, rows)])
 
-    def with_first(self, conditional: gtsam.GaussianConditional) -> "_Joint":
-        """Return it with the variable that a conditional gives from all that are here, before them."""
-        root = np.linalg.inv(conditional.R())
-        gain = -root @ conditional.S()
-        size = len(root)
-        cov = np.empty((size + len(self.cov), size + len(self.cov)))
-        cov[:size, size:] = gain @ self.cov
-        cov[:size, :size] = root @ root.T + cov[:size, size:] @ gain.T
-        cov[size:, :size], cov[size:, size:] = cov[:size, size:].T, self.cov
-        sizes = {key: len(rows) for key, rows in self.rows.items()}
-        return _Joint(_rows({conditional.firstFrontalKey(): size, **sizes}), cov)
+    def only(self, keys: Sequence[int], room: int) -> "_Joint":
+        """Return that of some of the variables, with room for so many rows beside them."""
+        return _Joint(_rows({key: len(self._rows[key]) for key in keys}), self.of(keys), room)
+
+    def has_room(self, clique: _Clique) -> bool:
+        """Say whether a clique can be added."""
+        return self._size + len(clique.cov) <= len(self._matrix)
+
+    def add(self, clique: _Clique) -> None:
+        """Add the variables of a clique, of which all that it depends on are here."""
+        before, size = self._size, self._size + len(clique.cov)
+        gain = np.zeros((size - before, before))
+        gain[:, _together(self._rows, clique.later)] = clique.gain
+        across = gain @ self._matrix[:before, :before]
+        self._matrix[before:size, :before], self._matrix[:before, before:size] = across, across.T
+        self._matrix[before:size, before:size] = clique.cov + across @ gain.T
+        self._rows |= {key: range(before + rows.start, before + rows.stop) for key, rows in _rows(clique.sizes).items()}
+        self._size = size
 
 
-def _rows(sizes: dict[int, int]) -> dict[int, range]:
+def _rows(sizes: Mapping[int, int]) -> dict[int, range]:
     ends = np.cumsum(list(sizes.values())).tolist()
     return {key: range(end - size, end) for (key, size), end in zip(sizes.items(), ends, strict=True)}
+
+
+def _together(rows: Mapping[int, range], keys: Iterable[int]) -> list[int]:
+    return [row for key in keys for row in rows[key]]
 
 
 def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence[Sequence[int]]) -> list[Array]:
@@ -238,26 +299,29 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
     needed = {key for group in together for key in group}
     for key, later in later_of.items():
         needed.update(later if key in needed else ())
-    # The first of those that a variable depends on depends on all the others.
-    next_of = {key: min(later, key=place.__getitem__) for key, later in later_of.items() if key in needed and later}
-    of_group = {min(group, key=place.__getitem__): group for group in together}
-    joints, waiting, covs = dict[int, _Joint](), Counter(next_of.values()), dict[int, Array]()
-    for conditional, key in zip(reversed(conditionals), reversed(later_of), strict=True):
-        if key not in needed:
-            continue
-        given = joints[next_of[key]].of(later_of[key]) if key in next_of else _Joint({}, np.empty((0, 0)))
-        joint = given.with_first(conditional)
-        if key in of_group:
-            covs[of_group[key][0]] = joint.of(of_group[key]).cov
-        if waiting[key]:
-            joints[key] = joint
-        if key in next_of:
-            _count_down(next_of[key], waiting, joints)
+    cliques = _cliques([one for one, key in zip(conditionals, later_of, strict=True) if key in needed])
+    clique_of = {key: i for i, clique in enumerate(cliques) for key in clique.sizes}
+    # The first of those that a clique depends on depends on all the others.
+    next_of = [clique_of[min(one.later, key=place.__getitem__)] if one.later else None for one in cliques]
+    groups = defaultdict[int, list[Sequence[int]]](list)
+    for group in together:
+        groups[clique_of[min(group, key=place.__getitem__)]].append(group)
+    joints, waiting, covs = dict[int, _Joint](), Counter(next_of), dict[int, Array]()
+    for i in reversed(range(len(cliques))):
+        joint = _given(cliques[i], next_of[i], joints, waiting)
+        joint.add(cliques[i])
+        covs |= {group[0]: joint.of(group) for group in groups[i]}
+        if waiting[i]:
+            joints[i] = joint
     return [covs[group[0]] for group in together]
 
 
-def _count_down(key: int, waiting: Counter[int], joints: dict[int, _Joint]) -> None:
-    """Forget a joint covariance with the last variable that is recovered from it."""
-    waiting[key] -= 1
-    if not waiting[key]:
-        del joints[key]
+def _given(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
+    """Return a joint covariance that a clique can be added to; the last clique that waits for one takes it over."""
+    if after is None:
+        return _Joint({}, np.empty((0, 0)), _ROOM + len(clique.cov))
+    waiting[after] -= 1
+    joint = joints[after] if waiting[after] else joints.pop(after)
+    if not waiting[after] and joint.has_room(clique):
+        return joint
+    return joint.only(clique.later, _ROOM + len(clique.cov))

@@ -81,8 +81,9 @@ def _errors_px(row: Row, sequence: Sequence, asked: BoolArray) -> Array | None:
         return None
     observations = sequence.observations
     wanted = np.flatnonzero(np.isin(observations.track_id, observations.track_id[asked]))
+    poses = Evaluation(row.run, row.output, sequence).poses_of_frames
     with np.errstate(all="ignore"):  # a diverged run overflows; that becomes null
-        found, found_px = errors_left_out(observations.select(wanted), Evaluation(row.run, row.output, sequence))
+        found, found_px = errors_left_out(observations.select(wanted), poses, sequence.rig)
     errors_px = np.full(len(observations), np.nan)
     errors_px[wanted[found]] = found_px
     return errors_px

@@ -22,6 +22,7 @@ _MARK = {
     "overconfident": "overconfident, too sure of itself",
     "timid": "timid, less sure of itself than it could be",
     "heavy-tailed": "heavy-tailed, of innovations that no one covariance describes",
+    "contradicted": "contradicted, by tracks that turn its state one way",
 }
 _TAILS = (
     "; and yet its gate refused much: most innovations are smaller than stated and some far larger, which no one "
@@ -216,11 +217,22 @@ def _marks(comparison: Comparison) -> Iterator[str]:
         found = row.consistency
         if found is not None and row.mark:
             name = metrics_called((found.metric,))[0].name
+            if row.mark == "contradicted":
+                yield f"{_of(row)} is contradicted: {_trend_in_words(found.mean, found.high)}"
+                continue
             yield (
                 f"{_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
                 f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
                 f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
             )
+
+
+def _trend_in_words(trend: float, limit: float) -> str:
+    return (
+        f"its tracks turn its state one way, {_figure(trend)} times as far (squared) as its covariance and the "
+        f"measured motion allow, by chance at most {_figure(limit)}; look for what all tracks share, as a fault of "
+        "calibration, motion or time stamps"
+    )
 
 
 def _refusals(comparison: Comparison) -> Iterator[str]:

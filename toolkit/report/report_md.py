@@ -22,8 +22,8 @@ withheld, so causal answers of that time rest on a little of their future; and t
 recording, withheld tracks included. Its findings are above."""
 _MARKED = """\
 `overconfident` or `timid` beside how a run ended: its errors, or without a truth its innovations, are larger or smaller
-than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that refused many. The
-notes have the figures."""
+than the uncertainty it states allows; `heavy-tailed`: its innovations are smaller behind a gate that refused many;
+`contradicted`: its tracks turn its state one way, farther than its covariance allows. The notes have the figures."""
 _HOW_TO_READ_ONE = f"""\
 Every estimator read the same packets, with the same noise, from the same start. A **causal** line is scored on what the
 estimator knew at each frame, a **final** line on its answer after the last frame; compare like with like.

@@ -294,7 +294,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     ] = False
     arithmetic: Annotated[
         Arithmetic,
-        Meta(description="of the windowed filters: auto is compiled where the extra fast is installed"),
+        Meta(description="of filters that have both: auto is compiled where the extra fast is installed"),
     ] = "auto"
     first_seed: Annotated[int, Meta(ge=0, description="seed of simulated sequences, the first of several")] = 0
     seeds: Annotated[

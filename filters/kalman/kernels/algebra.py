@@ -58,6 +58,53 @@ def invert(L: Array, n: int, W: Array) -> None:
 
 
 @compiled
+def multiply(A: Array, B: Array, out: Array) -> None:
+    """Put A (l, m) B (m, n) in ``out``."""
+    for i in range(A.shape[0]):
+        for c in range(B.shape[1]):
+            out[i, c] = 0.0
+        for k in range(A.shape[1]):
+            for c in range(B.shape[1]):
+                out[i, c] += A[i, k] * B[k, c]
+
+
+@compiled
+def multiply_transposed(A: Array, B: Array, out: Array) -> None:
+    """Put A (l, m) times the transposed B (n, m) in ``out``."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[0]):
+            out[i, j] = 0.0
+            for k in range(A.shape[1]):
+                out[i, j] += A[i, k] * B[j, k]
+
+
+@compiled
+def solve(A: Array, B: Array) -> None:
+    """Put the solution of ``A X = B`` in the place of B (n, m), by elimination with row pivots; A (n, n) is lost."""
+    n = A.shape[0]
+    for k in range(n):
+        pivot = k
+        for i in range(k + 1, n):
+            if abs(A[i, k]) > abs(A[pivot, k]):
+                pivot = i
+        for c in range(n):
+            A[k, c], A[pivot, c] = A[pivot, c], A[k, c]
+        for c in range(B.shape[1]):
+            B[k, c], B[pivot, c] = B[pivot, c], B[k, c]
+        for i in range(k + 1, n):
+            factor = A[i, k] / A[k, k]
+            for c in range(k + 1, n):
+                A[i, c] -= factor * A[k, c]
+            for c in range(B.shape[1]):
+                B[i, c] -= factor * B[k, c]
+    for k in range(n - 1, -1, -1):
+        for c in range(B.shape[1]):
+            for i in range(k + 1, n):
+                B[k, c] -= A[k, i] * B[i, c]
+            B[k, c] /= A[k, k]
+
+
+@compiled
 def transpose(A: Array, n: int) -> None:
     """Transpose A (n, n) in its place."""
     for i in range(n):

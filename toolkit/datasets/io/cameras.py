@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.datasets.io.fields import Fields
 from toolkit.errors import DataError
-from toolkit.frontend.cameras import Camera, Distortion
+from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 
 _MODELS: dict[str, Distortion] = {
     "radial-tangential": "radtan",
@@ -23,11 +23,7 @@ def camera_of(fields: Fields) -> Camera:
 
     Raises DataError where a field is missing or impossible, or the model is one that images are not rectified with.
     """
-    fields.require("intrinsics", "resolution")
-    model = str(fields.arrays["camera_model"]) if "camera_model" in fields else "pinhole"
-    if model != "pinhole":
-        raise DataError(f"{fields.path}: camera_model {model}; images are rectified of pinhole cameras only")
-    fx, fy, cx, cy = fields.constant("intrinsics", 4).tolist()
+    fx, fy, cx, cy = pinhole_of(fields)
     width, height = fields.constant("resolution", 2).tolist()
     if not (fx > 0.0 and fy > 0.0 and 0.0 < cx < width and 0.0 < cy < height):
         raise DataError(
@@ -35,6 +31,19 @@ def camera_of(fields: Fields) -> Camera:
         )
     distortion, coefficients = _distortion(fields)
     return Camera((fx, fy, cx, cy), distortion, coefficients, (int(width), int(height)))
+
+
+def pinhole_of(fields: Fields) -> Pinhole:
+    """Return (fx, fy, cx, cy) px of a camera; raises DataError where they are missing or of another model."""
+    fields.require("intrinsics", "resolution")
+    model = str(fields.arrays["camera_model"]) if "camera_model" in fields else "pinhole"
+    if model != "pinhole":
+        raise DataError(f"{fields.path}: camera_model {model}; images are rectified of pinhole cameras only")
+    given = fields.vector("intrinsics")
+    if given.size != 4 or not np.isfinite(given).all():
+        raise DataError(f"{fields.path}: intrinsics has {given.size} values, expected four finite ones, fx, fy, cx, cy")
+    fx, fy, cx, cy = given.tolist()
+    return fx, fy, cx, cy
 
 
 def part(fields: Fields, name: str) -> Fields:

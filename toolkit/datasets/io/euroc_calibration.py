@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.cameras import camera_of, part
+from toolkit.datasets.io.cameras import camera_of, part, pinhole_of
 from toolkit.datasets.io.fields import Fields, rigid
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.errors import DataError
@@ -52,6 +52,8 @@ _T_IMU_CAM0 = np.array(
 _CAM1_IN_IMU_M = np.array([-0.0198435579556, 0.0453689425024, 0.00786212447038])
 _PINHOLE_PX = (458.654, 457.296, 367.215, 248.375)
 _SIZE_PX = (752, 480)
+# No two cameras are so near each other.
+_SAME_PLACE_M = 1e-6
 _STATED_NOISE = ImuNoise(
     accel_noise_density=2e-3, gyro_noise_density=1.6968e-4, accel_random_walk=3e-3, gyro_random_walk=1.9393e-5
 )
@@ -108,7 +110,7 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
     stated = _stated_noise(imu)
     T_imu_left = se3_inverse(extrinsic(imu)) @ extrinsic(left)
     T_left_right = se3_inverse(extrinsic(left)) @ extrinsic(right)
-    sides = _Sides(left, right, T_imu_left, T_left_right)
+    sides = _Sides(left, right, T_imu_left, T_left_right, extrinsic(left) @ se3_inverse(extrinsic(right)))
     noise, noise_source = (stated, _AS_STATED) if simulated else (_in_flight(stated), _INFLATED)
     return _calibration(sides, noise, "the folder's sensor.yaml files", noise_source)
 
@@ -116,7 +118,7 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
 def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
     """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
     fields = read_fields(chain)
-    fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
+    _check_camchain(fields)
     left, right = (part(fields, name) for name in ("cam0", "cam1"))
     T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
     mounted = "T_cam_imu" in right
@@ -128,6 +130,18 @@ def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
     source = str(chain.relative_to(root))
     sides = _Sides(left, right, T_imu_left, se3_inverse(T_right_left))
     return _calibration(sides, noise, source, _AS_STATED)
+
+
+def _check_camchain(fields: Fields) -> None:
+    """Raise DataError where a camchain is not that of two cameras and an IMU."""
+    if not any(key.startswith("cam1.") for key in fields.arrays):
+        raise DataError(f"{fields.path}: holds one camera, and stereo needs two; calibrate cam0 and cam1 together")
+    if "cam0.intrinsics" in fields and "cam0.T_cam_imu" not in fields:
+        raise DataError(
+            f"{fields.path}: has no cam0.T_cam_imu, so it is of cameras alone; take the camchain that Kalibr writes "
+            "when it calibrates cameras and IMU"
+        )
+    fields.require("cam0.T_cam_imu", "cam1.T_cam_imu|cam1.T_cn_cnm1")
 
 
 def kalibr_noise(folder: Path) -> ImuNoise | None:
@@ -153,20 +167,41 @@ def _stated_noise(imu: Fields, prefix: str = "") -> ImuNoise:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """What a calibration says of both cameras."""
+    """What a calibration says of both cameras, and of sensor.yaml files where cam1 is if they say the inverse."""
 
     left: Fields
     right: Fields
     T_imu_left: Array
     T_left_right: Array
+    T_left_right_inverted: Array | None = None
+
+
+def _check_right(path: Path, T_left_right: Array, inverted: Array | None) -> None:
+    """Raise DataError where cam1 is not to the right of cam0.
+
+    ``inverted`` (4, 4) is where it would be if each extrinsic were the inverse of what it is called.
+    """
+    if T_left_right[0, 3] > 0.0:
+        return
+    x, y, z = T_left_right[:3, 3]
+    if max(abs(x), abs(y), abs(z)) < _SAME_PLACE_M:
+        raise DataError(f"{path}: cam0 and cam1 stand at one place, so there is no baseline; give each its own pose")
+    if -x < max(abs(y), abs(z)):
+        turned = inverted is not None and _is_right(inverted)
+        remedy = "each T_BS looks like the inverse of one: invert both" if turned else "mend the pose of one of them"
+        raise DataError(f"{path}: cam1 is at {x:.3g} {y:.3g} {z:.3g} m of cam0, not to the right of it; {remedy}")
+    raise DataError(f"{path}: cam1 is not to the right of cam0; exchange the two")
+
+
+def _is_right(T_left_right: Array) -> bool:
+    x, y, z = T_left_right[:3, 3]
+    return bool(x > max(abs(y), abs(z)))
 
 
 def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> Calibration:
     left, right, T_left_right = sides.left, sides.right, sides.T_left_right
-    if T_left_right[0, 3] <= 0.0:
-        raise DataError(f"{right.path}: cam1 is not to the right of cam0; exchange the two")
-    left.require("intrinsics", "resolution")
-    fx_px, fy_px, cx_px, cy_px = left.constant("intrinsics", 4)
+    _check_right(right.path, T_left_right, sides.T_left_right_inverted)
+    fx_px, fy_px, cx_px, cy_px = pinhole_of(left)
     width_px, height_px = left.constant("resolution", 2)
     rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))

@@ -17,6 +17,7 @@ from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
@@ -54,16 +55,18 @@ class Choice:
     reason: str
 
 
-def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples) -> Choice:
+def choose_truth(root: Path, mav0: Path | None, imu: ImuSamples, images: str) -> Choice:
     """Return the truth of a recording; of several, the one whose rates of rotation agree best with the gyro.
 
-    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged.
+    Raises DataError where there is none, for without it no stereo tracks can be simulated, or one is damaged;
+    ``images`` says why tracks are not made of images, nothing where there are none.
     """
     choice = find_truth(root, mav0, imu)
     if choice is None:
         raise DataError(
             f"{root}: no ground truth in mav0/state_groundtruth_estimate0/data.csv or a .csv or .tum table beside it, "
-            "and the stereo tracks are simulated along it; add the truth"
+            "and the stereo tracks are simulated along it where there are no images; add one of them"
+            f"{f': {images}' if images else ''}"
         )
     return choice
 
@@ -103,7 +106,10 @@ def _read(path: Path, mav0: Path | None) -> Truth:
     sensor_yaml = path.parent / "sensor.yaml"
     if mav0 is None or path.parent.parent != mav0 or not sensor_yaml.is_file():
         return truth
-    T_sensor_imu = se3_inverse(extrinsic(read_fields(sensor_yaml))) @ extrinsic(read_fields(mav0 / "imu0/sensor.yaml"))
+    imu_yaml = mav0 / "imu0/sensor.yaml"
+    # Beside a camchain there need be none: the body is the IMU then.
+    T_body_imu = extrinsic(read_fields(imu_yaml)) if is_regular(imu_yaml) else np.eye(4)
+    T_sensor_imu = se3_inverse(extrinsic(read_fields(sensor_yaml))) @ T_body_imu
     if np.array_equal(T_sensor_imu, np.eye(4)):
         return truth
     # Velocity and biases are the tracked sensor's own, not the IMU's.

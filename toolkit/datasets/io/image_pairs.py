@@ -24,11 +24,26 @@ _NAMED = 10
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """Pairs in order of time, how many stamps the left camera has, and what had to be put right, in words."""
+    """Pairs in order of time, how many stamps the left camera has, and what had to be put right, in words.
+
+    ``apart_ms`` is how far from each left image the nearest right one is (median) where none is of its instant.
+    """
 
     pairs: tuple[StampedPair, ...]
     stamps: int
     remarks: tuple[str, ...] = ()
+    apart_ms: float | None = None
+
+    def there(self, least: float) -> "Listed":
+        """Return the pairs of which both files are there, with a remark, where their share is below the least.
+
+        Of a recording that has nearly all its files those that are missing stay in, to be named one by one.
+        """
+        pairs = tuple(pair for pair in self.pairs if is_regular(pair.left) and is_regular(pair.right))
+        if len(pairs) >= least * len(self.pairs):
+            return self
+        remark = f"{len(self.pairs) - len(pairs)} of {len(self.pairs)} image pairs lack a file and are left out"
+        return replace(self, pairs=pairs, remarks=(*self.remarks, remark))
 
     def within(self, motion_t_ns: IntArray) -> "Listed":
         """Return the pairs within the time of motion samples (N,), with a remark where that leaves any out."""
@@ -47,8 +62,13 @@ def images_only(path: Path, tracks: Tracks) -> bool:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the image files of a folder by name; none where there is no such folder."""
-    return sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    """Return the image files of a folder by name, without hidden ones; none where there is no such folder.
+
+    A Mac puts a hidden ``._name.png`` beside each image on a disk of another system, which is none.
+    """
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
 
 
 def image_folder(camera: Path) -> Path:
@@ -79,16 +99,19 @@ def pairs_of_asl(mav0: Path) -> Listed:
         for t, i, j in zip(t_ns, first, partner, strict=True)
         if j >= 0
     )
-    return Listed(pairs, t_ns.size, tuple(remarks))
+    none = 0 < alone == t_ns.size and right.t_ns.size > 0
+    apart_ms = 1e-6 * float(np.median(np.abs(right.t_ns[:, None] - t_ns).min(axis=0))) if none else None
+    return Listed(pairs, t_ns.size, tuple(remarks), apart_ms)
 
 
 def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     """Pair images whose names are the same number; ``t_ns`` has the stamp of each number.
 
-    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said.
+    An image whose partner is missing stays in, to be named; numbers without a stamp are left out and said. Either
+    camera may write its numbers with other leading zeros or another suffix.
     """
-    numbers = {int(path.stem): path.suffix for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
-    names = {int(path.stem): path.stem for path in (*images_in(right), *images_in(left)) if path.stem.isdecimal()}
+    lefts, rights = _numbered(left), _numbered(right)
+    numbers = lefts.keys() | rights.keys()
     stamped = sorted((t_ns[number], number) for number in numbers if number in t_ns)
     remarks = []
     if len(stamped) < len(numbers):
@@ -98,10 +121,11 @@ def pairs_by_name(left: Path, right: Path, t_ns: Mapping[int, int]) -> Listed:
     pairs: list[StampedPair] = []
     for stamp, number in stamped:
         if pairs and pairs[-1].t_ns == stamp:
-            remarks.append(f"image {names[number]} has the stamp of another and is left out")
+            remarks.append(f"image {number} has the stamp of another and is left out")
             continue
-        name = f"{names[number]}{numbers[number]}"
-        pairs.append(StampedPair(stamp, left / name, right / name))
+        paths = lefts.get(number), rights.get(number)
+        name = (paths[0] or paths[1] or left).name
+        pairs.append(StampedPair(stamp, paths[0] or left / name, paths[1] or right / name))
     return Listed(tuple(pairs), len(numbers), tuple(remarks))
 
 
@@ -116,13 +140,18 @@ def pairs_by_stamps(left: Path, right: Path, t_ns: Mapping[int, int], right_t_ns
     in_order = all((np.diff([stamps[n] for n in sorted(stamps)]) > 0).all() for stamps in (t_ns, right_t_ns))
     if not in_order or all(number == other for number, other in partner.items()):
         return pairs_by_name(left, right, t_ns)
-    lefts, rights = ({int(p.stem): p for p in images_in(side) if p.stem.isdecimal()} for side in (left, right))
+    lefts, rights = _numbered(left), _numbered(right)
     paired = sorted((t_ns[number], lefts[number], partner[number]) for number in lefts.keys() & partner.keys())
     remarks = ["the cameras' images are numbered differently and paired by their stamps"]
     if len(paired) < len(lefts):
         remarks.append(f"{len(lefts) - len(paired)} left images have no right one of the same time and are left out")
     pairs = tuple(StampedPair(stamp, path, rights.get(other, right / path.name)) for stamp, path, other in paired)
     return Listed(pairs, len(lefts), tuple(remarks))
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Return the images of a folder whose names are numbers, by number."""
+    return {int(path.stem): path for path in images_in(folder) if path.stem.isdecimal()}
 
 
 def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:

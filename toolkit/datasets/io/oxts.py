@@ -3,6 +3,7 @@
 Positions are projected as the development kit of the data set does: Mercator, scaled at the first latitude.
 """
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ _PLACE, _ANGLES, _NORTH_EAST_UP = slice(0, 3), slice(3, 6), [6, 7, 10]
 # Of the body: specific force (m/s^2) and rates (rad/s).
 _ACCEL, _RATES = slice(11, 14), slice(17, 20)
 _EARTH_RADIUS_M = 6378137.0
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +74,21 @@ def read_stamps(file: Path) -> dict[int, int]:
         if not line.strip():
             continue
         try:
-            stamps[row] = int(np.datetime64(line.strip().replace(" ", "T"), "ns").astype(np.int64))
+            stamps[row] = _stamp_ns(line.strip())
         except ValueError as error:
-            raise DataError(f"{file}: line {row + 1} is no date and time, as 2011-09-26 13:02:25.96") from error
+            raise DataError(
+                f"{file}: line {row + 1} is no date and time; write it as in 2011-09-26 13:02:25.96"
+            ) from error
     if not stamps:
         raise DataError(f"{file}: holds no stamps; copy it again")
     return stamps
+
+
+def _stamp_ns(words: str) -> int:
+    """Return the nanoseconds since 1970 of a date and time; raises ValueError where it is none."""
+    if not _STAMP.fullmatch(words):
+        raise ValueError(words)
+    return int(np.datetime64(words.replace(" ", "T"), "ns").astype(np.int64))
 
 
 def _packet(file: Path) -> Array:

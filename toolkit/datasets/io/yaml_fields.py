@@ -23,6 +23,7 @@ _MOST_CHARACTERS = 1_000_000
 def read_fields(path: Path) -> Fields:
     """Return what a file holds as arrays with dotted keys: numbers (), lists of numbers (n,) or (n, m), and texts ().
 
+    OpenCV's matrices, mappings of rows, cols and data, are given as arrays (rows, cols) too, under their own key.
     What is none of these, as a list of names, is left out. Raises DataError, naming the line where there is one, where
     the file cannot be read, is no YAML, or says a thing twice.
     """
@@ -64,10 +65,21 @@ def _flattened(value: Any, key: str) -> Iterator[tuple[str, np.ndarray]]:
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _flattened(inner, f"{key}.{name}" if key else str(name))
+        matrix = _as_matrix(value)
+        if matrix is not None:
+            yield key, matrix
         return
     array = _as_array(value)
     if array is not None:
         yield key, array
+
+
+def _as_matrix(mapping: dict[Any, Any]) -> np.ndarray | None:
+    """Return the matrix (rows, cols) that a mapping is in OpenCV's dialect, None where it is another."""
+    data, rows, cols = _as_array(mapping.get("data")), mapping.get("rows"), mapping.get("cols")
+    if data is None or not isinstance(rows, int) or not isinstance(cols, int) or data.size != rows * cols:
+        return None
+    return data.reshape(rows, cols)
 
 
 def _as_array(value: Any) -> np.ndarray | None:

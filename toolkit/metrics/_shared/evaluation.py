@@ -6,9 +6,10 @@ from functools import cached_property
 import numpy as np
 
 from toolkit.estimate import Output, Run, Trajectory
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics._shared.alignment import Alignment, fit_se3, place_pose, place_yaw
 from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
+from toolkit.metrics._shared.leave_one_out import errors_left_out
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.sequence import Sequence
 
@@ -118,6 +119,14 @@ class Evaluation(AgainstTruth):
     def has_pose(self) -> BoolArray:
         """Whether each frame (K,) has a finite pose."""
         return finite_poses(self.poses_of_frames)
+
+    @cached_property
+    def held_out_errors(self) -> tuple[IntArray, Array]:
+        """Which sightings (M,) of withheld tracks have enough views with a pose, and their errors (M,) px.
+
+        They are in the order of tracks, each track's by frame.
+        """
+        return errors_left_out(self.sequence.held_out, self.poses_of_frames, self.sequence.rig)
 
     @cached_property
     def counted_frames(self) -> BoolArray:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.metrics._shared.evaluation import Evaluation
+from toolkit.metrics._shared.association import finite_poses
 from toolkit.metrics._shared.residuals import reprojection_errors_px
 from toolkit.models import left_only
 from toolkit.sequence import Observations, StereoRig
@@ -31,72 +31,110 @@ _BEHIND_SIGMAS = 1e4
 _ITERATIONS, _ITERATIONS_AGAIN = 12, 3
 _MOST_VIEWS_SOLVED_AGAIN = 40
 # So many views are solved again at a time: what is computed of them fits a processor's cache, which halves the time.
-_VIEWS_AT_A_TIME = 30_000
+_VIEWS_AT_A_TIME = 10_000
 _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
-
-
-_PER_VIEW = ("uv_px", "numerator", "numerator_0", "denominator", "denominator_0")
+# Where the shares of a robust problem have the upper half of H, row by row, and its symmetric whole; then g and cost.
+_H, _G, _COST = slice(0, 6), slice(6, 9), 9
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 class PredictedSightings(NamedTuple):
-    """Predicted (uL, uR, v) (N, 3) px, derivatives by the point (N, 3, 3), and whether it is in front (N,)."""
+    """Predicted (uL, uR, v) (N, 3) px, and whether the point is in front (N,)."""
 
     uv_px: Array
-    d_uv_d_point: Array
     in_front: BoolArray
 
 
-class NormalEquations(NamedTuple):
-    """Each view's share of its track's robust problem: H (N, 3, 3), g (N, 3), and its cost (N,)."""
+class _Seen(NamedTuple):
+    """What views make of a point each: the image (3, N) in focal lengths from the centre, 1 / z and z > 0 (N,)."""
 
-    H: Array
-    g: Array
-    cost: Array
+    ratio: Array
+    inverse_depth: Array
+    in_front: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
 class Views:
     """The views of M tracks, N in all, sorted by track: what turns a track's point into measurements.
 
-    ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. A measurement is
-    focal * (numerator @ q + numerator_0) / (denominator @ q + denominator_0) + centre, with numerators
-    (N, 3, 3), (N, 3) for uL, uR and v, and denominators (N, 3), (N,). ``sqrt_information`` (3, 3), or
-    one each (N, 3, 3), whitens.
+    ``track`` (N,) is 0 ... M-1, ``first`` (M,) the first row of each. ``linear`` (3, 3, N) and ``constant`` (3, N) make
+    of a track's point r times the point in the view's camera, linear @ q + constant. ``uv_px`` (3, N) was measured.
+    ``sqrt_information`` (3, 3), or one each (3, 3, N), whitens. Views come last, for arithmetic on whole rows takes a
+    third of the time of products of small matrices.
     """
 
     track: IntArray
     first: IntArray
     uv_px: Array
-    numerator: Array
-    numerator_0: Array
-    denominator: Array
-    denominator_0: Array
-    focal_px: Array
-    centre_px: Array
+    linear: Array
+    constant: Array
+    rig: StereoRig
     sqrt_information: Array
 
-    def predict(self, points: Array) -> PredictedSightings:
-        """Predict each view's measurement from a point of its own (N, 3)."""
-        depth = np.einsum("ni,ni->n", self.denominator, points) + self.denominator_0
-        ratio = ((self.numerator @ points[..., None])[..., 0] + self.numerator_0) / depth[:, None]
-        slope = (self.numerator - ratio[:, :, None] * self.denominator[:, None, :]) / depth[:, None, None]
-        uv_px = self.focal_px * ratio + self.centre_px
-        return PredictedSightings(uv_px, self.focal_px[:, None] * slope, depth > 0.0)
+    def seen(self, points: Array) -> _Seen:
+        """Project a point for each view (3, N)."""
+        linear, constant = self.linear, self.constant
+        x, y, depth = (linear[i, 0] * points[0] + linear[i, 1] * points[1] + linear[i, 2] * points[2] for i in range(3))
+        x, y, depth = x + constant[0], y + constant[1], depth + constant[2]
+        inverse_depth = 1.0 / depth
+        ratio = np.stack([x, x - self.rig.baseline_m * points[2], y]) * inverse_depth
+        return _Seen(ratio, inverse_depth, depth > 0.0)
 
-    def normal_equations(self, points: Array) -> NormalEquations:
-        """Linearise every view at its track's point (M, 3), with Huber's weights."""
-        uv_px, d_uv_d_point, in_front = self.predict(points[self.track])
-        residual = left_only.applied(self.sqrt_information, left_only.residuals_px(self.uv_px, uv_px))
-        length = np.linalg.norm(residual, axis=1)
-        visible = in_front & np.isfinite(length)
-        length = np.where(visible, length, _BEHIND_SIGMAS)
-        weight = visible * np.minimum(1.0, _HUBER_SIGMAS / np.maximum(length, _HUBER_SIGMAS))
-        slope = np.where(visible[:, None, None], self.sqrt_information @ d_uv_d_point, 0.0)
-        weighted_slope = weight[:, None, None] * np.swapaxes(slope, 1, 2)
-        g = -(weighted_slope @ np.where(visible[:, None], residual, 0.0)[..., None])[..., 0]
-        quadratic = 0.5 * length**2
-        cost = np.where(length <= _HUBER_SIGMAS, quadratic, _HUBER_SIGMAS * (length - 0.5 * _HUBER_SIGMAS))
-        return NormalEquations(weighted_slope @ slope, g, cost)
+    def pixels(self, seen: _Seen) -> Array:
+        """Return the pixels (3, N) of what is seen."""
+        return np.asarray(self._focal_px * seen.ratio + self._centre_px)
+
+    def predict(self, points: Array) -> PredictedSightings:
+        """Predict each view's measurement from a point of its own (3, N)."""
+        seen = self.seen(points)
+        return PredictedSightings(self.pixels(seen).T, seen.in_front)
+
+    def shares(self, points: Array) -> Array:
+        """Return each view's share (10, N) of its track's problem: H, g and cost, linearised at the point (3, M).
+
+        The weights are Huber's.
+        """
+        seen = self.seen(np.take(points, self.track, axis=1))
+        residual = self._whitened(left_only.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
+        length = np.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
+        visible = seen.in_front & np.isfinite(length)
+        slope = self._whitened(self._slope(seen))
+        if not visible.all():
+            length = np.where(visible, length, _BEHIND_SIGMAS)
+            residual, slope = np.where(visible, residual, 0.0), np.where(visible, slope, 0.0)
+        weighted = slope * (visible * np.minimum(1.0, _HUBER_SIGMAS / np.maximum(length, _HUBER_SIGMAS)))
+        shares = np.empty((10, length.size))
+        for row, (i, j) in enumerate(_UPPER):
+            shares[row] = _dot(weighted[:, i], slope[:, j])
+        for i in range(3):
+            shares[_G][i] = -_dot(weighted[:, i], residual)
+        robust = _HUBER_SIGMAS * (length - 0.5 * _HUBER_SIGMAS)
+        shares[_COST] = np.where(length <= _HUBER_SIGMAS, 0.5 * length**2, robust)
+        return shares
+
+    def _slope(self, seen: _Seen) -> Array:
+        """Return the derivatives (3, 3, N) of pixels by the point."""
+        slope = np.stack([self.linear[0], self.linear[0], self.linear[1]])
+        slope[1, 2] -= self.rig.baseline_m
+        slope -= seen.ratio[:, None] * self.linear[2]
+        slope *= (self._focal_px * seen.inverse_depth)[:, None]
+        return slope
+
+    def _whitened(self, values: Array) -> Array:
+        """Return pixels (3, ..., N) in standard deviations."""
+        whitener = self.sqrt_information
+        if whitener.ndim == 2:
+            return np.asarray((whitener @ values.reshape(3, -1)).reshape(values.shape))
+        return np.stack([_dot(row if values.ndim == 2 else row[:, None], values) for row in whitener])
+
+    @property
+    def _focal_px(self) -> Array:
+        return np.array([[self.rig.fx_px], [self.rig.fx_px], [self.rig.fy_px]])
+
+    @property
+    def _centre_px(self) -> Array:
+        return np.array([[self.rig.cx_px], [self.rig.cx_px], [self.rig.cy_px]])
 
     @property
     def count(self) -> IntArray:
@@ -111,29 +149,35 @@ class Views:
         place = np.arange(count.sum()) - np.repeat(first, count)
         other = first_of_track + place
         other += other >= np.repeat(rows, count)
-        chosen = {name: getattr(self, name)[other] for name in _PER_VIEW}
+        per_view = {name: getattr(self, name).take(other, axis=-1) for name in ("uv_px", "linear", "constant")}
         if self.sqrt_information.ndim == 3:
-            chosen["sqrt_information"] = self.sqrt_information[other]
-        return replace(self, track=np.repeat(np.arange(rows.size), count), first=first, **chosen)
+            per_view["sqrt_information"] = self.sqrt_information.take(other, axis=-1)
+        return replace(self, track=np.repeat(np.arange(rows.size), count), first=first, **per_view)
 
     def summed(self, shares: Array) -> Array:
-        """Add up the views' shares (N, ...) to one a track (M, ...)."""
-        return np.add.reduceat(shares, self.first, axis=0)
+        """Add up the views' shares (..., N) to one a track (..., M)."""
+        return np.add.reduceat(shares, self.first, axis=-1)
 
 
-def errors_left_out(observations: Observations, evaluation: Evaluation) -> tuple[IntArray, Array]:
+def _dot(first: Array, second: Array) -> Array:
+    """Return the sum of products over the first of the axes, of three."""
+    return np.asarray(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+def errors_left_out(observations: Observations, poses: Array, rig: StereoRig) -> tuple[IntArray, Array]:
     """Return which sightings (M,) have enough views with a pose, and their leave-one-view-out errors (M,) px.
 
-    They are in the order of tracks, each track's by frame.
+    They are in the order of tracks, each track's by frame. ``poses`` (K, 4, 4) T_world_imu are those of all frames, NaN
+    where there is none.
     """
-    posed = np.flatnonzero(evaluation.has_pose[observations.frame])
+    posed = np.flatnonzero(finite_poses(poses)[observations.frame])
     by_track = posed[np.lexsort((observations.frame[posed], observations.track_id[posed]))]
     _, track, views = np.unique(observations.track_id[by_track], return_inverse=True, return_counts=True)
     rows = by_track[views[track] >= FEWEST_VIEWS]
-    enough, rig = observations.select(rows), evaluation.sequence.rig
+    enough = observations.select(rows)
     if not rows.size:
         return rows, np.empty(0)
-    T_world_cam = evaluation.poses_of_frames[enough.frame] @ rig.T_imu_cam
+    T_world_cam = poses[enough.frame] @ rig.T_imu_cam
     predicted = predict_left_out(enough.track_id, enough.uv_px, T_world_cam, rig)
     return rows, reprojection_errors_px(predicted.uv_px, enough.uv_px, predicted.in_front)
 
@@ -149,7 +193,7 @@ def predict_left_out(track_ids: IntArray, uv_px: Array, T_world_cam: Array, rig:
     points = _without_each(views, _solve(views, _start(views, T_last_view, rig), _ITERATIONS))
     again = np.flatnonzero(views.count[views.track] <= _MOST_VIEWS_SOLVED_AGAIN)
     for rows in _in_parts(again, views.count[views.track[again]] - 1):
-        points[rows] = _solve(views.others(rows), points[rows], _ITERATIONS_AGAIN)
+        points[:, rows] = _solve(views.others(rows), points[:, rows], _ITERATIONS_AGAIN)
     return views.predict(points)
 
 
@@ -176,29 +220,27 @@ def _views(track_ids: IntArray, uv_px: Array, T_last_view: Array, rig: StereoRig
     T_view_last = se3_inverse(T_last_view)
     # r times the point in the view's camera: R (a, b, 1) + r t, linear in q = (a, b, r).
     linear, constant = T_view_last[:, :3, [0, 1, 3]], T_view_last[:, :3, 2]
-    right = linear[:, 0] - np.array([0.0, 0.0, rig.baseline_m])
+    whitener = left_only.whitener(uv_px, rig)
     return Views(
         track=np.repeat(np.arange(first.size), np.diff(np.append(first, track_ids.size))),
         first=first,
-        uv_px=uv_px,
-        numerator=np.stack([linear[:, 0], right, linear[:, 1]], axis=1),
-        numerator_0=constant[:, [0, 0, 1]],
-        denominator=linear[:, 2],
-        denominator_0=constant[:, 2],
-        focal_px=np.array([rig.fx_px, rig.fx_px, rig.fy_px]),
-        centre_px=np.array([rig.cx_px, rig.cx_px, rig.cy_px]),
-        sqrt_information=left_only.whitener(uv_px, rig),
+        uv_px=np.ascontiguousarray(uv_px.T),
+        linear=np.ascontiguousarray(linear.transpose(1, 2, 0)),
+        constant=np.ascontiguousarray(constant.T),
+        rig=rig,
+        sqrt_information=whitener if whitener.ndim == 2 else np.ascontiguousarray(whitener.transpose(1, 2, 0)),
     )
 
 
 def _start(views: Views, T_last_view: Array, rig: StereoRig) -> Array:
-    """Start each track (M, 3) at the median, by component, of what its views see in stereo one by one."""
-    ray = np.stack([(views.uv_px[:, 0] - rig.cx_px) / rig.fx_px, (views.uv_px[:, 2] - rig.cy_px) / rig.fy_px], axis=1)
-    inverse_depth = (views.uv_px[:, 0] - views.uv_px[:, 1]) / (rig.fx_px * rig.baseline_m)
+    """Start each track (3, M) at the median, by component, of what its views see in stereo one by one."""
+    u_left_px, u_right_px, v_px = views.uv_px
+    ray = np.stack([(u_left_px - rig.cx_px) / rig.fx_px, (v_px - rig.cy_px) / rig.fy_px], axis=1)
+    inverse_depth = (u_left_px - u_right_px) / (rig.fx_px * rig.baseline_m)
     homogeneous = np.column_stack([ray, np.ones(len(ray)), inverse_depth])
     in_last = (T_last_view[:, :3] @ homogeneous[..., None])[..., 0]
     seen = np.column_stack([in_last[:, :2], inverse_depth]) / in_last[:, 2:]
-    return np.stack([_median_by_track(views, component) for component in seen.T], axis=1)
+    return np.stack([_median_by_track(views, component) for component in seen.T])
 
 
 def _median_by_track(views: Views, values: Array) -> Array:
@@ -209,34 +251,32 @@ def _median_by_track(views: Views, values: Array) -> Array:
 
 
 def _without_each(views: Views, points: Array) -> Array:
-    """Return for each view its track's point (N, 3) one Gauss-Newton step after the view's share is taken out."""
-    shares = views.normal_equations(points)
-    H = views.summed(shares.H)[views.track] - shares.H
-    g = views.summed(shares.g)[views.track] - shares.g
-    return points[views.track] - _damped_solve(H, g, np.full(len(g), _LEAST_DAMPING))
+    """Return for each view its track's point (3, N) one Gauss-Newton step after the view's share is taken out."""
+    shares = views.shares(points)
+    rest = np.take(views.summed(shares), views.track, axis=1) - shares
+    step = _damped_step(rest, np.full(views.track.size, _LEAST_DAMPING))
+    return np.asarray(np.take(points, views.track, axis=1) - step)
 
 
 def _solve(views: Views, points: Array, iterations: int) -> Array:
-    """Minimise the robust cost of every track at once, each with a damping of its own (Levenberg-Marquardt)."""
-    damping = np.full(len(points), _DAMPING)
-    H, g, cost = (views.summed(share) for share in views.normal_equations(points))
+    """Minimise the robust cost of every track (3, M) at once, each with a damping of its own (Levenberg-Marquardt)."""
+    damping = np.full(points.shape[1], _DAMPING)
+    sums = views.summed(views.shares(points))
     for _ in range(iterations):
-        moved = points - _damped_solve(H, g, damping)
-        H_moved, g_moved, cost_moved = (views.summed(share) for share in views.normal_equations(moved))
-        better = cost_moved <= cost
-        points, g = np.where(better[:, None], moved, points), np.where(better[:, None], g_moved, g)
-        H, cost = np.where(better[:, None, None], H_moved, H), np.where(better, cost_moved, cost)
+        moved = points - _damped_step(sums, damping)
+        sums_moved = views.summed(views.shares(moved))
+        better = sums_moved[_COST] <= sums[_COST]
+        points, sums = np.where(better, moved, points), np.where(better, sums_moved, sums)
         damping = np.where(better, np.maximum(0.1 * damping, _LEAST_DAMPING), 10.0 * damping)
     return points
 
 
-def _damped_solve(H: Array, g: Array, damping: Array) -> Array:
-    """Solve (H + damping diag(H)) d = g (..., 3); where H is not finite or empty, the step is zero."""
-    diagonal = np.diagonal(H, axis1=-2, axis2=-1)
-    solvable: BoolArray = np.asarray(
-        np.isfinite(H).all(axis=(-2, -1)) & np.isfinite(g).all(axis=-1) & (diagonal > 0.0).all(axis=-1)
-    )
-    damped = H + damping[:, None, None] * diagonal[:, :, None] * np.eye(3)
-    matrix = np.where(solvable[:, None, None], damped, np.eye(3))
-    vector = np.where(solvable[:, None], g, 0.0)
-    return np.asarray(np.linalg.solve(matrix, vector[..., None])[..., 0])
+def _damped_step(sums: Array, damping: Array) -> Array:
+    """Solve (H + damping diag(H)) d = g of problems (10, M) for d (3, M); where H is not finite or empty, d is zero."""
+    diagonal = sums[[0, 3, 5]]
+    solvable: BoolArray = np.asarray(np.isfinite(sums[:_COST]).all(axis=0) & (diagonal > 0.0).all(axis=0))
+    H = sums[_WHOLE]
+    H[range(3), range(3)] = diagonal + damping * diagonal
+    matrix = np.where(solvable, H, np.eye(3)[:, :, None]).transpose(2, 0, 1)
+    vector = np.where(solvable, sums[_G], 0.0).T
+    return np.linalg.solve(matrix, vector[..., None])[..., 0].T

@@ -62,16 +62,21 @@ class Judged(Struct, frozen=True, kw_only=True):
     """What a run's errors, or its innovations, say of the uncertainty it states."""
 
     verdict: Annotated[
-        Literal["consistent", "overconfident", "timid", "heavy-tailed"],
-        Meta(description="by the mean: in, above, below its band; below, behind a gate that refused much"),
+        Literal["consistent", "overconfident", "timid", "heavy-tailed", "contradicted"],
+        Meta(
+            description="by the mean: in, above, below its band; below, behind a gate that refused much; corrections "
+            "that lean one way by more than their limit"
+        ),
     ]
     metric: Annotated[str, Meta(description="key of the metric it rests on")]
     mean: Annotated[float, Meta(description="its value, over seeds the mean over the runs that are ok")]
-    band: Annotated[tuple[float, float], Meta(description="of 95 % of consistent estimators")]
+    band: Annotated[
+        tuple[float, float], Meta(description="of 95 % of consistent estimators; of a correction trend 0 and its limit")
+    ]
 
 
 Consistency = (
-    Annotated[Judged, Meta(description="absent where neither NEES nor NIS can be had, and before it was added")]
+    Annotated[Judged, Meta(description="absent where neither NEES nor NIS nor a trend tells, and before it was added")]
     | UnsetType
 )
 

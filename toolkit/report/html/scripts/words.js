@@ -1,5 +1,5 @@
 const OUTPUT_MEANING = "causal: what was known at each frame; final: what was said when everything had been seen; both: the two are the same";
-const STATUS_MEANING = "ok: ran to a plausible end; diverged: ran to the end, but left what is plausible; failed: could not go on. overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that refused many; the notes have the figures";
+const STATUS_MEANING = "ok: ran to a plausible end; diverged: ran to the end, but left what is plausible; failed: could not go on. overconfident, timid: errors (NEES), or without truth innovations (NIS), larger or smaller than the stated uncertainty allows; heavy-tailed: innovations that are small behind a gate that refused many; contradicted: tracks that turn the state one way, farther than the stated uncertainty allows; the notes have the figures";
 const TABLE_NOTE = "The best of each recording is set off; a dash says why on pointing at it, and in the notes below. Compare causal with causal and final with final.";
 
 const STATUS_WORDS = {

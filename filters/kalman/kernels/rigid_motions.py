@@ -1,0 +1,101 @@
+"""The exponential map of SE(3) compiled, its right Jacobian and adjoint: ``toolkit.geometry`` of one twist at a time.
+
+Twists are [rotation, translation]. Source: Barfoot, "State Estimation for Robotics" (2017), eqs. 7.33, 7.85-7.86.
+"""
+
+import math
+
+import numpy as np
+
+from filters.kalman.kernels.algebra import multiply
+from filters.kalman.kernels.compiling import compiled
+from toolkit.geometry import Array
+
+
+@compiled
+def coefficients(x: float, c: Array) -> None:
+    """Put the five coefficients of the exponential map and its Jacobian at a squared angle x in c (5,).
+
+    They are ``sum_k (-x)^k / (2 k + n)!`` for n = 1 ... 5, as in ``toolkit.geometry``: seven terms of a small angle.
+    """
+    if x < 0.25:
+        first = 1.0
+        for n in range(1, 6):
+            first /= n
+            term = first
+            c[n - 1] = first
+            for k in range(1, 7):
+                term *= -x / ((2 * k + n - 1) * (2 * k + n))
+                c[n - 1] += term
+    else:
+        a = math.sqrt(x)
+        sine, cosine = math.sin(a), math.cos(a)
+        c[0], c[1], c[2] = sine / a, (1.0 - cosine) / x, (a - sine) / (a * x)
+        c[3], c[4] = (0.5 * x + cosine - 1.0) / (x * x), (sine - a + a * x / 6.0) / (a * x * x)
+
+
+@compiled
+def skew(v: Array, first: int, sign: float, X: Array) -> None:
+    """Put the matrix of the cross product with three elements of v, times a sign, in X (3, 3)."""
+    x, y, z = sign * v[first], sign * v[first + 1], sign * v[first + 2]
+    X[0, 0], X[0, 1], X[0, 2] = 0.0, -z, y
+    X[1, 0], X[1, 1], X[1, 2] = z, 0.0, -x
+    X[2, 0], X[2, 1], X[2, 2] = -y, x, 0.0
+
+
+@compiled
+def exponential(xi: Array, T: Array) -> None:
+    """Put the motion of a twist, the first six elements of xi, in T (1, 4, 4)."""
+    X, XX, c = np.empty((3, 3)), np.empty((3, 3)), np.empty(5)
+    skew(xi, 0, 1.0, X)
+    multiply(X, X, XX)
+    coefficients(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2], c)
+    for i in range(3):
+        T[0, 3, i], T[0, i, 3] = 0.0, xi[3 + i]
+        for j in range(3):
+            T[0, i, j] = (1.0 if i == j else 0.0) + c[0] * X[i, j] + c[1] * XX[i, j]
+            T[0, i, 3] += (c[1] * X[i, j] + c[2] * XX[i, j]) * xi[3 + j]
+    T[0, 3, 3] = 1.0
+
+
+@compiled
+def right_jacobian(xi: Array, J: Array) -> None:
+    """Put J_r of a twist, ``exp(xi + d) = exp(xi) exp(J_r d)``, in J (6, 6)."""
+    X, Y, XX, XY, YX = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    XYX, XXY, YXX = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    left, right = np.empty((3, 3)), np.empty((3, 3))
+    c = np.empty(5)
+    skew(xi, 0, -1.0, X)
+    skew(xi, 3, -1.0, Y)
+    multiply(X, X, XX)
+    multiply(X, Y, XY)
+    multiply(Y, X, YX)
+    multiply(XY, X, XYX)
+    multiply(X, XY, XXY)
+    multiply(YX, X, YXX)
+    multiply(X, XYX, left)
+    multiply(XYX, X, right)
+    coefficients(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2], c)
+    for i in range(3):
+        for j in range(3):
+            J[i, j] = J[3 + i, 3 + j] = (1.0 if i == j else 0.0) + c[1] * X[i, j] + c[2] * XX[i, j]
+            J[i, 3 + j] = 0.0
+            J[3 + i, j] = (
+                0.5 * Y[i, j]
+                + c[2] * (XY[i, j] + YX[i, j] + XYX[i, j])
+                + c[3] * (XXY[i, j] + YXX[i, j] - 3.0 * XYX[i, j])
+                + 0.5 * (c[3] - 3.0 * c[4]) * (left[i, j] + right[i, j])
+            )
+
+
+@compiled
+def adjoint_of_inverse(T: Array, A: Array) -> None:
+    """Put the adjoint of the inverse of a motion (1, 4, 4), ``[R^T, 0; -R^T [t]x, R^T]``, in A (6, 6)."""
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = A[3 + i, 3 + j] = T[0, j, i]
+            A[i, 3 + j] = 0.0
+        x, y, z = T[0, 0, i], T[0, 1, i], T[0, 2, i]
+        A[3 + i, 0] = z * T[0, 1, 3] - y * T[0, 2, 3]
+        A[3 + i, 1] = x * T[0, 2, 3] - z * T[0, 0, 3]
+        A[3 + i, 2] = y * T[0, 0, 3] - x * T[0, 1, 3]

@@ -1,0 +1,102 @@
+"""In which order the variables of a smoother's graph are eliminated: in COLAMD's, or, along a standstill, in time.
+
+COLAMD (Davis, Gilbert, Larimore and Ng 2004, "A column approximate minimum degree ordering algorithm") is the faster
+one where landmarks come and go. While a vehicle stands, hundreds of states see the same landmarks. In the order of time
+such a landmark waits for the last state that saw it, and a state depends on no more than the next one and what waits.
+Which order it is to be is counted: both are eliminated symbolically, and the one of fewer operations is taken. That
+takes the time of half an iteration, so it is asked only where a landmark is seen so often that they may differ.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from itertools import combinations
+
+import gtsam
+import numpy as np
+
+from toolkit.geometry import IntArray
+from toolkit.models.factors import L, X, kind_of
+from toolkit.sequence import StereoFrame
+
+Order = Callable[[gtsam.NonlinearFactorGraph, list[StereoFrame]], gtsam.Ordering]
+
+# In the order of time a landmark that more states saw than this waits for the last of them.
+_MOST_TIED = 50
+# With no landmark that more states saw than this, nothing is counted.
+_FEWEST_STANDING = 150
+# Rows of each kind of variable. A twist's bias has half of an IMU's, which decides nothing.
+_SIZES = {"x": 6, "v": 3, "b": 6, "l": 3, "s": 1}
+
+
+def cheaper_order(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> Order:
+    """Return how to order a graph of states that move so, of which state k saw the landmarks of frame k."""
+    if max((count for _, count, _ in _landmarks(frames)), default=0) <= _FEWEST_STANDING:
+        return by_colamd
+    graph = _symbolic(motion, frames)
+    colamd, along = gtsam.Ordering.ColamdSymbolicFactorGraph(graph), _in_time(_all_keys(graph), frames)
+    return in_time if _operations(graph, along) < _operations(graph, colamd) else by_colamd
+
+
+def by_colamd(graph: gtsam.NonlinearFactorGraph, _frames: list[StereoFrame]) -> gtsam.Ordering:
+    """Return COLAMD's order."""
+    return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+
+
+def in_time(graph: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.Ordering:
+    """Return landmarks first, then the states in time, each after the landmarks that wait for it, and all else last."""
+    return _in_time(graph.keyVector(), frames)
+
+
+def _in_time(keys: Iterable[int], frames: list[StereoFrame]) -> gtsam.Ordering:
+    wait = {L(track_id): last for track_id, count, last in _landmarks(frames) if count > _MOST_TIED}
+    first, of_states, rest = list[int](), defaultdict[int, list[int]](list), list[int]()
+    for key in sorted(keys):  # landmarks come before poses and velocities
+        kind = kind_of(key)
+        if kind == "l" and key not in wait:
+            first.append(key)
+        elif kind in "xvbl":
+            of_states[wait.get(key, gtsam.Symbol(key).index())].append(key)
+        else:
+            rest.append(key)
+    ordering = gtsam.Ordering()
+    for key in (*first, *(key for k in sorted(of_states) for key in of_states[k]), *rest):
+        ordering.push_back(key)
+    return ordering
+
+
+def _operations(graph: gtsam.SymbolicFactorGraph, ordering: gtsam.Ordering) -> int:
+    """Return how many operations an elimination takes, in proportion: rows times those they depend on, squared."""
+    net, total = graph.eliminateSequential(ordering), 0
+    for conditional in map(net.at, range(net.size())):
+        sizes = [_SIZES[kind_of(key)] for key in conditional.keys()]  # noqa: SIM118 - not a mapping
+        total += sizes[0] * sum(sizes) ** 2
+    return total
+
+
+def _landmarks(frames: list[StereoFrame]) -> list[tuple[int, int, int]]:
+    """Return each track's id, in how many frames it is seen, and the last of them."""
+    sizes = [frame.track_ids.size for frame in frames]
+    frame: IntArray = np.repeat(np.arange(len(frames)), sizes)
+    ids, track, counts = np.unique(
+        np.concatenate([f.track_ids for f in frames]), return_inverse=True, return_counts=True
+    )
+    last = np.zeros(ids.size, dtype=np.int64)
+    np.maximum.at(last, track, frame)
+    return list(zip(ids.tolist(), counts.tolist(), last.tolist(), strict=True))
+
+
+def _symbolic(motion: gtsam.NonlinearFactorGraph, frames: list[StereoFrame]) -> gtsam.SymbolicFactorGraph:
+    """Return which variables depend on one another."""
+    graph = gtsam.SymbolicFactorGraph()
+    for keys in (motion.at(i).keys() for i in range(motion.size())):
+        for tied in combinations(keys, 2) if len(keys) > 1 else [keys]:
+            graph.push_factor(*tied)
+    for k, frame in enumerate(frames):
+        for track_id in frame.track_ids.tolist():
+            graph.push_factor(X(k), L(track_id))
+    return graph
+
+
+def _all_keys(graph: gtsam.SymbolicFactorGraph) -> list[int]:
+    ordering = gtsam.Ordering.NaturalSymbolicFactorGraph(graph)
+    return [ordering.at(i) for i in range(ordering.size())]

@@ -1,0 +1,77 @@
+"""A smoother eliminates in the order of fewer operations, and its answer does not depend on which that is."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.smoothing import elimination_order
+from filters.smoothing.elimination_order import by_colamd, cheaper_order, in_time
+from filters.smoothing.levenberg_marquardt import Stopping, solve
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors, X
+from toolkit.models.motion import motion_model
+from toolkit.sequence import Sequence, StereoFrame
+from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.simulation.standstill import standstill
+
+Problem = tuple[gtsam.NonlinearFactorGraph, list[StereoFrame]]
+
+
+def _problem(sequence: Sequence) -> Problem:
+    """Return what ties the states of a recording to one another, the prior included, and the frames."""
+    model, packets = motion_model(sequence.noise, sequence.gravity_world), list(sequence.packets())
+    graph = model.hold(model.initial_belief(sequence.prior), 0)
+    for packet in packets[1:]:
+        graph.push_back(model.integrate(packet.motion, sequence.prior.bias).factors(packet.index))
+    return graph, [packet.frame for packet in packets]
+
+
+def _standing(pause_s: float) -> Sequence:
+    return standstill(simulate(replace(DRIVE, duration_s=3.0), 1), pause_s)
+
+
+@pytest.mark.parametrize("pause_s", [20.0, 30.0])
+def test_along_a_standstill_the_order_is_that_of_time(pause_s):
+    assert cheaper_order(*_problem(_standing(pause_s))) is in_time
+
+
+@pytest.mark.parametrize("scenario", [DRIVE, FLIGHT], ids=lambda scenario: scenario.name)
+def test_where_the_order_of_time_takes_more_operations_it_is_colamds(scenario, monkeypatch):
+    monkeypatch.setattr(elimination_order, "_FEWEST_STANDING", 0)  # so that they are counted
+    assert cheaper_order(*_problem(simulate(replace(scenario, duration_s=10.0), 1))) is by_colamd
+
+
+def test_operations_are_those_of_a_chain_counted_by_hand():
+    """Each of three poses is eliminated together with the next one: 6 rows of 12, twice, and 6 of 6."""
+    graph, ordering = gtsam.SymbolicFactorGraph(), gtsam.Ordering()
+    for k in range(3):
+        ordering.push_back(X(k))
+    graph.push_factor(X(0), X(1))
+    graph.push_factor(X(1), X(2))
+    assert elimination_order._operations(graph, ordering) == 2 * 6 * 12**2 + 6 * 6**2
+
+
+def test_both_orders_have_every_variable_once_and_lead_to_one_solution():
+    sequence = _standing(8.0)
+    graph, frames = _problem(sequence)
+    model, values = motion_model(sequence.noise, sequence.gravity_world), gtsam.Values()
+    maker, truth = StereoFactors(sequence.rig), sequence.truth
+    for k, frame in enumerate(frames):
+        values.insert(X(k), gtsam.Pose3(truth.T_world_imu[k]))
+        values.insert(model.keys(k)[1], np.zeros(3))
+        for factor in maker.of(frame, k):
+            graph.add(factor)
+        points = stereo.triangulate_world(frame.uvs_px, truth.T_world_imu[k], sequence.rig)
+        for track_id, point in zip(frame.track_ids.tolist(), points, strict=True):
+            if not values.exists(L(track_id)):
+                values.insert(L(track_id), point)
+    orders = [by_colamd(graph, frames), in_time(graph, frames)]
+    keys = [[order.at(i) for i in range(order.size())] for order in orders]
+    assert keys[0] != keys[1]
+    assert sorted(keys[0]) == sorted(keys[1]) == sorted(graph.keyVector())
+    solved = [solve(graph, values, Stopping(1e-12), ordering=order) for order in orders]
+    first, second = (np.array([s.values.atPose3(X(k)).translation() for k in range(len(frames))]) for s in solved)
+    assert all(solution.converged for solution in solved)
+    np.testing.assert_allclose(first, second, atol=1e-6)  # m; both within what the relative decrease leaves

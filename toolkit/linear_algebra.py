@@ -1,0 +1,19 @@
+"""Linear algebra on one thread, so that the same bits and comparable times come out wherever it runs."""
+
+import sys
+from contextlib import AbstractContextManager
+from functools import lru_cache
+
+from threadpoolctl import ThreadpoolController
+
+
+def on_one_thread() -> AbstractContextManager[object]:
+    """Return a context in which the linear algebra of this process runs on one thread."""
+    limited: AbstractContextManager[object] = _libraries(len(sys.modules)).limit(limits=1, user_api="blas")
+    return limited
+
+
+@lru_cache(maxsize=1)
+def _libraries(_modules: int) -> ThreadpoolController:
+    """Return the libraries of this process. Finding them takes 2 ms; it is done anew where more modules are loaded."""
+    return ThreadpoolController()
