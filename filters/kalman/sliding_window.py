@@ -79,7 +79,7 @@ class SlidingWindowFilter:
         self._tracks.add_frame(_without(packet.frame, self._joint))
         leaving = self._clone_t_ns < packet.frame.t_ns - self._lag_ns
         self._correct_by_tracks(leaving, gate)
-        self._correct_by_bridge(packet.frame)
+        self._correct_by_bridge(packet)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._forget_clones(leaving)
         now = self._in_view.corrected(self._joint, self._tracks.unused(), share)
@@ -137,11 +137,11 @@ class SlidingWindowFilter:
         joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
         self._correlation.learn(accepted.sightings, accepted.points, joint.clones)
 
-    def _correct_by_bridge(self, frame: StereoFrame) -> None:
+    def _correct_by_bridge(self, packet: Packet) -> None:
         """Correct the last three poses where no track leads from one of them to the next."""
         if self.bridge is None:
             return
-        kept, joint = self.bridge.added(frame), self._joint
+        kept, joint = self.bridge.added(packet.frame, packet.motion), self._joint
         if kept is not None:
             H = kept.derivatives(self._at.clones(joint)[-3:]) / kept.sigmas[:, None]
             residual = -kept.change(joint.clones[-3:]) / kept.sigmas

@@ -70,7 +70,7 @@ class GraphBuilder:
         self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
         if self._bridge is not None:
-            kept = self._bridge.added(sound)
+            kept = self._bridge.added(sound, packet.motion)
             if kept is not None:
                 extension.factors.add(kept_twist(kept, packet.index))
         return extension

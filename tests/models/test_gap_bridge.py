@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.geometry import se3_exp
-from toolkit.measured_motion import TwistChangeNoise, TwistNoise
+from toolkit.measured_motion import TwistChangeNoise, TwistMotion, TwistNoise
 from toolkit.models.factors import X
 from toolkit.models.gap_bridge import GapBridge, KeptTwist, TwistChange, bridged, gaps, kept_twist
 from toolkit.sequence import StereoFrame
@@ -93,50 +93,61 @@ def test_intervals_are_as_long_as_their_stamps_say():
     assert bridged(frames, NOISE).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
 
 
-def driven(bridge, ids_of_frames, sigma, seed=0):
-    """Drive on with a twist that changes by white noise of this size, and return what the bridge says at each frame."""
-    rng, said, pose = np.random.default_rng(seed), [], np.eye(4)
+def driven(bridge, ids_of_frames, sigma, error, seed=0):
+    """Drive on with a twist that changes by white noise of this size and is measured with errors of another.
+
+    Return what the bridge says at each frame.
+    """
+    rng, said, pose, motion = np.random.default_rng(seed), [], np.eye(4), None
     twist = np.array([0.0, 0.0, 0.1, 8.0, 0.0, 0.0])
     for frame in frames_of(*ids_of_frames):
-        said.append(bridge.added(frame))
+        said.append(bridge.added(frame, motion))
         bridge.learn(pose)
         twist = twist + sigma * rng.normal(size=6)
         pose = pose @ se3_exp(0.1 * twist)
+        measured = (twist + error * rng.normal(size=6))[None]
+        motion = TwistMotion(np.array([0.1]), measured[:, 3:], measured[:, :3])
     return said
 
 
+SIGMA = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
+LONG = [[1]] * 600 + [[2]] * 3
+
+
 def test_a_bridge_is_as_sure_as_the_twist_was_seen_to_stay():
-    sigma = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
-    frames = [[1]] * 600 + [[2]] * 3
-    said = driven(GapBridge(1.0, MEASURED), frames, sigma)
+    said = driven(GapBridge(1.0, MEASURED), LONG, SIGMA, 3.0 * SIGMA)
     assert [kept is not None for kept in said] == [False] * 600 + [True, True, False]
     stated = np.sqrt(2.0 / 0.1) * np.array([0.02] * 3 + [0.2] * 3)
-    expected = np.sqrt((598.0 * np.square(sigma) + 10.0 * np.square(stated)) / 608.0)
+    expected = np.sqrt((598.0 * np.square(SIGMA) + 10.0 * np.square(stated)) / 608.0)
     # Of so many changes the standard deviation is known to three percent.
     np.testing.assert_allclose(said[600].sigmas, expected, rtol=0.09)
 
 
 def test_at_first_a_bridge_tells_no_more_than_the_twists_that_are_measured():
     """Two of them, of intervals of a tenth of a second, differ by their white noise."""
-    said = driven(GapBridge(1.0, MEASURED), [[1], [1], [1], [2]], np.zeros(6))
-    stated = np.sqrt(2.0 / 0.1) * np.array([0.02] * 3 + [0.2] * 3)
-    np.testing.assert_allclose(said[3].sigmas, stated * np.sqrt(10.0 / 11.0))
-    # Before three poses were tied by tracks nothing is known of the change.
-    assert driven(GapBridge(1.0, MEASURED), [[1], [1], [2]], np.zeros(6)) == [None] * 3
+    change = TwistChange(MEASURED)
+    assert change.noise is None
+    change.learn(100_000_000 * np.arange(3), np.tile(np.eye(4), (3, 1, 1)), np.zeros((2, 6)))
+    expected = np.sqrt(2.0 * 10.0 / 11.0) * np.array([0.02] * 3 + [0.2] * 3) / 0.1
+    np.testing.assert_allclose(change.noise.turn_change_density, expected[:3])
+    np.testing.assert_allclose(change.noise.velocity_change_density, expected[3:])
+
+
+def test_twists_that_are_measured_as_they_are_need_no_bridge():
+    assert driven(GapBridge(1.0, MEASURED), LONG, SIGMA, 0.0) == [None] * 603
 
 
 def test_the_change_is_not_learnt_over_gaps_nor_from_one_pose_that_is_far_off():
-    sigma = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
     one, other = TwistChange(MEASURED), TwistChange(MEASURED)
     poses = [np.eye(4)]
     for _ in range(300):
-        poses.append(poses[-1] @ se3_exp(0.1 * sigma))
+        poses.append(poses[-1] @ se3_exp(0.1 * SIGMA))
     for k in range(298):
         for change, off in ((one, 0.0), (other, 50.0 if k == 200 else 0.0)):
             three = np.array(poses[k : k + 3])
             three[2, 0, 3] += off
-            change.learn(100_000_000 * np.arange(k, k + 3), three)
+            change.learn(100_000_000 * np.arange(k, k + 3), three, np.zeros((2, 6)))
     np.testing.assert_allclose(other.noise.velocity_change_density, one.noise.velocity_change_density, rtol=0.05)
     bridge = GapBridge(1.0, MEASURED)
-    driven(bridge, [[k] for k in range(50)], sigma)
+    driven(bridge, [[k] for k in range(50)], SIGMA, 3.0 * SIGMA)
     assert bridge.noise is None

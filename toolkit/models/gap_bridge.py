@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from toolkit.geometry import Array, IntArray, se3_adjoint, se3_inverse, se3_log, se3_right_jacobian
-from toolkit.measured_motion import MotionNoise, TwistChangeNoise, TwistNoise
+from toolkit.measured_motion import Motion, MotionNoise, TwistChangeNoise, TwistMotion, TwistNoise
 from toolkit.models.factors import X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import StereoFrame
@@ -24,6 +24,10 @@ from toolkit.sequence import StereoFrame
 _STATED_FOR = 10
 # A change of so many standard deviations counts for no more: where an answer was revised it is no motion.
 _MOST_SIGMAS = 3.0
+# Measured twists that change by less than so many times the mean square of what the body's does are not noisy.
+_NOISY = 2.0
+# A share of the stated noise that is rounding where twists do not change at all.
+_ROUNDING = 1e-6
 
 
 def gaps(frames: Sequence[StereoFrame]) -> IntArray:
@@ -41,26 +45,41 @@ class TwistChange:
 
     def __init__(self, measured: TwistNoise) -> None:
         self._measured = np.concatenate([measured.gyro_noise_density, measured.velocity_noise_density])
-        self._squares, self._count = np.zeros(6), 0
+        self._squares, self._measured_squares, self._count = np.zeros(6), np.zeros(6), 0
+        self._stated = np.zeros(6)
 
-    def learn(self, t_ns: IntArray, poses: Array) -> None:
-        """Take in three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks lead on."""
+    def learn(self, t_ns: IntArray, poses: Array, measured: Array) -> None:
+        """Take in three successive poses (3, 4, 4) at stamps (3,) ns, between which tracks lead on.
+
+        ``measured`` (2, 6) are the twists [rad/s, m/s] that were measured between them.
+        """
         before_s, after_s = (np.diff(t_ns) / NS_PER_S).tolist()
         between_s = 0.5 * (before_s + after_s)
         twists = [se3_log(se3_inverse(poses[i]) @ poses[i + 1]) / dt_s for i, dt_s in ((0, before_s), (1, after_s))]
         change = np.square(twists[1] - twists[0]) / between_s
         if not self._count:
-            self._squares, self._count = _STATED_FOR * 2.0 * np.square(self._measured / between_s), _STATED_FOR
-        self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._squares / self._count)
+            self._stated = 2.0 * np.square(self._measured / between_s)
+        self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._mean_squares)
+        self._measured_squares = self._measured_squares + np.square(measured[1] - measured[0]) / between_s
         self._count += 1
+
+    @property
+    def is_below_that_measured(self) -> bool:
+        """Say whether measured twists change by much more than the body's does, as noisy ones do."""
+        rounding = _ROUNDING * self._count * self._stated
+        return bool((self._measured_squares > _NOISY * self._squares + rounding).any())
 
     @property
     def noise(self) -> TwistChangeNoise | None:
         """Return the noise on the change; None as long as nothing was seen of it."""
         if not self._count:
             return None
-        density = np.sqrt(self._squares / self._count)
+        density = np.sqrt(self._mean_squares)
         return TwistChangeNoise(density[3:], density[:3])
+
+    @property
+    def _mean_squares(self) -> Array:
+        return np.asarray((self._squares + _STATED_FOR * self._stated) / (self._count + _STATED_FOR))
 
 
 class KeptTwist(NamedTuple):
@@ -104,15 +123,19 @@ class GapBridge:
         self._window_s, self._change = window_s, TwistChange(measured)
         self._frames: list[StereoFrame] = []
         self._poses: list[Array] = []
+        self._twists: list[Array] = []
 
     @property
     def noise(self) -> TwistChangeNoise | None:
-        """Return the noise on the twist's change so far."""
-        return self._change.noise
+        """Return the noise on the twist's change so far; None where measured twists are no noisier than that."""
+        return self._change.noise if self._change.is_below_that_measured else None
 
-    def added(self, frame: StereoFrame) -> KeptTwist | None:
-        """Return what a frame adds: that over the last three poses the twist is kept, or nothing."""
+    def added(self, frame: StereoFrame, motion: Motion | None) -> KeptTwist | None:
+        """Return what a frame adds, and the motion before it: that the last two twists are the same, or nothing."""
         self._frames = [*self._frames[-2:], frame]
+        if isinstance(motion, TwistMotion):
+            twists = np.hstack([motion.w_radps, motion.v_mps])
+            self._twists = [*self._twists[-1:], np.average(twists, axis=0, weights=motion.dt_s)]
         noise = self.noise
         if noise is None or len(self._frames) < 3 or not gaps(self._frames).size:
             return None
@@ -124,7 +147,8 @@ class GapBridge:
         """Take in the pose (4, 4) that was found for the last frame."""
         self._poses = [*self._poses[-2:], T_world_imu]
         if len(self._poses) == 3 and not gaps(self._frames).size:
-            self._change.learn(np.array([frame.t_ns for frame in self._frames]), np.array(self._poses))
+            t_ns = np.array([frame.t_ns for frame in self._frames])
+            self._change.learn(t_ns, np.array(self._poses), np.array(self._twists))
 
 
 def gap_bridge_for(measured: MotionNoise, window_s: float) -> GapBridge | None:
