@@ -56,7 +56,10 @@ class FixedLag:
         """Take in one packet and return the state at its frame."""
         extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
         while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
-            self._complete(self._first_in_window)
+            k = self._first_in_window
+            self._complete(k)
+            if k + 1 < packet.index:
+                self._builder.learn(k, np.array([state.T_world_imu for state in self._states[k : k + 2]]))
             self._first_in_window += 1
         recovery = self._tree.add(extension, t_ns)
         self._last_seen_ns.update(dict.fromkeys(extension.landmark_ids, t_ns))

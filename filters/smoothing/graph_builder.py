@@ -12,6 +12,7 @@ import numpy as np
 
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.alignment import aligned
+from filters.smoothing.discounted_tracks import DiscountedTracks, seen_often
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.refused_tracks import RefusedTracks
 from toolkit.estimate import Estimate
@@ -46,7 +47,8 @@ class GraphBuilder:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, outliers = setup.rig, setup.settings.outliers
-        self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
+        self._tracks, self._used = DiscountedTracks(setup), dict[int, StereoFrame]()
+        self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
@@ -83,9 +85,22 @@ class GraphBuilder:
             self._bridge.learn(newest.T_world_imu)
         self._points.update(points)
 
+    def learn(self, k: int, T_world_imu: Array) -> None:
+        """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and that of the next one.
+
+        That is once the window has done for it what it can. Later frames must have been taken in.
+        """
+        often = seen_often(self._used.values())
+        points = {i: point for i, point in self._points.items() if i in often}
+        self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
+
+    def as_told(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """Return a graph in which the sightings of all frames count for what those of the newest do."""
+        return graph if self._tracks.share == 1.0 else self._factors().remade(graph)
+
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the motion that was taken in."""
-        return self._noise.told
+        """Return what a user should know of the motion and the tracks that were taken in."""
+        return self._noise.told + self._tracks.told
 
     def contradicted(self) -> set[int]:
         """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
@@ -135,7 +150,15 @@ class GraphBuilder:
         if self._rig.track_noise is not None:
             extension.chained = used, k
         else:
-            for factor in self._stereo.of(used, k):
+            for factor in self._factors().of(used, k):
                 extension.factors.add(factor)
+        self._used[k] = used
         extension.landmark_ids = used.track_ids.tolist()
         self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))
+
+    def _factors(self) -> StereoFactors:
+        """Return what makes factors of sightings that count for what they are known to count for now."""
+        if self._share != self._tracks.share:
+            rig, huber = self._tracks.now
+            self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share
+        return self._stereo

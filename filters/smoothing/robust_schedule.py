@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from filters.kalman.residual_correlation import ResidualCorrelation
-from filters.smoothing.discounted_tracks import discounted, successive_residuals
+from filters.smoothing.discounted_tracks import discounted, seen_often, successive_residuals
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
@@ -75,7 +75,8 @@ def solve_robustly(
     frames = _placed_by_stereo(frames)
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
-    correlation.add(*successive_residuals(frames, values, rig))
+    poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
+    correlation.add(*successive_residuals(frames, poses, points, rig))
     rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
     if values.exists(SCALE):
         sightings = ChainedSightings.of(frames, rig)
@@ -183,7 +184,7 @@ def _residuals(
     """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
     ids, sizes = seen_ids(frames), [len(frame.track_ids) for frame in frames]
     points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-    T_imu_world = se3_inverse(np.array([values.atPose3(X(k)).matrix() for k in range(len(frames))]))
+    T_imu_world = se3_inverse(_poses(values, len(frames)))
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
     seen = points[np.searchsorted(ids, np.concatenate([frame.track_ids for frame in frames]))]
     predicted_px, depth_m = stereo.images(transform(np.repeat(T_imu_world, sizes, axis=0), seen), rig)
@@ -191,6 +192,10 @@ def _residuals(
     distance = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted_px), covs_px2)
     ends = np.cumsum(sizes)[:-1]
     yield from zip(frames, np.split(distance, ends), np.split(depth_m, ends), strict=True)
+
+
+def _poses(values: gtsam.Values, count: int) -> Array:
+    return np.array([values.atPose3(X(k)).matrix() for k in range(count)])
 
 
 def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:
