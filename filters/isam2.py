@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.chained_past import ChainedPast
-from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
+from filters.smoothing.graph_builder import LEARNT_AFTER_FRAMES, GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
@@ -71,7 +71,7 @@ class Isam2:
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
-        graph, motion = self._builder.as_told(self._tree.graph()), self._builder.motion
+        graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
         values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
@@ -83,8 +83,8 @@ class Isam2:
         return Finished(trajectory, Landmarks.of(points), converged, (*self._builder.log(), *self._log, *log))
 
     def _learn(self, packet: Packet) -> None:
-        """Learn what tracks count for from a frame that most sightings of its tracks have come after."""
-        k = packet.index - FROZEN_AFTER_FRAMES // 2
+        """Learn from a frame some time ago what tracks count for."""
+        k = packet.index - LEARNT_AFTER_FRAMES
         if k >= 0:
             poses = self._tree.read([X(k), X(k + 1)])
             self._builder.learn(k, np.array([poses.atPose3(X(i)).matrix() for i in (k, k + 1)]))

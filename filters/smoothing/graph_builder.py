@@ -26,6 +26,11 @@ from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame
 
+# A frame tells what tracks count for once so many more have come: its landmarks are seen from enough by then.
+LEARNT_AFTER_FRAMES = 5
+# Sightings in the graph may count for so many times as much as they are known to by now, or for so much less.
+_MOST_OUTDATED = 1.25
+
 
 @dataclass
 class GraphExtension:
@@ -49,6 +54,8 @@ class GraphBuilder:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._tracks, self._used = DiscountedTracks(setup), dict[int, StereoFrame]()
         self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
+        # What the sightings counted for that are longest in the graph.
+        self._share_in_graph = 1.0
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
@@ -86,17 +93,22 @@ class GraphBuilder:
         self._points.update(points)
 
     def learn(self, k: int, T_world_imu: Array) -> None:
-        """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and that of the next one.
-
-        That is once the window has done for it what it can. Later frames must have been taken in.
-        """
+        """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
         often = seen_often(self._used.values())
         points = {i: point for i, point in self._points.items() if i in often}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
 
-    def as_told(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
-        """Return a graph in which the sightings of all frames count for what those of the newest do."""
-        return graph if self._tracks.share == 1.0 else self._factors().remade(graph)
+    @property
+    def is_outdated(self) -> bool:
+        """Say whether sightings in the graph count for far more, or less, than they are known to by now."""
+        return not 1.0 / _MOST_OUTDATED < self._tracks.share / self._share_in_graph < _MOST_OUTDATED
+
+    def brought_up_to_date(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """Return a graph whose sightings all count for what they are known to by now; the rest is as it was."""
+        if self._tracks.share == self._share_in_graph:
+            return graph
+        self._share_in_graph = self._tracks.share
+        return self._factors().remade(graph)
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the motion and the tracks that were taken in."""
