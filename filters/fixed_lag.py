@@ -17,7 +17,7 @@ import numpy as np
 from filters.kalman.thinning import Thinned
 from filters.smoothing.chained_window import ChainedWindow
 from filters.smoothing.fixed_lag_tree import FixedLagTree
-from filters.smoothing.graph_builder import GraphBuilder
+from filters.smoothing.graph_builder import LEARNT_AFTER_FRAMES, GraphBuilder
 from filters.smoothing.indeterminate import Recovery, behind_camera
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
@@ -54,6 +54,8 @@ class FixedLag:
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
+        if self._builder.is_outdated:
+            self._note(packet, self._tree.rebuild(self._builder.brought_up_to_date))
         extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
         while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
             self._complete(self._first_in_window)
@@ -88,6 +90,9 @@ class FixedLag:
         in_tree = {i: values.atPoint3(L(i)) for i in self._last_seen_ns}
         self._points |= in_tree
         self._builder.update(self._states[-1], in_tree)
+        k = packet.index - LEARNT_AFTER_FRAMES
+        if k >= 0:
+            self._builder.learn(k, np.array([state.T_world_imu for state in self._states[k : k + 2]]))
 
     def _drop_landmarks(self, packet: Packet) -> None:
         """Drop what is not in front of the camera any more, before it is linearised there, and what is elsewhere."""

@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 
 from filters.smoothing.chained_past import ChainedPast
-from filters.smoothing.graph_builder import GraphBuilder, GraphExtension
+from filters.smoothing.graph_builder import LEARNT_AFTER_FRAMES, GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
 from filters.smoothing.levenberg_marquardt import Stopping, solve
@@ -26,7 +26,7 @@ from filters.smoothing.robust_schedule import CHAIN_STOPPING
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models.factors import L
+from toolkit.models.factors import L, X
 from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
@@ -65,12 +65,13 @@ class Isam2:
         points = self._tree.points(map(L, seen))
         self._relinearise(packet, estimate)
         self._builder.update(estimate, dict(zip(seen, points, strict=True)))
+        self._learn(packet)
         self._drop_landmarks(seen, points, estimate, packet)
         return estimate
 
     def finish(self) -> Finished:
         """Solve for every state and landmark, all of them linearised anew until the error stalls."""
-        graph, motion = self._tree.graph(), self._builder.motion
+        graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
         values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
@@ -80,6 +81,13 @@ class Isam2:
         points = {gtsam.Symbol(key).index(): values.atPoint3(key) for key in self._tree.landmarks()}
         trajectory, log = with_covariances(Trajectory.of(states), graph.linearize(values), motion)
         return Finished(trajectory, Landmarks.of(points), converged, (*self._builder.log(), *self._log, *log))
+
+    def _learn(self, packet: Packet) -> None:
+        """Learn from a frame some time ago what tracks count for."""
+        k = packet.index - LEARNT_AFTER_FRAMES
+        if k >= 0:
+            poses = self._tree.read([X(k), X(k + 1)])
+            self._builder.learn(k, np.array([poses.atPose3(X(i)).matrix() for i in (k, k + 1)]))
 
     def _relinearise(self, packet: Packet, estimate: Estimate) -> None:
         """Mark the landmarks in view, refused or not, that are no longer where they are linearised."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.thinning import Thinned
+from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.smart_factors import RobustCamera
 from filters.smoothing.smart_solver import SolvedWindow, solve_window, without_oldest
@@ -45,7 +46,7 @@ class Smart:
     def __init__(self, setup: Setup, lag_s: float) -> None:
         outliers = setup.settings.outliers
         self._rig, self._lag_ns = setup.rig, round(lag_s * NS_PER_S)
-        self._camera = RobustCamera.of(setup.rig, outliers.smoother_huber)
+        self._tracks, self._camera = DiscountedTracks(setup), RobustCamera.of(setup.rig, outliers.smoother_huber)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._predicted = self._motion.initial_belief(setup.prior)
@@ -74,7 +75,11 @@ class Smart:
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""
         self._complete_all()
-        return Finished(Trajectory.of(self._states), Landmarks.of(self._points), log=(*self._noise.told, *self._log))
+        return Finished(
+            Trajectory.of(self._states),
+            Landmarks.of(self._points),
+            log=(*self._noise.told, *self._tracks.told, *self._log),
+        )
 
     def _extended(self, packet: Packet) -> TrackedWindow:
         """Return the window with the packet's state, predicted, and its sightings."""
@@ -133,5 +138,13 @@ class Smart:
         leaving = sum(state.t_ns < oldest_ns for state in self._states[-in_window:])
         if leaving:
             self._complete(range(leaving))
+            self._learn(leaving)
             window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
+            self._camera = RobustCamera.of(*self._tracks.now)
+
+    def _learn(self, leaving: int) -> None:
+        """Learn what tracks count for from those that go with the oldest states, of which there are so many."""
+        window = self._tracked.window
+        going = np.unique(window.sightings.point[window.sightings.pose < leaving])
+        self._tracks.learn_from(window.sightings.of_points(going), window.poses, window.points)

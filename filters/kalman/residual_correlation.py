@@ -27,11 +27,11 @@ _MOST_TOLD = 0.95
 
 
 class ResidualCorrelation:
-    """Measures over a run the correlation of a track's residuals from one sighting to the next."""
+    """Measures over a run the correlation of a track's residuals from one sighting to the next, if it ``matches``."""
 
     def __init__(self, rig: StereoRig, matches: bool = True) -> None:
         # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
-        self._rig, self._matches = rig, matches and rig.track_noise is None
+        self._rig, self.matches = rig, matches and rig.track_noise is None
         self._products, self._squares, self._pairs = 0.0, 0.0, 0
 
     @property
@@ -60,12 +60,17 @@ class ResidualCorrelation:
     def learn(self, sightings: TrackSightings, points: Array, poses: Array) -> None:
         """Take in tracks of points (F, 3) that have corrected W poses, as they are corrected (W, 4, 4)."""
         long_enough = sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS
-        if not self._matches or not long_enough.any():
+        if not self.matches or not long_enough.any():
             return
         sightings = sightings.select(long_enough)
         left = residuals_left(sightings, points[long_enough], poses, self._rig)
         both = sightings.seen[:, 1:] & sightings.seen[:, :-1]
-        before, after = left[:, :-1][both], left[:, 1:][both]
+        self.add(left[:, :-1][both], left[:, 1:][both])
+
+    def add(self, before: Array, after: Array) -> None:
+        """Take in whitened residuals (n, 3) of n sightings, and those of the same tracks a frame later."""
+        if not self.matches:
+            return
         self._products += float((before * after).sum())
         self._squares += 0.5 * float(np.square(before).sum() + np.square(after).sum())
         self._pairs += 3 * len(before)

@@ -18,7 +18,7 @@ is in the null space of both only at the same place. Off by a hundredth of a rad
 the standard deviation it had.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 import gtsam
 import numpy as np
@@ -80,9 +80,12 @@ class FixedLagTree:
             back = self.rebuild()
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
-    def rebuild(self) -> Recovery:
-        """Build the tree anew; its estimates, now and later, are the same but for rounding."""
-        return self._solved(*self._emptied())
+    def rebuild(
+        self, remade: Callable[[gtsam.NonlinearFactorGraph], gtsam.NonlinearFactorGraph] | None = None
+    ) -> Recovery:
+        """Build the tree anew; its estimates, now and later, are the same but for rounding, and for factors remade."""
+        factors, values = self._emptied()
+        return self._solved(factors if remade is None else remade(factors), values)
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Take landmarks out with their sightings in the window; the others keep what older sightings added."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.alignment import aligned
+from filters.smoothing.discounted_tracks import DiscountedTracks, seen_often
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.refused_tracks import RefusedTracks
 from toolkit.estimate import Estimate
@@ -24,6 +25,11 @@ from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
 from toolkit.models.state import Belief
 from toolkit.sequence import Packet, StereoFrame
+
+# A frame tells what tracks count for once so many more have come: its landmarks are seen from enough by then.
+LEARNT_AFTER_FRAMES = 5
+# Sightings in the graph may count for so many times as much as they are known to by now, or for so much less.
+_MOST_OUTDATED = 1.25
 
 
 @dataclass
@@ -46,7 +52,10 @@ class GraphBuilder:
 
     def __init__(self, setup: Setup) -> None:
         self._rig, outliers = setup.rig, setup.settings.outliers
-        self._stereo = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber))
+        self._tracks, self._used = DiscountedTracks(setup), dict[int, StereoFrame]()
+        self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
+        # What the sightings counted for that are longest in the graph.
+        self._share_in_graph = 1.0
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
@@ -83,9 +92,27 @@ class GraphBuilder:
             self._bridge.learn(newest.T_world_imu)
         self._points.update(points)
 
+    def learn(self, k: int, T_world_imu: Array) -> None:
+        """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
+        often = seen_often(self._used.values())
+        points = {i: point for i, point in self._points.items() if i in often}
+        self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
+
+    @property
+    def is_outdated(self) -> bool:
+        """Say whether sightings in the graph count for far more, or less, than they are known to by now."""
+        return not 1.0 / _MOST_OUTDATED < self._tracks.share / self._share_in_graph < _MOST_OUTDATED
+
+    def brought_up_to_date(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """Return a graph whose sightings all count for what they are known to by now; the rest is as it was."""
+        if self._tracks.share == self._share_in_graph:
+            return graph
+        self._share_in_graph = self._tracks.share
+        return self._factors().remade(graph)
+
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the motion that was taken in."""
-        return self._noise.told
+        """Return what a user should know of the motion and the tracks that were taken in."""
+        return self._noise.told + self._tracks.told
 
     def contradicted(self) -> set[int]:
         """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""
@@ -135,7 +162,15 @@ class GraphBuilder:
         if self._rig.track_noise is not None:
             extension.chained = used, k
         else:
-            for factor in self._stereo.of(used, k):
+            for factor in self._factors().of(used, k):
                 extension.factors.add(factor)
+        self._used[k] = used
         extension.landmark_ids = used.track_ids.tolist()
         self._points |= dict(zip(new.track_ids.tolist(), points, strict=True))
+
+    def _factors(self) -> StereoFactors:
+        """Return what makes factors of sightings that count for what they are known to count for now."""
+        if self._share != self._tracks.share:
+            rig, huber = self._tracks.now
+            self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share
+        return self._stereo

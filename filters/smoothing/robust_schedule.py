@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.smoothing.discounted_tracks import discounted, seen_often, successive_residuals
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
@@ -50,13 +52,15 @@ def solve_robustly(
     rig: StereoRig,
     start: gtsam.Values,
     outliers: Outliers,
+    correlation: ResidualCorrelation,
     progress: Progress,
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
 
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
-    A scale of disparities among the values stays as it is until what is an outlier has been decided.
+    A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
+    tracks count for the share that the correlation of their residuals leaves them by then.
     """
     values, order_of = start, cheaper_order(motion, frames)
     for robust, stopping, stage in _stages(outliers):
@@ -71,11 +75,14 @@ def solve_robustly(
     frames = _placed_by_stereo(frames)
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
+    poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
+    correlation.add(*successive_residuals(frames, poses, points, rig))
+    rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
     if values.exists(SCALE):
-        sightings, huber = ChainedSightings.of(frames, rig), outliers.batch_last_huber
+        sightings = ChainedSightings.of(frames, rig)
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
         return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
-    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(outliers.batch_last_huber)))
+    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(huber)))
     values, stage = _only_seen(values, frames), "solving without outliers"
     last = solve(graph, values, _LAST_STOPPING, progress, stage, ordering=order_of(graph, frames))
     return Smoothed(last, graph, frames)
@@ -177,7 +184,7 @@ def _residuals(
     """Yield each frame with its sightings' squared Mahalanobis distances (N,) and their landmarks' depths (N,) m."""
     ids, sizes = seen_ids(frames), [len(frame.track_ids) for frame in frames]
     points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-    T_imu_world = se3_inverse(np.array([values.atPose3(X(k)).matrix() for k in range(len(frames))]))
+    T_imu_world = se3_inverse(_poses(values, len(frames)))
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
     seen = points[np.searchsorted(ids, np.concatenate([frame.track_ids for frame in frames]))]
     predicted_px, depth_m = stereo.images(transform(np.repeat(T_imu_world, sizes, axis=0), seen), rig)
@@ -185,6 +192,10 @@ def _residuals(
     distance = mahalanobis_squared(left_only.residuals_px(uvs_px, predicted_px), covs_px2)
     ends = np.cumsum(sizes)[:-1]
     yield from zip(frames, np.split(distance, ends), np.split(depth_m, ends), strict=True)
+
+
+def _poses(values: gtsam.Values, count: int) -> Array:
+    return np.array([values.atPose3(X(k)).matrix() for k in range(count)])
 
 
 def _placed_by_stereo(frames: list[StereoFrame]) -> list[StereoFrame]:

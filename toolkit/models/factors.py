@@ -48,15 +48,30 @@ class StereoFactors:
         pose = X(k)
         for track_id, uv_px in zip(frame.track_ids.tolist(), frame.uvs_px.tolist(), strict=True):
             if isnan(uv_px[1]):
-                left_px = np.array([uv_px[0], uv_px[2]])
-                yield gtsam.GenericProjectionFactorCal3_S2(
-                    left_px, self._left_noise, pose, L(track_id), self._left_calibration, self._T_imu_cam
-                )
-                continue
-            measured = gtsam.StereoPoint2(*uv_px)
-            yield gtsam.GenericStereoFactor3D(
-                measured, self._noise, pose, L(track_id), self._calibration, self._T_imu_cam
-            )
+                yield self._by_left(np.array([uv_px[0], uv_px[2]]), pose, L(track_id))
+            else:
+                yield self._by_both(gtsam.StereoPoint2(*uv_px), pose, L(track_id))
+
+    def remade(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+        """Return a graph whose sightings have this noise and loss, and whose other factors are as they were."""
+        made = gtsam.NonlinearFactorGraph()
+        for i in range(graph.size()):
+            factor = graph.at(i)
+            if isinstance(factor, gtsam.GenericStereoFactor3D):
+                made.add(self._by_both(factor.measured(), *factor.keys()))
+            elif isinstance(factor, gtsam.GenericProjectionFactorCal3_S2):
+                made.add(self._by_left(factor.measured(), *factor.keys()))
+            elif factor is not None:
+                made.add(factor)
+        return made
+
+    def _by_both(self, measured: gtsam.StereoPoint2, pose: int, landmark: int) -> gtsam.NonlinearFactor:
+        return gtsam.GenericStereoFactor3D(measured, self._noise, pose, landmark, self._calibration, self._T_imu_cam)
+
+    def _by_left(self, measured_px: Array, pose: int, landmark: int) -> gtsam.NonlinearFactor:
+        return gtsam.GenericProjectionFactorCal3_S2(
+            measured_px, self._left_noise, pose, landmark, self._left_calibration, self._T_imu_cam
+        )
 
 
 def _noise(cov_px2: Array, robust: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.noiseModel.Base:

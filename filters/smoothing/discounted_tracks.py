@@ -1,0 +1,121 @@
+"""Tracks that count for a share of their information in smoothers, and the residuals along them that tell it.
+
+What is an outlier stays a matter of the stated noise, so a loss has its threshold in pixels where it was. Which share,
+and why: :mod:`filters.kalman.residual_correlation`.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, ResidualCorrelation
+from filters.smoothing.smart_factors import Sightings
+from toolkit.estimator import Setup
+from toolkit.geometry import Array, IntArray, se3_inverse, transform
+from toolkit.models import left_only, stereo
+from toolkit.models.gating import chi2_bound
+from toolkit.sequence import StereoFrame, StereoRig
+
+# What chance explains less often, by the stated noise, is an outlier and says nothing of the others.
+_SOUND = 0.999
+
+
+class Discounted(NamedTuple):
+    """A rig whose sightings count for a share of their information, and the threshold of Huber's loss beside it."""
+
+    rig: StereoRig
+    huber: float | None
+
+
+def discounted(rig: StereoRig, huber: float | None, share: float) -> Discounted:
+    """Return the rig and the threshold (in sigma, None for no loss) with which sightings count for a share in (0, 1].
+
+    The loss is of residuals in sigma, which become smaller by the root of the share: so does its threshold.
+    """
+    if share == 1.0:
+        return Discounted(rig, huber)
+    threshold = None if huber is None else huber * float(np.sqrt(share))
+    return Discounted(replace(rig, cov_uv_px2=rig.cov_uv_px2 / share), threshold)
+
+
+class DiscountedTracks:
+    """What the sightings of an incremental smoother count for, by the frames that have left its window."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._rig, self._huber = setup.rig, setup.settings.outliers.smoother_huber
+        self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+
+    @property
+    def share(self) -> float:
+        """Return the share of its information that a sighting counts for now."""
+        return self._correlation.share
+
+    @property
+    def now(self) -> Discounted:
+        """Return the rig and the loss that give sightings this share."""
+        return discounted(self._rig, self._huber, self.share)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Return what a user should know, a line, where tracks do not count in full."""
+        return self._correlation.told
+
+    def learn(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
+        """Take in what successive frames saw of points (3,) m from poses (K, 4, 4)."""
+        if self._correlation.matches:
+            self._correlation.add(*successive_residuals(frames, T_world_imu, points, self._rig))
+
+    def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
+        """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""
+        if not self._correlation.matches:
+            return
+        often = np.bincount(sightings.point, minlength=len(points)) >= FEWEST_SIGHTINGS
+        seen = sightings.of_points(np.flatnonzero(often))
+        whitened = _whitened(seen.uv_px, T_world_imu[seen.pose], points[seen.point], self._rig)
+        self._correlation.add(*successive(seen.point, seen.pose, whitened))
+
+
+def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
+    """Return the ids of the tracks with sightings enough that their landmarks do not take up all there is."""
+    count = Counter[int]()
+    for frame in frames:
+        count.update(frame.track_ids.tolist())
+    return {track_id for track_id, sightings in count.items() if sightings >= FEWEST_SIGHTINGS}
+
+
+def successive_residuals(
+    frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array], rig: StereoRig
+) -> tuple[Array, Array]:
+    """Return whitened residuals (n, 3) of sightings of points (3,) m from poses (K, 4, 4), and those a frame later.
+
+    Tracks without a point, and pairs of which one is an outlier by the stated noise, are left out.
+    """
+    frames = [frame.select(np.array([i in points for i in frame.track_ids.tolist()], dtype=bool)) for frame in frames]
+    index = np.repeat(np.arange(len(frames)), [len(frame.track_ids) for frame in frames])
+    track_ids = np.concatenate([frame.track_ids for frame in frames])
+    if not track_ids.size:
+        return np.empty((0, 3)), np.empty((0, 3))
+    uvs_px = np.concatenate([frame.uvs_px for frame in frames])
+    seen = np.array([points[i] for i in track_ids.tolist()])
+    return successive(track_ids, index, _whitened(uvs_px, T_world_imu[index], seen, rig))
+
+
+def _whitened(uvs_px: Array, T_world_imu: Array, points: Array, rig: StereoRig) -> Array:
+    """Return the whitened residuals (N, 3) of sightings (N, 3) px of points (N, 3) m from poses (N, 4, 4)."""
+    predicted_px, _ = stereo.images(transform(se3_inverse(T_world_imu), points), rig)
+    return left_only.whitened_residuals(uvs_px, predicted_px, rig)
+
+
+def successive(tracks: IntArray, frames: IntArray, whitened: Array) -> tuple[Array, Array]:
+    """Return those of N residuals (N, 3), of tracks (N,) in frames (N,), that have one a frame later, and that one.
+
+    Pairs of which one is an outlier are left out.
+    """
+    order = np.lexsort((frames, tracks))
+    before, after = order[:-1], order[1:]
+    sound = np.square(whitened).sum(axis=1) < chi2_bound(3, _SOUND)
+    pairs = (tracks[before] == tracks[after]) & (frames[after] == frames[before] + 1) & sound[before] & sound[after]
+    return whitened[before[pairs]], whitened[after[pairs]]
