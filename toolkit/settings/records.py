@@ -192,7 +192,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     match_tracks: Annotated[
         bool,
         Meta(
-            description="white noise: windowed filters take tracks for less where residuals along them are correlated"
+            description="white noise: windows and smoothers take tracks for less where residuals along them are correlated"
         ),
     ] = True
 
