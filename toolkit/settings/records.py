@@ -191,9 +191,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     match_tracks: Annotated[
         bool,
-        Meta(
-            description="white noise: windows and smoothers take tracks for less where residuals along them are correlated"
-        ),
+        Meta(description="white noise: tracks count for less where residuals along them are correlated"),
     ] = True
 
 
