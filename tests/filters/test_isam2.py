@@ -23,14 +23,14 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
-from toolkit.measured_motion import TwistMotion
+from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
 from toolkit.models.factors import B, L, V, X
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
-from toolkit.simulation.track_faults import moving_objects
+from toolkit.simulation.track_faults import cut_tracks, moving_objects
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
@@ -326,6 +326,19 @@ def test_what_leaves_the_tree_changes_no_later_answer_and_is_in_the_final_one(sc
     finals = [estimator.finish().trajectory.T_world_imu for estimator in (ours, whole)]
     # Both stop where the error stalls, of which a hundredth of a sigma is the slack.
     np.testing.assert_allclose(finals[0], finals[1], atol=2e-3)
+
+
+@pytest.mark.usefixtures("nothing_linearised_anew")
+def test_a_state_leaves_whole_where_a_bridge_over_a_gap_still_ties_its_pose(monkeypatch):
+    """Its bias alone would take all factors of the pose along, and the tree would have a pose on nothing."""
+    noisy = TwistNoise(np.full(3, 0.16), np.full(3, 0.016), np.full(3, 1e-5))
+    few_tracks = replace(DRIVE, duration_s=2.5, camera=replace(DRIVE.camera, max_tracks=30))
+    scenario = replace(few_tracks, motion=replace(few_tracks.motion, noise=noisy))
+    sequence = cut_tracks(simulate(scenario, 1), 0.4, 1)
+    _, expected = stepped(sequence, monkeypatch, retired_after=1000)
+    ours, estimates = stepped(sequence, monkeypatch, retired_after=8)
+    assert_same_answers(estimates, expected)
+    assert not ours._tree.has(X(3))
 
 
 @pytest.mark.usefixtures("nothing_linearised_anew")
