@@ -60,6 +60,11 @@ class FrameGate:
         self.tested += accepted.size
         self.accepted += count
 
+    @property
+    def weighs(self) -> bool:
+        """Say whether what is accepted may count for less than in full."""
+        return self.huber is not None or self.share != 1.0
+
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
         """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] times the share."""
         if self.huber is None:

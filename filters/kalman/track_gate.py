@@ -166,7 +166,7 @@ class TrackGate:
         accepted = gate.accepts(tracks.nis, dof)
         weights = gate.weights(tracks.nis, dof, accepted)
         H, residuals = tracks.H, tracks.residuals
-        if gate.huber is not None:
+        if gate.weighs:
             roots = np.sqrt(weights)[tracks.track]
             H, residuals = roots[:, None] * H, roots * residuals
         passed = AcceptedTracks(
