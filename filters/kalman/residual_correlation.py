@@ -22,6 +22,9 @@ FEWEST_SIGHTINGS = 4
 _STANDARD_ERRORS = 3.0
 # What counts for less than a hundredth would be no measurement; beyond that another cause is likelier.
 _MOST_CORRELATED = 0.98
+# Of residuals this much smaller than the stated noise, in variance, one outlier or rounding is as much as all the rest,
+# and sightings count for a hundredth of what they tell as it is.
+_LEAST_VARIANCE = 0.01
 # What rounds to the full information is none to speak of.
 _MOST_TOLD = 0.95
 
@@ -36,10 +39,10 @@ class ResidualCorrelation:
 
     @property
     def correlation(self) -> float:
-        """Return the correlation so far, 0 unless it is positive beyond chance."""
-        if not self._pairs:
+        """Return the correlation so far, 0 unless it is positive beyond chance, of residuals that there are."""
+        if self._squares <= _LEAST_VARIANCE * self._pairs:
             return 0.0
-        found = self._products / max(self._squares, np.finfo(float).tiny)
+        found = self._products / self._squares
         return float(min(found, _MOST_CORRELATED)) if found > _STANDARD_ERRORS / np.sqrt(self._pairs) else 0.0
 
     @property
