@@ -1,0 +1,97 @@
+"""Sightings that count for a share in smoothers: of every cost that share, outliers where they were, old ones too."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from filters.smoothing.discounted_tracks import discounted, seen_often, successive, successive_residuals
+from toolkit.geometry import se3_exp
+from toolkit.models import stereo
+from toolkit.models.factors import L, StereoFactors, X, huber_loss
+from toolkit.sequence import StereoFrame
+from toolkit.simulation import DRIVE, simulate
+
+SHARE, HUBER = 0.1, 1.5
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return simulate(DRIVE, 0).rig
+
+
+def frame(track_ids, uvs_px):
+    ids = np.array(track_ids)
+    return StereoFrame(0, ids, np.asarray(uvs_px, dtype=float), np.zeros(ids.size, dtype=np.int64))
+
+
+def factors(rig, huber, seen):
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in StereoFactors(rig, huber_loss(huber)).of(seen, 0):
+        graph.add(factor)
+    return graph
+
+
+@pytest.fixture
+def scene(rig):
+    """Return a frame of four sightings, the last by the left image alone and the third far off, and the values."""
+    points = np.array([[12.0, 1.0, 0.5], [20.0, -3.0, 0.0], [15.0, 2.0, 1.0], [9.0, 0.0, 0.2]])
+    uvs_px = stereo.predict(points, np.eye(4), rig).uv_px + np.array([[0.3], [-0.4], [9.0], [0.5]])
+    uvs_px[3, 1] = np.nan
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose3())
+    for track_id, point in enumerate(points):
+        values.insert(L(track_id), point)
+    return frame(range(4), uvs_px), values
+
+
+@pytest.mark.parametrize("huber", [None, HUBER])
+def test_every_sighting_costs_the_share_of_what_it_cost_outliers_too(rig, scene, huber):
+    seen, values = scene
+    whole, part = factors(rig, huber, seen), factors(*discounted(rig, huber, SHARE), seen)
+    for i in range(whole.size()):
+        assert part.at(i).error(values) == pytest.approx(SHARE * whole.at(i).error(values), rel=1e-9)
+
+
+def test_a_whole_share_is_the_rig_itself(rig):
+    assert discounted(rig, HUBER, 1.0) == (rig, HUBER)
+
+
+def test_factors_made_anew_cost_what_new_ones_do_and_others_stay_as_they_were(rig, scene):
+    seen, values = scene
+    graph = factors(rig, HUBER, seen)
+    prior = gtsam.PriorFactorPose3(
+        X(0), gtsam.Pose3(se3_exp(np.full(6, 0.1))), gtsam.noiseModel.Isotropic.Sigma(6, 0.2)
+    )
+    graph.add(prior)
+    part, threshold = discounted(rig, HUBER, SHARE)
+    made, expected = StereoFactors(part, huber_loss(threshold)).remade(graph), factors(part, threshold, seen)
+    assert made.size() == graph.size()
+    for i in range(expected.size()):
+        assert made.at(i).error(values) == pytest.approx(expected.at(i).error(values), rel=1e-12)
+    assert made.at(4).error(values) == prior.error(values)
+
+
+def test_pairs_are_of_one_track_in_successive_frames_and_of_no_outlier():
+    tracks, frames = np.array([7, 7, 7, 9, 9, 8, 8]), np.array([0, 1, 3, 0, 1, 1, 2])
+    whitened = np.arange(21.0).reshape(7, 3) / 20.0
+    whitened[4] = 10.0
+    before, after = successive(tracks, frames, whitened)
+    np.testing.assert_array_equal(before, whitened[[0, 5]])
+    np.testing.assert_array_equal(after, whitened[[1, 6]])
+
+
+def test_residuals_are_those_of_the_points_that_are_known(rig):
+    points = {3: np.array([12.0, 1.0, 0.5]), 4: np.array([20.0, -3.0, 0.0])}
+    poses = np.array([se3_exp(np.array([0.0, 0.0, 0.01 * k, 0.4 * k, 0.0, 0.0])) for k in range(2)])
+    exact = [stereo.predict(np.array(list(points.values())), T, rig).uv_px for T in poses]
+    off_px = np.linalg.inv(rig.whitener) @ np.array([0.5, -0.2, 0.1])
+    frames = [frame([3, 4, 5], [*(uv + off_px), [0.0, 0.0, 0.0]]) for uv in exact]
+    before, after = successive_residuals(frames, poses, points, rig)
+    np.testing.assert_allclose(before, np.tile([0.5, -0.2, 0.1], (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    assert all(len(each) == 0 for each in successive_residuals(frames, poses, {}, rig))
+
+
+def test_tracks_seen_often_have_four_sightings():
+    frames = [frame([1, 2], np.zeros((2, 3)))] * 3 + [frame([2], np.zeros((1, 3)))]
+    assert seen_often(frames) == {2}
