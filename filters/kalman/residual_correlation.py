@@ -4,9 +4,11 @@ A tracker takes its error along from image to image, and a filter told white noi
 for new. Residuals that are correlated by rho from one sighting to the next carry, as a sum, as much as (1 - rho) /
 (1 + rho) times as many independent ones (Bayley & Hammersley 1946, "The 'effective' number of independent observations
 in an autocorrelated time series"): for long tracks whose errors are an autoregression of first order that is exact. So
-where they are correlated every track corrects with that share of its information; what is an outlier stays a matter of
-the stated noise. White errors have residuals that are correlated negatively, by the landmark that was fitted to them,
-and count in full: a filter whose noise is as stated stays, to the bit, what it is without.
+with a variance that is v times the stated one a sighting tells (1 - rho) / (1 + rho) / v of what it is stated to, and
+where that is less than all of it, every track corrects with that share of its information; what is an outlier stays a
+matter of the stated noise. Noise that was stated large enough for such tracks counts in full. White errors have
+residuals that are correlated negatively, by the landmark that was fitted to them, and count in full: a filter whose
+noise is as stated stays, to the bit, what it is without.
 """
 
 import numpy as np
@@ -22,9 +24,6 @@ FEWEST_SIGHTINGS = 4
 _STANDARD_ERRORS = 3.0
 # What counts for less than a hundredth would be no measurement; beyond that another cause is likelier.
 _MOST_CORRELATED = 0.98
-# Of residuals this much smaller than the stated noise, in variance, one outlier or rounding is as much as all the rest,
-# and sightings count for a hundredth of what they tell as it is.
-_LEAST_VARIANCE = 0.01
 # What rounds to the full information is none to speak of.
 _MOST_TOLD = 0.95
 
@@ -39,16 +38,17 @@ class ResidualCorrelation:
 
     @property
     def correlation(self) -> float:
-        """Return the correlation so far, 0 unless it is positive beyond chance, of residuals that there are."""
-        if self._squares <= _LEAST_VARIANCE * self._pairs:
+        """Return the correlation so far, 0 unless it is positive beyond chance."""
+        if not self._pairs:
             return 0.0
-        found = self._products / self._squares
+        found = self._products / max(self._squares, np.finfo(float).tiny)
         return float(min(found, _MOST_CORRELATED)) if found > _STANDARD_ERRORS / np.sqrt(self._pairs) else 0.0
 
     @property
     def share(self) -> float:
-        """Return the share of its information that a track counts for."""
-        return (1.0 - self.correlation) / (1.0 + self.correlation)
+        """Return the share of its information that a track counts for: all of it where residuals are not correlated."""
+        rho = self.correlation
+        return min(1.0, (1.0 - rho) / (1.0 + rho) * self._pairs / self._squares) if rho > 0.0 else 1.0
 
     @property
     def told(self) -> tuple[str, ...]:

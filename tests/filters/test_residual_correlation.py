@@ -74,6 +74,14 @@ def test_correlated_errors_count_for_as_much_as_their_mean_is_worth(drive):
     assert f"{found.correlation:.2f} from frame to frame" in found.told[0]
 
 
+def test_noise_stated_large_enough_for_correlated_errors_counts_in_full(drive):
+    """Errors of a third of the stated noise, each as wrong as four others: nine times as much is told by each."""
+    found = ResidualCorrelation(replace(drive.rig, cov_uv_px2=9.0 * drive.rig.cov_uv_px2))
+    found.learn(*tracks_of(drive.rig, 0.6, 0))
+    assert found.correlation > 0.4
+    assert found.share == 1.0
+
+
 def test_a_handful_of_residuals_that_happen_to_agree_proves_nothing(drive):
     sightings, points, poses = tracks_of(drive.rig, 0.9, 0)
     found = ResidualCorrelation(drive.rig)
@@ -108,7 +116,16 @@ def test_a_drive_whose_noise_is_as_stated_is_answered_as_without_to_the_bit(name
     assert not tells(with_it)
 
 
-@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam", *SMOOTHERS])
+@pytest.mark.parametrize("name", SMOOTHERS)
+def test_a_smoother_is_the_nearer_to_honest_for_it(name, walking, run_estimator):
+    run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
+    assert tells(run)
+    assert not tells(full)
+    found, believed = (score_run(each, "final", walking, only=["nees_pose_mean"]).values for each in (run, full))
+    assert found["nees_pose_mean"] < 0.8 * believed["nees_pose_mean"]
+
+
+@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam"])
 def test_tracks_that_walk_are_found_and_claimed_to_tell_less(name, walking, run_estimator):
     run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
     assert tells(run)
