@@ -218,8 +218,8 @@ for name, run in matched.runs.items():
 #
 # ## Told what they are like
 #
-# More can be told: `noise.tracks=fitted` hands the fitted noise, with all of its parts, to every estimator that can use it. The decoupled `ekf` cannot, nor can
-# dead reckoning, so their lines stay as they are.
+# More can be told: `noise.tracks=fitted` hands the fitted noise, with all of its parts, to every estimator that can use
+# it. The decoupled `ekf` cannot, nor can dead reckoning, so their lines stay as they are.
 
 # %%
 fitted.table(*COLUMNS)
@@ -259,10 +259,10 @@ for name in CHOSEN:
         print(f"{name:{width}}  drift {old:.2f} % -> {new:.2f} %")
 
 # %% [markdown]
-# Over white noise in full the smoother gains. A windowed filter may lose on a real drive, even its way: real errors have
-# tails that no Gaussian has, the fitted noise is that of the bulk of the tracks, and a gate that believes in it throws
-# many good tracks away. What to tell an estimator is more than [the noise of the bulk](../docs/tracks.md), and to count
-# all tracks for less does better on such a drive than the whole model.
+# Over white noise in full the smoother gains. A windowed filter may lose on a real drive, even its way: real errors
+# have tails that no Gaussian has, the fitted noise is that of the bulk of the tracks, and a gate that believes in it
+# throws many good tracks away. What to tell an estimator is more than [the noise of the bulk](../docs/tracks.md), and
+# to count all tracks for less may do better on such a drive than the whole model.
 #
 # One drive is one draw of luck again. So the last step is a simulation with such tracks, where the truth is exact and
 # seeds can be repeated: the smoother once told white, and once told the walk and the offset that were planted.
