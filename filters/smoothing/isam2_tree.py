@@ -272,15 +272,12 @@ class Isam2Tree:
         return Recovery([], set())
 
     def _leaving(self) -> list[int]:
-        """Return the variables to be retired now: none in most frames, and none while it is solved by QR.
-
-        Those of a state go together. A bridge over a gap ties poses for longer than biases; of a bias that goes alone
-        GTSAM takes the factors of its pose along, in one clique with it, and keeps no marginal.
-        """
+        """Return the variables to be retired now: none in most frames, and none while it is solved by QR."""
         is_time = self._taken_back or self._frozen.count % RETIRING_EVERY_FRAMES == 0
         if not self._retires or self._factorization == "QR" or not is_time:
             return []
         unused = self._frozen.unused_for(RETIRED_AFTER_FRAMES)
+        # A bridge ties poses for longer than biases. A bias that left alone would take its pose's factors along.
         stay = {key for keys in self._recent if not set(keys).issubset(unused) for key in keys}
         return [key for key in unused if key not in stay and self.has(key)]
 
