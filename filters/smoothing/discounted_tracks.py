@@ -42,7 +42,7 @@ def discounted(rig: StereoRig, huber: float | None, share: float) -> Discounted:
 
 
 class DiscountedTracks:
-    """What the sightings of an incremental smoother count for, by the frames that have left its window."""
+    """What the sightings of an incremental smoother count for, by those of earlier frames."""
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._huber = setup.rig, setup.settings.outliers.smoother_huber

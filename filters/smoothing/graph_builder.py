@@ -54,8 +54,8 @@ class GraphBuilder:
         self._rig, outliers = setup.rig, setup.settings.outliers
         self._tracks, self._used = DiscountedTracks(setup), dict[int, StereoFrame]()
         self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
-        # What the sightings counted for that are longest in the graph.
-        self._share_in_graph = 1.0
+        # What the sightings counted for that are longest in the graph, and whether all others count for that too.
+        self._share_in_graph, self._count_alike = 1.0, True
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
@@ -94,8 +94,7 @@ class GraphBuilder:
 
     def learn(self, k: int, T_world_imu: Array) -> None:
         """Learn from frame k what tracks count for; poses (2, 4, 4) are its own and the next one's, as known by now."""
-        often = seen_often(self._used.values())
-        points = {i: point for i, point in self._points.items() if i in often}
+        points = {i: self._points[i] for i in seen_often(self._used.values()) if i in self._points}
         self._tracks.learn([self._used.pop(k), self._used[k + 1]], T_world_imu, points)
 
     @property
@@ -105,10 +104,11 @@ class GraphBuilder:
 
     def brought_up_to_date(self, graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
         """Return a graph whose sightings all count for what they are known to by now; the rest is as it was."""
-        if self._tracks.share == self._share_in_graph:
+        if self._count_alike and self._tracks.share == self._share_in_graph:
             return graph
-        self._share_in_graph = self._tracks.share
-        return self._factors().remade(graph)
+        factors = self._factors()
+        self._share_in_graph, self._count_alike = self._share, True
+        return factors.remade(graph)
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the motion and the tracks that were taken in."""
@@ -173,4 +173,5 @@ class GraphBuilder:
         if self._share != self._tracks.share:
             rig, huber = self._tracks.now
             self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share
+            self._count_alike = False
         return self._stereo
