@@ -45,6 +45,7 @@ CONTRACT = [
 # What later versions added, each behind a key of the contract in the order of tables.
 _BLOCKS = ("variance", "pose", "vel", "bias")
 ADDED = {
+    "end_drift_percent": ["clock_offset_ms", "clock_offset_error_ms"],
     "heldout_reproj_rmse_px": ["heldout_over_motion", "heldout_over_motion_error"],
     "nees_pose_in_band_percent": ["nees_vel_mean", "nees_gyro_bias_mean", "nees_accel_bias_mean"],
     "nis_mean": ["gate_accepted_percent", "correction_trend", "correction_trend_limit"],

@@ -10,8 +10,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-from toolkit.audit.parts.robust import MAD_TO_SIGMA, jackknife_error
+from toolkit.audit.parts.robust import MAD_TO_SIGMA
 from toolkit.geometry import Array
+from toolkit.jackknife import jackknife_error
 
 # -1 / (2 + w), w a walk's variance a frame over that of the white part: beyond it the walk has more than twice that.
 # Simulated white tracks have -0.40 to -0.48, for the camera's motion is fitted to them; real ones 0.1 to 0.9.

@@ -9,8 +9,9 @@ from scipy.special import stdtrit
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-from toolkit.audit.parts.robust import STRETCHES, Scalar, median_error
+from toolkit.audit.parts.robust import Scalar, median_error
 from toolkit.geometry import Array
+from toolkit.jackknife import STRETCHES
 from toolkit.resampling import NS_PER_S
 
 # A step is one at this level over all places where it can be, and beyond this share: sound drives at hand have 0.057

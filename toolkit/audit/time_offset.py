@@ -16,10 +16,11 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
-from toolkit.audit.parts.robust import Scalar, jackknife_error, slope, spread
+from toolkit.audit.parts.robust import Scalar, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
 from toolkit.geometry import Array, BoolArray
+from toolkit.jackknife import jackknife_error
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

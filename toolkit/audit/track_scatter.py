@@ -11,8 +11,8 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-from toolkit.audit.parts.robust import jackknife_error
 from toolkit.geometry import Array
+from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
 
 # Standard deviations over the stated ones. 21 sound simulated recordings have 0.98 to 1.00 and real ones, whose noise

@@ -28,7 +28,7 @@ from toolkit.errors import DataError
 from toolkit.evaluation.stated import nees_scores
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, so3_log
-from toolkit.metrics import Metric, Scores, Unavailable, ate, coverage, drift, kitti, nees, rpe
+from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
 from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, distance_along
 from toolkit.metrics._shared.evaluation import AgainstTruth, PairsAgainstTruth
 from toolkit.resampling import NS_PER_S
@@ -50,11 +50,14 @@ METRICS: tuple[Metric, ...] = (
     *rpe.METRICS,
     *kitti.METRICS,
     *drift.METRICS,
+    *clock_offset.METRICS,
     *(metric for metric in nees.METRICS if metric.key in NEES_KEYS),
     COVERAGE,
     _PAIRS,
 )
 _OVER_A_SECOND = ("rpe_1s_m", "rpe_1s_deg")
+# What stamps are needed for.
+_OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRICS))
 # What depends on the body's axes, and not on where the body is alone.
 _OF_THE_BODY = (
     *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
@@ -138,7 +141,7 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     matched = _matched(estimate, truth, terms.max_dt_s)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
-        scores = _without(scores, _OVER_A_SECOND, "the files have no stamps")
+        scores = _without(scores, _OF_THE_CLOCK, "the files have no stamps")
     if turn is not None:
         scores = _without(
             scores, _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
@@ -206,11 +209,10 @@ def nearest_poses(estimate: Poses, truth: TruthFile, max_dt_s: float) -> Matched
 
 def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile, terms: Terms) -> Scores:
     pairs = PairsAgainstTruth(matched, terms.level)
-    files: tuple[Callable[[AgainstTruth], Scores], ...] = (ate.score, rpe.score, kitti.score, drift.score)
     found: list[Scores] = []
     with np.errstate(all="ignore"):  # what is not finite is no value, with that as its reason
-        for score, metrics in zip(files, (ate.METRICS, rpe.METRICS, kitti.METRICS, drift.METRICS), strict=True):
-            found.append(_or_reason(score, pairs, metrics))
+        for file_of_metrics in (ate, rpe, kitti, drift, clock_offset):
+            found.append(_or_reason(file_of_metrics.score, pairs, file_of_metrics.METRICS))
         found.append(nees_scores(file, estimate, truth.stamped, level=terms.level))
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
     found.append(Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)}))

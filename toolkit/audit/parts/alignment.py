@@ -21,12 +21,12 @@ from toolkit.audit.parts.robust import (
     chance_bound,
     chance_sigmas,
     in_motion,
-    jackknife_cov,
     slip_stretches,
     spread,
 )
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
+from toolkit.jackknife import jackknife_cov
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

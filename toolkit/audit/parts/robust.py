@@ -1,20 +1,18 @@
 """Statistics robust to a few outlying intervals."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from toolkit.geometry import Array
+from toolkit.jackknife import STRETCHES
 
 MAD_TO_SIGMA = 1.4826
 CAUCHY_SIGMAS = 2.0
 ITERATIONS = 10
 # Standard error of a median over that of a mean, for normal errors.
 MEDIAN_TO_MEAN_ERROR = 1.2533
-# Parts of a recording of which a jackknife leaves out one at a time: what lasts for seconds is one event.
-STRETCHES = 10
 LEAST_STRETCHES = 2
 # What is chance less often than this counts.
 LEVEL = 1e-3
@@ -58,22 +56,6 @@ def median_error(residuals: Array) -> Array:
     """Return the standard error (d,) of the median of independent residuals (M, d)."""
     error: Array = MEDIAN_TO_MEAN_ERROR * spread(residuals) / np.sqrt(len(residuals))
     return error
-
-
-def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
-    """Return the standard error of an estimate from arrays (M, ...) in time, by what it is without each tenth of them.
-
-    Source: Shao & Tu, "The Jackknife and Bootstrap" (1995), section 2.3: the delete-d jackknife of dependent data.
-    """
-    return float(np.sqrt(jackknife_cov(lambda *some: np.array([estimate(*some)]), *rows)[0, 0]))
-
-
-def jackknife_cov(estimate: Callable[..., Array], *rows: Array, stretches: int = STRETCHES) -> Array:
-    """Return the covariance (m, m) of an estimate (m,) of the same kind."""
-    stretch = np.arange(len(rows[0])) * stretches // len(rows[0])
-    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(stretches)])
-    off_mean = without - without.mean(axis=0)
-    return np.asarray((stretches - 1) / stretches * off_mean.T @ off_mean)
 
 
 def slip_stretches(duration_s: float) -> int:

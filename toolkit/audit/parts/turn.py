@@ -13,13 +13,12 @@ from toolkit.audit.parts.alignment import TURN, formal_cov, robust_solution, vel
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import (
     INFLATION,
-    STRETCHES,
     chance_bound,
     in_motion,
-    jackknife_cov,
     slip_stretches,
 )
 from toolkit.geometry import Array, skew
+from toolkit.jackknife import STRETCHES, jackknife_cov
 
 # Axes about which the turn is known worse than this many times the best one are not judged: about its own direction a
 # velocity says nothing, and slip feigns something.

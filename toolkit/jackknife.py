@@ -1,0 +1,26 @@
+"""Standard errors of estimates from dependent data, by what they are without each stretch of it.
+
+Source: Shao & Tu, "The Jackknife and Bootstrap" (1995), section 2.3: the delete-d jackknife of dependent data.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from toolkit.geometry import Array
+
+# Parts of a recording of which one at a time is left out: what lasts for seconds is one event.
+STRETCHES = 10
+
+
+def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
+    """Return the standard error of an estimate from arrays (M, ...) in time, by what it is without each tenth."""
+    return float(np.sqrt(jackknife_cov(lambda *some: np.array([estimate(*some)]), *rows)[0, 0]))
+
+
+def jackknife_cov(estimate: Callable[..., Array], *rows: Array, stretches: int = STRETCHES) -> Array:
+    """Return the covariance (m, m) of an estimate (m,) from arrays (M, ...) in time, M no less than the stretches."""
+    stretch = np.arange(len(rows[0])) * stretches // len(rows[0])
+    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(stretches)])
+    off_mean = without - without.mean(axis=0)
+    return np.asarray((stretches - 1) / stretches * off_mean.T @ off_mean)

@@ -1,0 +1,133 @@
+"""The clock of an estimate beside the truth's: by how much its stamps must be shifted for its positions to fit best.
+
+A constant offset of two clocks displaces each position along its velocity. It is fitted together with the alignment
+that ATE fits, as in Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems"
+(IROS 2013), section III, with the truth's positions in the place of a spline of them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from toolkit.geometry import Array, BoolArray, skew
+from toolkit.jackknife import STRETCHES, jackknife_error
+from toolkit.metrics._shared.alignment import fit_se3
+from toolkit.metrics._shared.evaluation import AgainstTruth
+from toolkit.metrics._shared.residuals import lengths, rmse
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.resampling import NS_PER_S
+
+ORDER = 45
+OFFSET, ERROR = "clock_offset_ms", "clock_offset_error_ms"
+METRICS = (
+    Metric(
+        OFFSET,
+        "what the stamps of the estimate must be shifted by for its positions to fit the truth's best (ms)",
+        "ms",
+        ("clock", "offset"),
+        decimals=1,
+        best="",
+    ),
+    Metric(
+        ERROR,
+        "standard error of the clock offset, by a jackknife over ten stretches of time (ms)",
+        "ms",
+        ("clock", "off. +-"),
+        name="clock offset, error",
+        decimals=1,
+        best="",
+    ),
+)
+_ITERATIONS, _SETTLED_S = 20, 1e-6
+# So many pairs are needed, at most these steps of the median one apart: a path is not known across a gap.
+_FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
+# Where less of the velocity (share) is left beside the alignment, a shift in time looks like one in space.
+_LEAST_LEFT = 0.02
+# An offset is told from so many standard errors and from a millisecond on: few stamps are better than that.
+_SIGMAS, _LEAST_S = 5.0, 1e-3
+_REMARK = (
+    "with its stamps shifted by {:.1f} +- {:.1f} ms its positions fit the truth's to {:.3g} m in place of {:.3g} m: "
+    "two clocks, or a truth whose positions are stamped early or late"
+)
+
+
+class _Fit(NamedTuple):
+    """An offset and its standard error (s), and the RMS distance of positions without it and with it (m)."""
+
+    offset_s: float
+    error_s: float
+    before_m: float
+    after_m: float
+
+
+class _Linearised(NamedTuple):
+    """Of n pairs the aligned positions less the true ones (n, 3) m, and their Jacobian (n, 3, 7).
+
+    Its columns are the true velocity (m/s), a turn about each axis of the world and a displacement along each.
+    """
+
+    error_m: Array
+    jacobian: Array
+
+
+def score(evaluation: AgainstTruth) -> Scores:
+    """Score the offset of the estimate's clock, and how well it is known."""
+    try:
+        fit = _fit(evaluation)
+    except Unavailable as reason:
+        return Scores({OFFSET: None, ERROR: None}, {OFFSET: str(reason), ERROR: str(reason)})
+    scores = Scores({OFFSET: 1e3 * fit.offset_s, ERROR: 1e3 * fit.error_s})
+    if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s):
+        return scores
+    told = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
+    return scores.remarked([OFFSET], told)
+
+
+def _fit(evaluation: AgainstTruth) -> _Fit:
+    """Fit the offset by Gauss-Newton; raises Unavailable where it is not determined."""
+    pairs = evaluation.compared
+    t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
+    true, estimated = pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3]
+    usable = _beside_no_gap(t_s)
+    if usable.sum() < _FEWEST_PAIRS:
+        raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
+    path = CubicSpline(t_s, true)
+    offset_s = 0.0
+    for _ in range(_ITERATIONS):
+        # A pair that a step took beyond the ends stays out, lest the fit come and go with it.
+        usable &= (t_s + offset_s >= t_s[0]) & (t_s + offset_s <= t_s[-1])
+        if usable.sum() < _FEWEST_PAIRS:
+            raise Unavailable("no offset within the recording makes the positions fit")
+        at = _linearised(path, t_s[usable] + offset_s, estimated[usable])
+        step_s = _offset_s(*at)
+        offset_s += step_s
+        if abs(step_s) < _SETTLED_S:
+            before_m = rmse(lengths(_linearised(path, t_s[usable], estimated[usable]).error_m))
+            return _Fit(offset_s, jackknife_error(_offset_s, *at), before_m, rmse(lengths(at.error_m)))
+    raise Unavailable("no offset was found from which the fit does not step on")
+
+
+def _beside_no_gap(t_s: Array) -> BoolArray:
+    """Return which stamps (n,) s are no farther from their neighbours than stamps are as a rule."""
+    wide = np.diff(t_s) > _WIDEST_STEPS * np.median(np.diff(t_s))
+    return ~(np.append(wide, False) | np.insert(wide, 0, False))
+
+
+def _linearised(path: CubicSpline, t_s: Array, estimated: Array) -> _Linearised:
+    """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise what is left."""
+    true, velocity = path(t_s), path(t_s, 1)
+    alignment = fit_se3(true, estimated)
+    aligned = estimated @ alignment.rotation.T + alignment.translation
+    turned = -skew(aligned - aligned.mean(axis=0))
+    moved = np.broadcast_to(np.eye(3), turned.shape)
+    return _Linearised(aligned - true, np.concatenate([velocity[:, :, None], turned, moved], axis=2))
+
+
+def _offset_s(error_m: Array, jacobian: Array) -> float:
+    """Return the step of the offset that explains errors (n, 3) best, beside any turn and displacement."""
+    velocity, aligning = jacobian[:, :, 0].ravel(), jacobian[:, :, 1:].reshape(-1, 6)
+    left = velocity - aligning @ np.linalg.lstsq(aligning, velocity, rcond=None)[0]
+    if left @ left <= _LEAST_LEFT**2 * (velocity @ velocity):
+        raise Unavailable("the velocity hardly changes, so that a shift in time looks like one in space")
+    return float(left @ error_m.ravel() / (left @ left))
