@@ -206,8 +206,7 @@ class Isam2Tree:
         told = [*(key for keys in self._recent for key in keys), *self._to_relinearise]
         may_move = [key for key in self._frozen.others(told) if key not in fixed and self.has(key)]
         states = [key for key in may_move if kind_of(key) != "l"]
-        at = self.isam.getLinearizationPoint().extract(states)
-        return set(may_move).difference(() if any_moved_beyond(self._at_most, self.read(states), at) else states)
+        return set(may_move).difference(() if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else states)
 
     def _linearisations(
         self, factors: gtsam.NonlinearFactorGraph, new: gtsam.Values

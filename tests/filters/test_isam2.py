@@ -383,6 +383,28 @@ def test_what_a_recovery_takes_back_leaves_again_with_the_next_frame(monkeypatch
     assert_same_answers(estimates, expected)
 
 
+def test_one_state_beyond_the_threshold_of_its_kind_is_enough():
+    at_most, steps = linearisation_error.state_thresholds(MOTION, 0.1), gtsam.VectorValues()
+    for kind, key in zip("xvb", (X(3), V(3), B(3)), strict=True):
+        assert at_most[kind].size == MOTION.variable_sizes[kind]
+        steps.insert(key, 0.9 * at_most[kind])
+    keys = [X(3), V(3), B(3)]
+    assert not linearisation_error.any_moved_beyond(at_most, steps, keys)
+    assert not linearisation_error.any_moved_beyond(at_most, steps, [])
+    for kind, key in zip("xvb", keys, strict=True):
+        for row in range(at_most[kind].size):
+            off = gtsam.VectorValues(steps)
+            off.update(step_of(key, at_most[kind] * np.where(np.arange(at_most[kind].size) == row, -1.1, 0.9)))
+            assert linearisation_error.any_moved_beyond(at_most, off, keys)
+            assert not linearisation_error.any_moved_beyond(at_most, off, [other for other in keys if other != key])
+
+
+def step_of(key: int, step: np.ndarray) -> gtsam.VectorValues:
+    steps = gtsam.VectorValues()
+    steps.insert(key, step)
+    return steps
+
+
 def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
     rng = np.random.default_rng(0)
     sequence = simulate(replace(FLIGHT, duration_s=0.5), 0)
