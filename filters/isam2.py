@@ -1,11 +1,12 @@
 """Incremental full smoother: every state and landmark kept, re-solved only where new factors reach (iSAM2, GTSAM).
 
-What it approximates, frame by frame: a variable is relinearised once it has moved by a threshold, not at every
-iteration; what none of the last 30 frames has factors on is not relinearised at all, and after 60 its marginal stands
-in the tree for it; and each frame makes one Gauss-Newton step (Kaess et al. 2012, "iSAM2: Incremental smoothing and
-mapping using the Bayes tree"). Its causal answer is the newest state. For its final answer everything is linearised
-anew until the error stalls: that is the optimum of all it took in. A landmark that falls behind the camera, makes the
-system indeterminate, or is refused by more sightings than made it, where these agree, is dropped and the log says so.
+What it approximates, frame by frame: recent states are relinearised, all together, once one of them has moved by a
+threshold, and a landmark once its image is off, not at every iteration; what none of the last 30 frames has factors on
+is not relinearised at all, and after 60 its marginal stands in the tree for it; and each frame makes one Gauss-Newton
+step (Kaess et al. 2012, "iSAM2: Incremental smoothing and mapping using the Bayes tree"). Its causal answer is the
+newest state. For its final answer everything is linearised anew until the error stalls: that is the optimum of all it
+took in. A landmark that falls behind the camera, makes the system indeterminate, or is refused by more sightings than
+made it, where these agree, is dropped and the log says so.
 
 Where the rig states noise of tracks, what is new in each sighting of a track is a residual of two poses and its
 landmark (``filters/smoothing/chained_past.py``).

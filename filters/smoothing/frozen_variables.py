@@ -23,9 +23,9 @@ class FrozenVariables:
         self._frozen: set[int] = set()
         self.keys = gtsam.KeyList()
 
-    def contain_all(self, keys: Iterable[int]) -> bool:
-        """Say whether all of some variables are frozen."""
-        return self._frozen.issuperset(keys)
+    def others(self, keys: Iterable[int]) -> list[int]:
+        """Return those of some variables that are not frozen."""
+        return [key for key in keys if key not in self._frozen]
 
     def unused_for(self, frames: int) -> list[int]:
         """Return the listed keys that none of the last so many frames has factors on, or in view."""

@@ -14,12 +14,7 @@ from collections.abc import Iterable
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import (
-    CachedLinearisation,
-    cached_linearisations,
-    renewed,
-    with_linearisations,
-)
+from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
 from filters.smoothing.chained_past import ChainedPast, Places
 from filters.smoothing.frozen_variables import FrozenVariables
 from filters.smoothing.indeterminate import (
@@ -70,7 +65,7 @@ class Isam2Tree:
         self._tie_slots: list[int] = []
         # Whether anything leaves at all, and whether what had left was taken back and leaves again with the next frame.
         self._retired, self._retires, self._taken_back = RetiredVariables(), True, False
-        # The landmarks in the tree, and what of them, and beside chained sightings of all, is linearised anew next.
+        # The landmarks in the tree, and what is linearised anew next.
         self._landmarks, self._to_relinearise = set[int](), set[int]()
 
     def add(
@@ -88,17 +83,12 @@ class Isam2Tree:
         sees = any(kind_of(key) == "l" for key in list(values.keys()))
         self._recent.append(state_keys)
         self._frozen.add_frame([*factors.keyVector(), *(map(L, seen[0].track_ids.tolist()) if seen else ())])
-        cached = cached_linearisations(factors, lambda keys: self._first_values(keys, values))
-        watched = [
-            (slot, factor)
-            for slot, factor in self._cached.items()
-            if slot not in self._retired.slots and not self._frozen.contain_all(factor.keys)
-        ]
-        moved = renewed(watched, self.read)
-        factors, stale = with_linearisations(factors, cached), list[int]()
         if seen is not None and self._chained is not None:
             self._chained.add(*seen)
-            self._to_relinearise = self._moved_beside_chains()
+        self._to_relinearise = self._moved()
+        cached, moved = self._linearisations(factors, values)
+        factors, stale = with_linearisations(factors, cached), list[int]()
+        if seen is not None and self._chained is not None:
             renewal = self._chained.renewal(lambda keys: self._places(keys, values), self._slot_count + factors.size())
             factors.push_back(renewal.factors)
             for slot, landmark in renewal.replaced.items():
@@ -210,14 +200,27 @@ class Isam2Tree:
         values.insert(new.extract([key for key in keys if new.exists(key)]))
         return values
 
-    def _moved_beside_chains(self) -> set[int]:
+    def _moved(self) -> set[int]:
         """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
-        assert self._chained is not None
-        stay = {*self._frozen.keys, *self.isam.getFixedVariables(), *self._chained.settled}
-        states = [key for keys in self._recent for key in keys if key not in stay and self.has(key)]
-        at = self.isam.getLinearizationPoint().extract(states)
-        landmarks = {key for key in self._to_relinearise - stay if self.has(key)}
-        return landmarks.union(states if any_moved_beyond(self._at_most, self.read(states), at) else [])
+        fixed = {*self.isam.getFixedVariables(), *(self._chained.settled if self._chained is not None else ())}
+        told = [*(key for keys in self._recent for key in keys), *self._to_relinearise]
+        may_move = [key for key in self._frozen.others(told) if key not in fixed and self.has(key)]
+        states = [key for key in may_move if kind_of(key) != "l"]
+        return set(may_move).difference(() if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else states)
+
+    def _linearisations(
+        self, factors: gtsam.NonlinearFactorGraph, new: gtsam.Values
+    ) -> tuple[dict[int, CachedLinearisation], dict[int, CachedLinearisation]]:
+        """Return those of Python factors: of new ones, by place, and of old ones linearised anew, by slot."""
+        added = python_factors(factors)
+        states = self._to_relinearise - self._landmarks
+        stale = {slot: old for slot, old in self._cached.items() if not states.isdisjoint(old.keys)} if states else {}
+        of_factors = [*(factor.keys() for factor in added.values()), *(old.keys for old in stale.values())]
+        at = self._places(list(set().union(*of_factors)), new).linearised_at if of_factors else new
+        return (
+            {place: CachedLinearisation(factor, at.extract(factor.keys())) for place, factor in added.items()},
+            {slot: CachedLinearisation(old.factor, at.extract(old.keys)) for slot, old in stale.items()},
+        )
 
     def _places(self, keys: list[int], new: gtsam.Values) -> Places:
         """Return values of states and landmarks, and where the tree linearises them from this frame on."""
@@ -227,9 +230,9 @@ class Isam2Tree:
         return Places(estimates, at)
 
     def _held(self) -> gtsam.KeyList:
-        """Return what GTSAM is not to linearise anew; beside chained sightings every state that they do not expect."""
-        states = [key for keys in self._recent for key in keys] if self._chained is not None else []
-        return key_list([*self._frozen.keys, *(self._landmarks.union(states) - self._to_relinearise)])
+        """Return what GTSAM is not to linearise anew: all but what is told by key."""
+        others = self._landmarks.union(*self._recent) - self._to_relinearise
+        return key_list([*self._frozen.keys, *others, LAST])
 
     def _unchain(self, landmarks: list[int]) -> None:
         if self._chained is not None:
@@ -387,14 +390,9 @@ class Isam2Tree:
         self._solve_back()
 
     def _empty_tree(self) -> gtsam.ISAM2:
-        params, thresholds = gtsam.ISAM2Params(), gtsam.ISAM2ThresholdMap()
-        for kind, at_most in self._at_most.items():
-            # Beside chained sightings, as for landmarks, what is linearised anew is told by key.
-            thresholds.insert((kind, at_most if self._chained is None else np.zeros(at_most.size)))
-        thresholds.insert((kind_of(LAST), np.ones(1)))
-        # Which landmarks are linearised anew is told by key.
-        thresholds.insert(("l", np.zeros(3)))
-        params.setRelinearizeThreshold(thresholds)
+        params = gtsam.ISAM2Params()
+        # What is linearised anew is told by key.
+        params.setRelinearizeThreshold(0.0)
         params.relinearizeSkip = 1
         params.setFactorization(self._factorization)
         return gtsam.ISAM2(params)

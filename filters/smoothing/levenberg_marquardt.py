@@ -19,7 +19,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import CachedLinearisation, cached_linearisations, with_linearisations
+from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
 from filters.smoothing.indeterminate import variable_named
 from filters.smoothing.landmark_steps import LandmarkSteps
 from toolkit.errors import EstimatorError
@@ -135,9 +135,9 @@ def _solved(
 class _MixedGraph:
     """A graph of GTSAM's own factors and of Python's, which are linearised and evaluated one by one."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> None:
+    def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
         self._graph, self._native = graph, gtsam.NonlinearFactorGraph(graph)
-        self._python = {place: old.factor for place, old in cached_linearisations(graph, start.extract).items()}
+        self._python = python_factors(graph)
         for place in self._python:
             self._native.remove(place)
 
@@ -173,7 +173,7 @@ class _GraphSolver:
     """Takes the steps of a solve of factors alone, each by GTSAM's optimizer."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, ordering: gtsam.Ordering | None) -> None:
-        self._graph = _MixedGraph(graph, start)
+        self._graph = _MixedGraph(graph)
         self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph) if ordering is None else ordering
 
     def started(self, values: gtsam.Values, error: float) -> _OfGtsam:
@@ -230,7 +230,7 @@ class _LandmarkSolver:
     """Takes the steps of a solve with sightings beside the graph, of which the landmarks alone are damped."""
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, beside: Beside) -> None:
-        self._graph, self._beside = _MixedGraph(graph, start), beside
+        self._graph, self._beside = _MixedGraph(graph), beside
         self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
 
     def started(self, values: gtsam.Values, error: float) -> _WithLandmarks:

@@ -33,11 +33,11 @@ def state_thresholds(motion: MotionModel, baseline_m: float) -> dict[str, Array]
     return {kind: at_most[kind][-size:] for kind, size in motion.variable_sizes.items()}
 
 
-def any_moved_beyond(at_most: Mapping[str, Array], now: gtsam.Values, linearised_at: gtsam.Values) -> bool:
-    """Say whether any variable of states is beyond the thresholds from where it is linearised."""
-    steps = linearised_at.localCoordinates(now)
-    keys: list[int] = list(now.keys())
-    return any((np.abs(steps.at(key)) >= at_most[kind_of(key)]).any() for key in keys)
+def any_moved_beyond(at_most: Mapping[str, Array], steps: gtsam.VectorValues, keys: list[int]) -> bool:
+    """Say whether a variable of states is beyond the thresholds, a step in its tangent space from its linearisation."""
+    if not keys:
+        return False
+    return bool((np.abs(steps.vector(keys)) >= np.concatenate([at_most[kind_of(key)] for key in keys])).any())
 
 
 def linearised_badly(now: Array, linearised_at: Array, T_world_imu: Array, rig: StereoRig) -> BoolArray:

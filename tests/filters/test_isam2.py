@@ -1,5 +1,6 @@
 """iSAM2: the incremental answer is that of the whole problem, and the tree survives what would end GTSAM's."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby, pairwise
 
@@ -8,12 +9,10 @@ import numpy as np
 import pytest
 
 from filters.isam2 import Isam2
-from filters.smoothing import cached_linearisation, isam2_tree, linearisation_error
+from filters.smoothing import isam2_tree, linearisation_error
 from filters.smoothing.cached_linearisation import (
-    RENEW_BEYOND,
     CachedLinearisation,
-    cached_linearisations,
-    renewed,
+    python_factors,
     with_linearisations,
 )
 from filters.smoothing.frozen_variables import FrozenVariables
@@ -25,7 +24,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
-from toolkit.models.factors import B, L, V, X
+from toolkit.models.factors import B, L, V, X, kind_of
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
@@ -34,6 +33,8 @@ from toolkit.simulation.track_faults import cut_tracks, moving_objects
 
 MOTION = motion_model(FLIGHT.motion.noise, FLIGHT.gravity_world)
 STEP_BIAS = np.array([0.01, -0.02, 0.005])
+# What a pose is from itself, in its tangent space.
+ROUNDING = 1e-12
 
 
 def step_factor(k: int = 1) -> gtsam.CustomFactor:
@@ -79,21 +80,12 @@ def test_python_factors_only_are_replaced_and_keep_their_place(values):
     graph = gtsam.NonlinearFactorGraph()
     graph.addPriorPose3(X(0), values.atPose3(X(0)), gtsam.noiseModel.Unit.Create(6))
     graph.add(step_factor())
-    held = cached_linearisations(graph, values.extract)
-    assert list(held) == [1]
-    replaced = with_linearisations(graph, held)
+    found = python_factors(graph)
+    assert list(found) == [1]
+    replaced = with_linearisations(graph, {1: CachedLinearisation(found[1], values)})
     assert isinstance(replaced.at(0), gtsam.PriorFactorPose3)
     assert isinstance(replaced.at(1), gtsam.LinearContainerFactor)
     assert isinstance(graph.at(1), gtsam.CustomFactor), "the graph given stays as it was"
-
-
-@pytest.mark.parametrize(("far", "expected"), [(0.5, []), (2.0, [7])])
-def test_a_cached_factor_is_renewed_once_its_states_have_moved(values, far, expected):
-    pose = values.atPose3(X(1)).retract(np.array([0.0, 0.0, far * RENEW_BEYOND, 0.0, 0.0, 0.0]))
-    now = values_of(values.atPose3(X(0)), pose, values.atVector(B(0)))
-    new = renewed([(7, CachedLinearisation(step_factor(), values))], now.extract)
-    assert list(new) == expected
-    assert all(held.linearised_at.equals(now, 1e-12) for held in new.values())
 
 
 def pose_and_landmarks(landmarks: int, unseen: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -231,8 +223,7 @@ def test_what_none_of_the_last_frames_had_factors_on_is_frozen():
     for keys in ([X(3), L(2)], [X(4)], [X(5)]):
         frozen.add_frame(keys)
     assert list(frozen.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
-    assert frozen.contain_all([X(3), L(2)])
-    assert not frozen.contain_all([X(3), X(4)])
+    assert frozen.others([X(3), X(4), L(2), X(5)]) == [X(4), X(5)]
 
 
 def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
@@ -258,19 +249,35 @@ def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):
     assert not np.allclose(final.T_world_imu[1], points[-1].atPose3(X(1)).matrix(), atol=1e-9)
 
 
-def test_a_python_factor_whose_states_are_frozen_is_renewed_no_more(monkeypatch):
-    """With a threshold that any motion passes: the others are renewed in every frame."""
-    monkeypatch.setattr(cached_linearisation, "RENEW_BEYOND", 0.0)
-    sequence = simulate(replace(DRIVE, duration_s=4.0), 0)
-    estimator, before = isam2_of(sequence), dict[tuple[int, ...], CachedLinearisation]()
+def places_and_renewals(sequence: Sequence) -> Iterator[tuple[set[int], set[tuple[int, ...]], set[tuple[int, ...]]]]:
+    """Yield frame by frame which old states moved where they are linearised, and the old Python factors' keys.
+
+    Those of the factors that are as they were, and of those that are linearised anew.
+    """
+    estimator, before, at = isam2_of(sequence), dict[tuple[int, ...], CachedLinearisation](), gtsam.Values()
     for packet in sequence.packets():
         estimator.step(packet)
         now = {held.keys: held for held in estimator._tree._cached.values()}
+        places = gtsam.Values(estimator._tree.isam.getLinearizationPoint())
+        old = [key for key in places.keys() if at.exists(key) and kind_of(key) in "xb"]  # noqa: SIM118
+        steps = places.extract(old).localCoordinates(at.extract(old))
         kept = {keys for keys, held in before.items() if now[keys] is held}
-        # A frame freezes variables before it renews the others.
-        assert kept == {keys for keys in before if estimator._tree._frozen.contain_all(keys)}
-        before = now
-    assert kept
+        yield {key for key in old if np.abs(steps.at(key)).max() > ROUNDING}, kept, before.keys() - kept
+        before, at = now, places
+
+
+def test_recent_states_are_linearised_anew_together_and_python_factors_with_them(monkeypatch):
+    """One that moves alone would leave the others' factors with Jacobians of elsewhere; frozen ones stay."""
+    monkeypatch.setattr(linearisation_error, "POSITION_THRESHOLD_BASELINES", 0.02)
+    events = 0
+    for moved, kept, renewed in places_and_renewals(simulate(replace(DRIVE, duration_s=6.0), 0)):
+        assert all(not moved.isdisjoint(keys) for keys in renewed)
+        assert all(moved.isdisjoint(keys) for keys in kept)
+        poses = sorted(gtsam.Symbol(key).index() for key in moved if kind_of(key) == "x")
+        assert poses == list(range(poses[0], poses[-1] + 1)) if poses else not moved
+        assert len(poses) <= FROZEN_AFTER_FRAMES + 1
+        events += bool(renewed) and bool(kept)
+    assert events > 2, "so that some are frozen by then"
 
 
 @pytest.fixture
@@ -374,6 +381,28 @@ def test_what_a_recovery_takes_back_leaves_again_with_the_next_frame(monkeypatch
             assert estimator._tree._frozen.count % isam2_tree.RETIRING_EVERY_FRAMES
             assert not estimator._tree.has(X(0))
     assert_same_answers(estimates, expected)
+
+
+def test_one_state_beyond_the_threshold_of_its_kind_is_enough():
+    at_most, steps = linearisation_error.state_thresholds(MOTION, 0.1), gtsam.VectorValues()
+    for kind, key in zip("xvb", (X(3), V(3), B(3)), strict=True):
+        assert at_most[kind].size == MOTION.variable_sizes[kind]
+        steps.insert(key, 0.9 * at_most[kind])
+    keys = [X(3), V(3), B(3)]
+    assert not linearisation_error.any_moved_beyond(at_most, steps, keys)
+    assert not linearisation_error.any_moved_beyond(at_most, steps, [])
+    for kind, key in zip("xvb", keys, strict=True):
+        for row in range(at_most[kind].size):
+            off = gtsam.VectorValues(steps)
+            off.update(step_of(key, at_most[kind] * np.where(np.arange(at_most[kind].size) == row, -1.1, 0.9)))
+            assert linearisation_error.any_moved_beyond(at_most, off, keys)
+            assert not linearisation_error.any_moved_beyond(at_most, off, [other for other in keys if other != key])
+
+
+def step_of(key: int, step: np.ndarray) -> gtsam.VectorValues:
+    steps = gtsam.VectorValues()
+    steps.insert(key, step)
+    return steps
 
 
 def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share_of_the_noise():
