@@ -72,7 +72,6 @@ class Speeds:
 
     verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...]
-    tests: int
 
 
 def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
@@ -81,7 +80,7 @@ def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: P
     Raises BaselineError where the version cannot be had or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
-    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes, len(turns.timed))
+    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes)
 
 
 def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:

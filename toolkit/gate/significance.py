@@ -23,7 +23,7 @@ from scipy.special import stdtr, stdtrit
 
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
@@ -196,11 +196,6 @@ def holm(p_values: Array) -> Array:
     adjusted = np.empty_like(given)
     np.put_along_axis(adjusted, order, np.minimum(stepped, 1.0), axis=-1)
     return adjusted
-
-
-def rejected(p_values: Array, rate: float) -> BoolArray:
-    """Return which of m null hypotheses (..., m) fall at a family-wise false-alarm rate."""
-    return np.asarray(holm(p_values) <= rate)
 
 
 def smallest_seen(differences: Array, rate: float, power: float) -> float:
