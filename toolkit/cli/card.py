@@ -36,14 +36,14 @@ def command(options: argparse.Namespace) -> int:
     from toolkit.audit import faults
     from toolkit.documents import to_text
     from toolkit.experiment.recording import Recording, recording_card
-    from toolkit.files import check_file, replaced_file
+    from toolkit.files import check_writable, write_text
     from toolkit.progress import of_this_process
     from toolkit.report.card import card_record, card_text
     from toolkit.report.prose import width_of_output
     from toolkit.settings import settings_of
 
     if options.json is not None:
-        check_file(options.json)
+        check_writable(options.json)
     keep = kept_faults(options, faults())
     frontend = settings_of(with_tracks({}, options), "the command line").frontend
     recording = Recording(options.sequence, options.seed, keep=keep, max_frames=options.max_frames, frontend=frontend)
@@ -51,6 +51,5 @@ def command(options: argparse.Namespace) -> int:
         sequence, card = recording_card(recording, progress)
     print(card_text(sequence, card, width_of_output()))
     if options.json is not None:
-        with replaced_file(options.json) as file:
-            file.write_text(to_text(card_record(card)), encoding="utf-8")
+        write_text(options.json, to_text(card_record(card)))
     return 0
