@@ -47,8 +47,8 @@ def seeds_document(over: Comparison) -> Seeds:
         sequence=SequenceOfSeeds(
             name=over.name,
             source=over.source,
-            frames=over.frames_s.size,
-            duration_s=float(over.frames_s[-1]),
+            frames=over.sequence.frame_count,
+            duration_s=over.sequence.duration_s,
             motion=over.sequence.motion_kind,
         ),
         seeds=over.seeds,

@@ -24,7 +24,6 @@ from toolkit.report.figures.style import (
     new_figure,
     quiet,
 )
-from toolkit.resampling import NS_PER_S
 
 _CAPTION = (
     "How close to the limit. Black: the Cramér-Rao bound, one standard deviation (dashed: of what was known at the "
@@ -71,7 +70,7 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
 def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
-    colour, t_s = colour_of(comparison, row.estimator), _seconds(comparison, one)
+    colour, t_s = colour_of(comparison, row.estimator), comparison.sequence.elapsed_s(one.t_ns)
     line, label = line_of_estimator(comparison, row.estimator, _shown_as(row)), f"{row.estimator} {row.label}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
@@ -92,14 +91,10 @@ def _plot_bounds(
         one = next(one for row, one in found if row.output == output)
         sigma = scale * _sigma(one.bound, block)
         least = min(least, float(sigma.min()))
-        t_s, line = _seconds(comparison, one), line_of(output)
+        t_s, line = comparison.sequence.elapsed_s(one.t_ns), line_of(output)
         axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
     axes.set_yscale("log")
     axes.set_ylim(bottom=_LEAST_SHARE * least)
-
-
-def _seconds(comparison: Comparison, one: AgainstBound) -> Array:
-    return np.asarray((one.t_ns - int(comparison.sequence.frames_t_ns[0])) / NS_PER_S)
 
 
 def _sigma(covs: Array, block: slice) -> Array:

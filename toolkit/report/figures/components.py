@@ -10,6 +10,7 @@ from matplotlib.patches import Patch
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, plain_name
+from toolkit.geometry import Array
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import Components, components, last_good_answer
 from toolkit.report.figures.panels import COLOUR_OF
@@ -23,7 +24,6 @@ from toolkit.report.figures.style import (
     new_figure,
     quiet,
 )
-from toolkit.resampling import NS_PER_S
 
 _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
@@ -50,12 +50,11 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
     figure = new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
     what = _what(comparison)
-    start_ns = int(comparison.sequence.frames_t_ns[0])
     for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
         for i, axis in enumerate(_ROWS):
             axes = grid[i, column]
             for output, one in found.items():
-                _plot(axes, one, block.start + i, start_ns, "final" if both else output)
+                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, "final" if both else output)
             _limit(axes, found.values(), block.start + i, least)
             quiet(
                 axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
@@ -73,8 +72,8 @@ def _what(comparison: Comparison) -> str:
     return "error" if reference is None else f"difference from {reference.name}"
 
 
-def _plot(axes: Axes, one: Components, i: int, start_ns: int, shown_as: Output) -> None:
-    t_s, colour, line = (one.t_ns - start_ns) / NS_PER_S, COLOUR_OF[shown_as], line_of(shown_as)
+def _plot(axes: Axes, t_s: Array, one: Components, i: int, shown_as: Output) -> None:
+    colour, line = COLOUR_OF[shown_as], line_of(shown_as)
     if one.sigma is not None:
         band = _SIGMAS * one.sigma[:, i]
         if shown_as == "final":

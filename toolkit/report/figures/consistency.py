@@ -24,7 +24,6 @@ from toolkit.report.figures.panels import (
     tell_shares,
 )
 from toolkit.report.figures.style import BAND_COLOUR, NamedFigure, line_of
-from toolkit.resampling import NS_PER_S
 
 _OF_NEES = (
     "Pose NEES of one run over its 6 degrees of freedom: the squared error over the covariance that the estimator "
@@ -83,14 +82,15 @@ def _found(comparison: Comparison, of_row: Callable[[Comparison, Row], Normalise
 def _nees(comparison: Comparison, row: Row) -> Normalised:
     nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
     low, high = (np.full(nees.pose.size, side) for side in nees_band(POSE_DOF))
-    return Normalised((nees.t_ns - comparison.sequence.frames_t_ns[0]) / NS_PER_S, nees.pose, low, high)
+    return Normalised(comparison.sequence.elapsed_s(nees.t_ns), nees.pose, low, high)
 
 
 def _nis(comparison: Comparison, row: Row) -> Normalised:
-    found = nis_over_time(Evaluation(row.run, row.output, comparison.sequence))
+    evaluation = Evaluation(row.run, row.output, comparison.sequence)
+    found = nis_over_time(evaluation)
     low, high = found.bands()
-    t_ns = Evaluation(row.run, row.output, comparison.sequence).estimate.t_ns[found.rows]
-    return Normalised((t_ns - comparison.sequence.frames_t_ns[0]) / NS_PER_S, found.nis / found.expected, low, high)
+    t_s = comparison.sequence.elapsed_s(evaluation.estimate.t_ns[found.rows])
+    return Normalised(t_s, found.nis / found.expected, low, high)
 
 
 def _figure(

@@ -20,7 +20,6 @@ from toolkit.report.figures.style import (
     quiet,
     width_of,
 )
-from toolkit.resampling import NS_PER_S
 
 # A run that is not ok is drawn up to this many times the largest error of the runs that are.
 _ROOM_FOR_DIVERGED = 1.5
@@ -39,9 +38,8 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
 def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     figure = new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
-    start_ns = int(comparison.sequence.frames_t_ns[0])
     for row, errors in curves.of_rows:
-        t_s, width = (errors.t_ns - start_ns) / NS_PER_S, width_of(comparison, row.estimator)
+        t_s, width = comparison.sequence.elapsed_s(errors.t_ns), width_of(comparison, row.estimator)
         look = {
             "color": colour_of(comparison, row.estimator),
             "linestyle": line_of_estimator(comparison, row.estimator, row.output),

@@ -37,7 +37,7 @@ def _errors(over: Comparison) -> NamedFigure:
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
         kind = _shown_as(over, group)
-        axes, t_s, colour = panels[group.estimator], over.frames_s[known], COLOUR_OF[kind]
+        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], COLOUR_OF[kind]
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
         kinds.add(kind)
@@ -61,9 +61,9 @@ def _nees(over: Comparison) -> NamedFigure:
         if nees is None or _repeats(over, group):
             continue
         axes = panels[group.estimator]
-        axes.fill_between(over.frames_s, nees.low, nees.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
+        axes.fill_between(over.sequence.frames_s, nees.low, nees.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
         kind, shown = _shown_as(over, group), np.clip(nees.mean, *RANGE)
-        axes.plot(over.frames_s, shown, color=COLOUR_OF[kind], linestyle=line_of(kind), linewidth=1.0)
+        axes.plot(over.sequence.frames_s, shown, color=COLOUR_OF[kind], linestyle=line_of(kind), linewidth=1.0)
         shares.setdefault(group.estimator, []).append(nees.in_band_percent)
         least, most = np.nanmin([least, *shown, *nees.low]), np.nanmax([most, *shown, *nees.high])
         kinds.add(kind)
