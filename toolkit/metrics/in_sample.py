@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.residuals import median_px, reprojection_errors_px, rmse_px, scored_remark
@@ -58,9 +59,8 @@ def _errors_of_sightings(evaluation: Evaluation) -> tuple[IntArray, Array]:
     if not len(landmarks):
         raise Unavailable("the estimator has no landmarks")
     observations = evaluation.sequence.visible
-    row = np.minimum(np.searchsorted(landmarks.track_ids, observations.track_id), len(landmarks) - 1)
-    known = (landmarks.track_ids[row] == observations.track_id) & evaluation.has_pose[observations.frame]
-    known &= _seen_again(observations.track_id)
+    row, has_landmark = rows_of(observations.track_id, landmarks.track_ids)
+    known = has_landmark & evaluation.has_pose[observations.frame] & _seen_again(observations.track_id)
     T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)
