@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable
@@ -23,6 +22,7 @@ from toolkit.report.figures.style import (
     line_of_estimator,
     new_figure,
     quiet,
+    shown_as,
 )
 
 _CAPTION = (
@@ -63,7 +63,7 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
         Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))
         for output in dict.fromkeys(row.output for row, _ in found)
     ]
-    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, _shown_as(row)) for row, _ in found]))
+    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found]))
     return NamedFigure("against_bound", _CAPTION, figure)
 
 
@@ -71,15 +71,10 @@ def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
     colour, t_s = colour_of(comparison, row.estimator), comparison.sequence.elapsed_s(one.t_ns)
-    line, label = line_of_estimator(comparison, row.estimator, _shown_as(row)), f"{row.estimator} {row.label}"
+    line, label = line_of_estimator(comparison, row.estimator, shown_as(row)), f"{row.estimator} {row.label}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
     axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=0.7)
-
-
-def _shown_as(row: Row) -> Output:
-    """Return the output whose line a row has: a filter's only answer is drawn as a final one."""
-    return "final" if row.label == "both" else row.output
 
 
 def _plot_bounds(

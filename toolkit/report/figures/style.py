@@ -14,7 +14,7 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from toolkit.estimate import Output
-from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.comparison import Comparison, Row
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -61,6 +61,11 @@ def line_of_estimator(comparison: Comparison, estimator: str, output: Output) ->
     order = [run.estimator for run in comparison.runs]
     styles = _LINE_OF[output]
     return styles[order.index(estimator) // len(_COLOURS) % len(styles)]
+
+
+def shown_as(row: Row) -> Output:
+    """Return the kind of output whose line a row has: a filter's only answer is drawn as a final one."""
+    return "final" if row.label == "both" else row.output
 
 
 def width_of(comparison: Comparison, estimator: str) -> float:
