@@ -28,14 +28,13 @@ import numpy as np
 from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress
 
 R = TypeVar("R")
 
 # A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
-    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
-}
+_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
 _PARENT_POLL_S = 1.0
 T = TypeVar("T")
 Work = Callable[[T, Progress], R]

@@ -26,15 +26,15 @@ from scipy.special import ndtri
 
 from toolkit.errors import printable
 from toolkit.gate import timing_child
-from toolkit.gate.baseline import Baseline, BaselineError, Case
+from toolkit.gate.baseline import SPEED, Baseline, BaselineError, Case
 from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import ProgressFor
 from toolkit.settings import changes_of
 
-SPEED = "speed"
 # Slower by 5 % is nobody's concern; slower by 15 % must be seen.
 MARGIN, TO_SEE = 0.05, 0.15
 FEWEST_PAIRS, MOST_PAIRS = 16, 60
@@ -190,7 +190,7 @@ def timers(*paths: Sequence[Path]) -> Iterator[tuple[Process, ...]]:
 
 
 def _environment(path: Sequence[Path]) -> dict[str, str]:
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    single = dict.fromkeys(THREAD_VARIABLES, "1")
     before = os.environ.get("PYTHONPATH")
     return {**os.environ, **single, "PYTHONPATH": os.pathsep.join([*map(str, path), *([before] if before else [])])}
 

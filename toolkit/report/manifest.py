@@ -18,11 +18,12 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
 
 _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
+_THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")
 
 
 def manifest_document(comparison: Comparison, command: str, asked: Configuration) -> Manifest:

@@ -23,8 +23,11 @@ BAND_PROBABILITY = 0.95
 # The scatter of a run is told by what four in five of its steps change by, at least so many: 1.28 standard deviations.
 _USUAL_SHARE, _USUAL_SIGMAS, _FEWEST_FRAMES = 0.8, 1.2816, 20
 INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
-# A prior this improbable under its own covariance is expressed in another world frame than the truth.
-_OTHER_WORLD = 1e-6
+# A first pose this improbable under its own covariance is expressed in another world frame than the truth.
+OTHER_WORLD = 1e-6
+PLACED = "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
+NOT_MET = "no pose has a true one at its time"
+NOT_PLACED = "the estimate has its own world frame, and the truth has no pose for its first one"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +174,11 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
     reached, true_poses = truth_at(estimate.t_ns[usable], truth, frame_period_ns)
     rows = usable[reached]
     if not rows.size:
-        raise Unavailable("no pose has a true one at its time")
+        raise Unavailable(NOT_MET)
     poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
     if placed:
         if rows[0] != 0:
-            raise Unavailable("the estimate has its own world frame, and the truth has no pose for its first one")
+            raise Unavailable(NOT_PLACED)
         place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
         poses = place(true_poses[0], poses[0]).apply(poses)
     return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, poses, placed)
@@ -190,7 +193,7 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
     if not reached.any():
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
-    return float(normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - _OTHER_WORLD, POSE_DOF)
+    return float(normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - OTHER_WORLD, POSE_DOF)
 
 
 def stated_errors(evaluation: Evaluation) -> StatedErrors:
