@@ -74,6 +74,14 @@ class Outcome:
     files: Mapping[str, str] = field(default_factory=dict)
     arithmetic: Arithmetic | None = None
 
+    @property
+    def why(self) -> str:
+        """Return in one line why the run did not end well; nothing where it did, or its log does not say."""
+        if self.status == "ok" or not self.log:
+            return ""
+        # A run that failed begins with the reason; the runner appends what diverged to the estimator's log.
+        return " ".join(self.log[0 if self.status == "failed" else -1].split())
+
 
 def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
     """Return what computed in some outcomes of an estimator; None where it has NumPy alone, or never ran."""

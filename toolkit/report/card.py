@@ -7,7 +7,7 @@ from msgspec import UNSET
 
 from toolkit.documents import number, rounded
 from toolkit.geometry import Array
-from toolkit.report.messages import sequence_line
+from toolkit.report.header import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.records.card import CardRecord
 from toolkit.report.table import MISSING, Table, as_text

@@ -24,13 +24,12 @@ from toolkit.report.curves import (
     shown_output,
     truth_during,
 )
+from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
-    header_lines,
     note_lines,
     outcome,
     remark_lines,
-    sequence_line,
 )
 from toolkit.report.records.report import (
     AuditWords,

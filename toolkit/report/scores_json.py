@@ -9,6 +9,7 @@ from msgspec import UNSET, UnsetType
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.metrics import Metric, describe, known_metrics
+from toolkit.report.curves import truth_during
 from toolkit.report.records.scores import (
     AuditEntry,
     Judged,
@@ -71,10 +72,8 @@ def path_length_m(sequence: Sequence) -> float | None:
     """Return the length of the true path while the camera ran, or None without truth or frames."""
     if sequence.truth is None or not sequence.frame_count:
         return None
-    t_ns = sequence.truth.t_ns
-    during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
-    positions = sequence.truth.T_world_imu[during, :3, 3]
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    truth = truth_during(sequence)
+    return 0.0 if truth is None else float(np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
 
 
 def _sequence(sequence: Sequence) -> SequenceRead:
