@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     Interrupted,
+    UsageError,
     add_estimators_argument,
     add_part_arguments,
     add_repair_arguments,
@@ -26,7 +27,7 @@ from toolkit.cli.arguments import (
     names,
     with_tracks,
 )
-from toolkit.errors import printable
+from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -216,8 +217,6 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.cli.arguments import UsageError
-    from toolkit.errors import VislamError
     from toolkit.report.table import columns_asked
 
     try:
@@ -265,7 +264,6 @@ def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
 
 def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
     """Return the plan with where it is run."""
-    from toolkit.cli.arguments import UsageError
 
     if options.scheduler is not None and options.workers is not None:
         raise UsageError("--scheduler and --workers exclude each other: a cluster has its own workers")
@@ -274,7 +272,6 @@ def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
 
 def _plan(asked: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
-    from toolkit.cli.arguments import UsageError
     from toolkit.estimator import defaults
     from toolkit.experiment import Plan
     from toolkit.experiment.recording import Part
@@ -306,7 +303,6 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     """Raise UsageError for a trajectory whose name stands for something else."""
     if not trajectories:
         return
-    from toolkit.cli.arguments import UsageError
     from toolkit.estimator import find_all
     from toolkit.experiment.comparison import plain_name
     from toolkit.report.export import TRUTH
