@@ -18,8 +18,8 @@ from toolkit.metrics._shared.consistency import (
     OTHER_WORLD,
     PLACED,
     chi2_quantile,
-    normalised,
 )
+from toolkit.models.gating import mahalanobis_squared
 
 _KEYS = ("nees_ori_mean", "nees_pos_mean")
 _NONE = "the file states no covariance"
@@ -62,7 +62,7 @@ def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level:
 def _nees(true: Array, poses: Array, cov_orientation: Array, cov_position: Array) -> tuple[Array, Array]:
     turned = so3_log((se3_inverse(poses) @ true)[:, :3, :3])
     moved = true[:, :3, 3] - poses[:, :3, 3]
-    return normalised(turned, cov_orientation) / 3.0, normalised(moved, cov_position) / 3.0
+    return mahalanobis_squared(turned, cov_orientation) / 3.0, mahalanobis_squared(moved, cov_position) / 3.0
 
 
 def _least_eigenvalue(cov: Array) -> Array:

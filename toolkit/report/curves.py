@@ -66,8 +66,7 @@ def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
     """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
     fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
     try:
-        pairs = Evaluation(run, output, sequence).compared
-        return fit(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+        return fit(*Evaluation(run, output, sequence).compared.positions)
     except Unavailable:
         return NOT_ALIGNED
 

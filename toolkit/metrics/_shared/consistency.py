@@ -15,6 +15,7 @@ from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.association import finite_poses, median_period_ns, truth_at
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import Sequence
 
 POSE_DOF = 6
@@ -193,7 +194,8 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
     if not reached.any():
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
-    return float(normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - OTHER_WORLD, POSE_DOF)
+    off = float(mahalanobis_squared(error[None], prior.cov[None, :6, :6])[0])
+    return off < chi2_quantile(1.0 - OTHER_WORLD, POSE_DOF)
 
 
 def stated_errors(evaluation: Evaluation) -> StatedErrors:
@@ -227,14 +229,8 @@ def nees_over_time(evaluation: Evaluation) -> Nees:
     xi = se3_log(errors.T_estimate_truth)
     return Nees(
         errors.t_ns,
-        normalised(xi, pose_cov) / POSE_DOF,
-        normalised(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
-        normalised(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
+        mahalanobis_squared(xi, pose_cov) / POSE_DOF,
+        mahalanobis_squared(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
+        mahalanobis_squared(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
         errors.placed,
     )
-
-
-def normalised(errors: Array, cov: Array) -> Array:
-    """Return e^T P^-1 e (n,) of errors (n, d) with covariances (n, d, d)."""
-    solved = np.linalg.solve(cov, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ni,ni->n", errors, solved))

@@ -52,8 +52,7 @@ class AgainstTruth:
     @cached_property
     def se3_alignment(self) -> Alignment:
         """The rigid motion that fits the estimated positions to the true ones."""
-        pairs = self.compared
-        return fit_se3(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+        return fit_se3(*self.compared.positions)
 
 
 @dataclass(frozen=True, eq=False)
