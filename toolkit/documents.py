@@ -10,10 +10,10 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import msgspec
-from msgspec import inspect
+from msgspec import Meta, inspect
 
 from toolkit.errors import DataError, VislamError
 from toolkit.geometry import Array
@@ -22,6 +22,9 @@ from toolkit.inputs import read_input
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
 Older = Mapping[str, Callable[[Json], Json]]
+Count = Annotated[int, Meta(ge=0)]
+# Of a metric; a count stays an integer when it is read and written again.
+Value = int | float | None
 
 _DIGITS = 6
 # What msgspec calls a type, in JSON's words.

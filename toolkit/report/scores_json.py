@@ -6,6 +6,7 @@ from dataclasses import asdict, fields
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from toolkit.documents import Value, of_attributes
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.metrics import Metric, describe, known_metrics
@@ -22,7 +23,6 @@ from toolkit.report.records.scores import (
     Seeds,
     SequenceOfSeeds,
     SequenceRead,
-    Value,
     WholeRuns,
 )
 from toolkit.sequence import Sequence
@@ -33,9 +33,7 @@ def metrics_document(comparison: Comparison) -> Metrics:
     return Metrics(
         schema="vislam.metrics/1",
         sequence=_sequence(comparison.sequence),
-        audit=tuple(
-            AuditEntry(fault=f.fault, count=f.count, repaired=f.repaired, detail=f.detail) for f in comparison.findings
-        ),
+        audit=tuple(of_attributes(AuditEntry, finding) for finding in comparison.findings),
         undecided=dict(comparison.undecided),
         runs=tuple(_run(row) for row in comparison.rows),
     )
@@ -57,9 +55,7 @@ def seeds_document(over: Comparison) -> Seeds:
         start=over.prior.source,
         estimators=over.estimators,
         runs=tuple(_run_over_seeds(group, over) for group in over.rows),
-        log=tuple(
-            LogEntry(estimator=o.estimator, seed=o.seed, status=o.status, log=o.log) for o in over.outcomes if o.log
-        ),
+        log=tuple(of_attributes(LogEntry, outcome) for outcome in over.outcomes if outcome.log),
     )
 
 
