@@ -163,7 +163,7 @@ def command(options: argparse.Namespace) -> int:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
-        open_files.enter_context(_told_where_to_go_on(stores))
+        open_files.enter_context(_kept_when_interrupted(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
             if not (options.json or options.quiet):
@@ -186,7 +186,7 @@ def _made_by(options: argparse.Namespace, asked: Configuration) -> MadeBy:
 
 
 @contextmanager
-def _told_where_to_go_on(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
+def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
     """Say what of the kept outcomes is of no use and, after an interrupt, where others are; close them in the end.
 
     Raises Interrupted in the place of KeyboardInterrupt where any outcome is kept.

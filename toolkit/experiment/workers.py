@@ -197,9 +197,9 @@ class Workers:
             handing_out: _HandingOut[R] = _HandingOut(self._processes, tasks, [needs(unit) for unit in units])
             progress.advance(0, board.total)
             try:
-                for place, result in handing_out.results(lambda: progress.advance(*board.told())):
+                for place, result in handing_out.results(lambda: progress.advance(*board.progress())):
                     board.finish(place)
-                    progress.advance(*board.told())
+                    progress.advance(*board.progress())
                     yield place, result
             finally:
                 handing_out.stop()
@@ -333,7 +333,7 @@ class _Board:
         """Count a unit as done."""
         self._under_way[place] = False
 
-    def told(self) -> tuple[int, int, str]:
+    def progress(self) -> tuple[int, int, str]:
         """Return the steps that are done, of how many, and what the first smoother that has come to its end does."""
         entries = np.array(self._entries[: self._under_way.size])[self._under_way]
         shares = _share_done(entries["stages"], entries["done"], entries["total"])

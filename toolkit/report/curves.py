@@ -33,14 +33,14 @@ class Errors(NamedTuple):
     heading_deg: Array
 
 
-class Answer(NamedTuple):
+class ReferenceEstimate(NamedTuple):
     """A trajectory that others are measured against where there is no truth, and how to call it."""
 
     name: str
     trajectory: Trajectory
 
 
-def last_good_answer(comparison: Comparison) -> Answer | None:
+def reference_estimate(comparison: Comparison) -> ReferenceEstimate | None:
     """Return the last trajectory made here of a run that is ok: with the defaults, the smoother's.
 
     Only where there is none is it one that was read from a file; None where no run is ok.
@@ -49,7 +49,7 @@ def last_good_answer(comparison: Comparison) -> Answer | None:
     for row in reversed(made_here_last):
         trajectory = row.run.trajectory(row.output)
         if row.status == "ok" and trajectory is not None:
-            return Answer(f"{row.estimator} {row.output}", trajectory)
+            return ReferenceEstimate(f"{row.estimator} {row.output}", trajectory)
     return None
 
 
@@ -122,7 +122,7 @@ class ErrorCurves(NamedTuple):
 
 def error_curves(comparison: Comparison) -> ErrorCurves | None:
     """Return every row's errors (with truth) or differences (without), or None where no row has any."""
-    reference = _truth(comparison) or _answer(comparison)
+    reference = _from_truth(comparison) or _from_estimate(comparison)
     if reference is None:
         return None
     curves: list[tuple[Row, Errors]] = []
@@ -138,7 +138,7 @@ def error_curves(comparison: Comparison) -> ErrorCurves | None:
     return ErrorCurves(curves, reference.what, reference.caption) if curves else None
 
 
-def _truth(comparison: Comparison) -> _Reference | None:
+def _from_truth(comparison: Comparison) -> _Reference | None:
     sequence = comparison.sequence
     truth = truth_during(sequence)
     if truth is None:
@@ -150,16 +150,16 @@ def _truth(comparison: Comparison) -> _Reference | None:
     return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
 
 
-def _answer(comparison: Comparison) -> _Reference | None:
-    answer = last_good_answer(comparison)
-    if answer is None:
+def _from_estimate(comparison: Comparison) -> _Reference | None:
+    estimate = reference_estimate(comparison)
+    if estimate is None:
         return None
     caption = (
-        f"There is no truth: position and heading difference from {answer.name}, not aligned. "
+        f"There is no truth: position and heading difference from {estimate.name}, not aligned. "
         "A difference says that two estimators disagree, not which of them is right."
     )
-    as_truth = Truth(answer.trajectory.t_ns, answer.trajectory.T_world_imu)
-    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {answer.name}", caption, answer.trajectory)
+    as_truth = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
+    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {estimate.name}", caption, estimate.trajectory)
 
 
 class Components(NamedTuple):
@@ -175,7 +175,7 @@ class Components(NamedTuple):
 
 
 def components(comparison: Comparison, row: Row) -> Components | None:
-    """Return the errors of an output as the NEES takes them, or without truth its difference from the last answer.
+    """Return the errors of an output as the NEES takes them, or without truth its difference from the last estimate.
 
     Returns None where there is neither.
     """
@@ -193,7 +193,7 @@ def components(comparison: Comparison, row: Row) -> Components | None:
 
 
 def _difference(comparison: Comparison, row: Row) -> Components | None:
-    reference, trajectory = last_good_answer(comparison), row.run.trajectory(row.output)
+    reference, trajectory = reference_estimate(comparison), row.run.trajectory(row.output)
     if reference is None or trajectory is None or trajectory is reference.trajectory:
         return None
     t_ns, mine, theirs = np.intersect1d(trajectory.t_ns, reference.trajectory.t_ns, return_indices=True)

@@ -88,13 +88,13 @@ def sequences_table(evaluation: Evaluation) -> Table:
     rows, best = [], set()
     for i, sequence in enumerate(evaluation.sequences):
         cells = [evaluation.cells[system, sequence] for system in systems]
-        rows.append((sequence, *(_told(one, metric) for one in cells)))
+        rows.append((sequence, *(_median_and_failures(one, metric) for one in cells)))
         if len(systems) > 1:
             best |= {(i, 1 + j) for j in _best([one.median(metric) for one in cells], metric)}
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
-def _told(runs: Cell, metric: Metric) -> str:
+def _median_and_failures(runs: Cell, metric: Metric) -> str:
     """Return the median of the runs of a system on a sequence, and how many of them failed."""
     failed = f"{runs.failed} of {len(runs.runs)} failed" if runs.failed else ""
     median = runs.median(metric)

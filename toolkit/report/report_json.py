@@ -149,8 +149,8 @@ def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
         rotation=(_vector(rotation[0]), _vector(rotation[1]), _vector(rotation[2])),
         translation_m=_vector(translation_m),
         errors=None if errors is None else _errors(errors, comparison.sequence),
-        nees=_told_or_why(_nees, row, comparison),
-        nis=_told_or_why(_nis, row, comparison),
+        nees=_series_or_reason(_nees, row, comparison),
+        nis=_series_or_reason(_nis, row, comparison),
         components=UNSET if row.repeats_causal else _components(row, comparison),
     )
 
@@ -169,7 +169,7 @@ def _errors(errors: Errors, sequence: Sequence) -> ErrorSeries:
     )
 
 
-def _told_or_why(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
+def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
     """Return a series, or in words why there is none."""
     if row.run.trajectory(row.output) is None:
         return "the run gave no trajectory"

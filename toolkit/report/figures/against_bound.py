@@ -21,8 +21,8 @@ from toolkit.report.figures.style import (
     line_of,
     line_of_estimator,
     new_figure,
-    quiet,
     shown_as,
+    style_axes,
 )
 
 _CAPTION = (
@@ -56,8 +56,8 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
         for row, one in found:
             _plot_estimator(axes, comparison, row, one, block, scale)
         _plot_bounds(axes, comparison, found, block, scale)
-    quiet(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
-    quiet(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
+    style_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
+    style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     bounds = [
         Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))

@@ -12,7 +12,7 @@ from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.geometry import Array
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.curves import Components, components, last_good_answer
+from toolkit.report.curves import Components, components, reference_estimate
 from toolkit.report.figures.panels import COLOUR_OF
 from toolkit.report.figures.style import (
     TITLE_PT,
@@ -22,7 +22,7 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of,
     new_figure,
-    quiet,
+    style_axes,
 )
 
 _SIGMAS = 3.0
@@ -56,7 +56,7 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
             for output, one in found.items():
                 _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, "final" if both else output)
             _limit(axes, found.values(), block.start + i, least)
-            quiet(
+            style_axes(
                 axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
             )
     grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
@@ -68,7 +68,7 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
 
 def _what(comparison: Comparison) -> str:
     """Return how to call what is drawn: the error, or without truth the difference from whom."""
-    reference = None if comparison.sequence.truth is not None else last_good_answer(comparison)
+    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
     return "error" if reference is None else f"difference from {reference.name}"
 
 
@@ -109,7 +109,7 @@ def _caption(comparison: Comparison, name: str) -> str:
     """Say what the panels show and how the band is to be read."""
     axes = "by component along and about the world's axes, z up"
     if comparison.sequence.truth is None:
-        reference = last_good_answer(comparison)
+        reference = reference_estimate(comparison)
         of_whom = "" if reference is None else f" from {reference.name}"
         return (
             f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "

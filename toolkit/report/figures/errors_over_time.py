@@ -17,7 +17,7 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of_estimator,
     new_figure,
-    quiet,
+    style_axes,
     width_of,
 )
 
@@ -46,8 +46,8 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
         }
         position.plot(t_s, errors.position_m, linewidth=width, **look)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
-    quiet(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
-    quiet(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
+    style_axes(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
+    style_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
     _limit_position(position, curves.of_rows)
     low, high = heading.get_ylim()
     heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))

@@ -24,7 +24,7 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of,
     new_figure,
-    quiet,
+    style_axes,
 )
 
 # Okabe & Ito (2008). In panels of one estimator the colour tells the output.
@@ -47,7 +47,7 @@ def panels_of(names: Sequence[str], x_label: str = "time [s]") -> tuple[Figure, 
         axes.set_axis_off()
     panels = dict(zip(names, grid, strict=False))
     for name, axes in panels.items():
-        quiet(axes, name, "", "")
+        style_axes(axes, name, "", "")
     # A panel with nothing below it has the numbers of the axis, too.
     for axes in grid[: len(names)][-columns:]:
         axes.tick_params(labelbottom=True)
@@ -128,14 +128,14 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
         words = ", ".join(f"{percent:.0f} %" for percent in percents)
-        tell(panels, estimator, (f"{words} in band", words))
+        annotate(panels, estimator, (f"{words} in band", words))
     scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
     return figure
 
 
-def tell(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
-    """Say something in the upper right of a panel, above the data: the first of the words for which there is room."""
+def annotate(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
+    """Write above a panel, to the right: the first of the words for which there is room."""
     room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
     told = next((one for one in words if len(name) + len(one) <= room), words[-1])
     panels[name].set_title(told, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)

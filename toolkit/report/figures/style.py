@@ -81,7 +81,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
-def quiet(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     """Label axes (with units), draw a light grid behind the data and no frame on the open sides."""
     axes.set_title(title, fontsize=TITLE_PT, loc="left")
     axes.set_xlabel(x_label, fontsize=LABEL_PT)
