@@ -31,17 +31,15 @@ from loky.process_executor import BrokenProcessPool
 from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress
 
-R = TypeVar("R")
-
-# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
-_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
-_PARENT_POLL_S = 1.0
 T = TypeVar("T")
+R = TypeVar("R")
 Work = Callable[[T, Progress], R]
 # What a process keeps ready for the units for which this is equal; None where it is nothing.
 Needs = Callable[[T], Hashable]
 
-_POLL_S = 0.1
+# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
+_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
+_PARENT_POLL_S, _POLL_S = 1.0, 0.1
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.

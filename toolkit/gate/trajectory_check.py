@@ -13,7 +13,7 @@ from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import place_of
-from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, holm, percent_text
+from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, geometric_mean, holm, percent_text
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, ScoredSequence, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
 from toolkit.gate.verdict import Check, Finding, Verdict
@@ -209,7 +209,7 @@ def _tested(
     where = one.where
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, words,
-        before=float(np.exp(np.log(one.before).mean())), after=float(np.exp(np.log(one.after).mean())),
+        before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
         seen_percent=100.0 * float(np.expm1(spread.seen(one.margin, each))),
     )  # fmt: skip

@@ -18,6 +18,7 @@ from toolkit.track_errors import Card
 _MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
 # A scale is off where it is so many standard errors and so much away from one.
 _SIGMAS, _SCALE_OFF = 3.0, 0.005
+_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
 
 
 def card_lines(card: Card) -> Iterator[str]:
@@ -45,9 +46,6 @@ def card_lines(card: Card) -> Iterator[str]:
             "on the measured motion alone, and no smoother repairs what that gets wrong"
         )
     yield from _scale(card)
-
-
-_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
 
 
 def _noise(card: Card) -> str:
