@@ -20,8 +20,8 @@ from toolkit.frontend.tracking import read_pairs
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import errors_left_out
+from toolkit.report.curves import seconds
 from toolkit.report.records.report import CameraFrame, TrackErrors
-from toolkit.report.report_json import seconds
 from toolkit.sequence import Sequence
 
 FOLDER = "frames"

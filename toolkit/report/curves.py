@@ -21,6 +21,7 @@ from toolkit.metrics._shared.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.sequence import Sequence, Truth
 
+_MICROSECONDS = 6
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
 
 
@@ -92,6 +93,11 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
         np.linalg.norm(aligned[:, :3, 3] - pairs.truth[:, :3, 3], axis=1),
         np.degrees((heading + np.pi) % (2.0 * np.pi) - np.pi),
     )
+
+
+def seconds(sequence: Sequence, t_ns: IntArray) -> tuple[float, ...]:
+    """Return stamps (N,) as seconds from the first frame, to the microsecond."""
+    return tuple(round(t, _MICROSECONDS) for t in sequence.elapsed_s(t_ns).tolist())
 
 
 def shown_output(run: Run) -> Output:

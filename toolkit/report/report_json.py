@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType
 from toolkit.documents import number, numbers, rounded
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
@@ -21,6 +21,7 @@ from toolkit.report.curves import (
     components,
     error_curves,
     onto_truth,
+    seconds,
     shown_output,
     truth_during,
 )
@@ -54,7 +55,6 @@ from toolkit.sequence import Sequence
 
 TRUTH_FILE = "trajectories/truth.tum"
 
-_MICROSECONDS = 6
 
 Series = TypeVar("Series", NeesSeries, NisSeries)
 
@@ -253,8 +253,3 @@ def _rms_over_runs(errors: Array) -> Array:
     known = np.isfinite(errors)
     total, count = np.where(known, errors, 0.0) ** 2, known.sum(axis=0)
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
-
-
-def seconds(sequence: Sequence, t_ns: IntArray) -> tuple[float, ...]:
-    """Return stamps (N,) as seconds from the first frame, to the microsecond."""
-    return tuple(round(t, _MICROSECONDS) for t in sequence.elapsed_s(t_ns).tolist())
