@@ -5,8 +5,8 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.residuals import median_px, reprojection_errors_px, rmse_px, scored_remark
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import pixel_scores, reprojection_errors_px
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 from toolkit.models import stereo
 
 ORDER = 50
@@ -31,10 +31,8 @@ METRICS = (
 
 def score(evaluation: Evaluation) -> Scores:
     """Score the reprojection of the run's landmarks from the evaluated poses."""
-    errors_px = errors(evaluation)
-    scores = evaluate({"reproj_median_px": lambda: median_px(errors_px), "reproj_rmse_px": lambda: rmse_px(errors_px)})
     lacking = "lack a landmark, a second sighting or a pose of their frame"
-    return scores.remarked(scores.values, scored_remark(errors_px, len(evaluation.sequence.visible), lacking))
+    return pixel_scores("reproj", errors(evaluation), len(evaluation.sequence.visible), lacking)
 
 
 def errors(evaluation: Evaluation) -> Array:
