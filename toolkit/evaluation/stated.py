@@ -34,7 +34,7 @@ def nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) 
     try:
         return _scores(file.covariances, estimate, truth, level=level)
     except Unavailable as reason:
-        return Scores(dict.fromkeys(_KEYS), dict.fromkeys(_KEYS, str(reason)))
+        return Scores.none(_KEYS, str(reason))
 
 
 def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level: bool) -> Scores:

@@ -140,8 +140,7 @@ class Row:
         scored = self.outcomes[0].outputs.get(self.output)
         if scored is not None:
             return scored.scores
-        keys = describe()
-        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
+        return Scores.none(describe(), "the run gave no trajectory")
 
     @property
     def answered(self) -> bool:
