@@ -32,7 +32,7 @@ from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
 from toolkit.linear_algebra import THREAD_VARIABLES
-from toolkit.progress import ProgressFor
+from toolkit.progress import Progress, ProgressFor
 from toolkit.settings import changes_of
 
 # Slower by 5 % is nobody's concern; slower by 15 % must be seen.
@@ -87,7 +87,7 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
     """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    found: list[TimedPairs] = []
+    timed: list[TimedPairs | str] = []
     notes: list[str] = []
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
         lacking = _lacking(version, sides, names)
@@ -97,11 +97,9 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
             present = [name for name in case.estimators if name not in lacking]
             with progress_for(f"{case.source}: speed against {version}") as progress:
                 _prepare(sides, case, baseline)
-                for done, name in enumerate(present):
-                    progress.advance(done, len(present))
-                    timed = _time(sides, case.source, name)
-                    (found if isinstance(timed, TimedPairs) else notes).append(timed)  # type: ignore[arg-type]
-    return Turns(tuple(found), tuple(notes))
+                timed += _timed(sides, case.source, present, progress)
+    notes += [why for why in timed if isinstance(why, str)]
+    return Turns(tuple(one for one in timed if isinstance(one, TimedPairs)), tuple(notes))
 
 
 def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
@@ -219,6 +217,15 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
             duration_s=min(LONGEST_S, case.duration_s or LONGEST_S),
             settings=changes_of(baseline.settings),
         )
+
+
+def _timed(
+    sides: Sequence[Process], source: str, estimators: Sequence[str], progress: Progress
+) -> Iterator[TimedPairs | str]:
+    """Yield the times of each estimator on the recording that is ready, or why it has none."""
+    for done, name in enumerate(estimators):
+        progress.advance(done, len(estimators))
+        yield _time(sides, source, name)
 
 
 def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | str:

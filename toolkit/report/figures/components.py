@@ -36,12 +36,8 @@ _LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield a figure for each estimator with a trajectory that has something to be compared with."""
     for run in comparison.runs:
-        found: dict[Output, Components] = {}
-        for row in comparison.rows:
-            if row.run is run and not row.repeats_causal:
-                one = components(comparison, row)
-                if one is not None:
-                    found[row.output] = one
+        rows = [row for row in comparison.lines if row.run is run]
+        found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
         if found:
             yield _figure(comparison, run.estimator, run.final_is_causal, found)
 
