@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toolkit.errors import OutputError
-from toolkit.files import content_digest, replaced_file, uninterrupted
+from toolkit.files import check_writable, content_digest, replaced_file, uninterrupted
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,19 @@ def test_of_a_link_the_file_behind_it_is_replaced(tmp_path: Path) -> None:
         partial.write_text("new")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "file").read_text() == "new"
+
+
+def test_a_place_where_no_file_can_be_is_told_before_there_is_anything_to_write(tmp_path: Path) -> None:
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    file.write_text("kept")
+    for place, why in ((tmp_path, "is a directory"), (pipe, "a device or a pipe"), (file / "below", "is a file")):
+        with pytest.raises(OutputError, match=why):
+            check_writable(place)
+    check_writable(file)
+    assert file.read_text() == "kept"
+    check_writable(tmp_path / "new" / "file")
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_signal_waits_until_something_is_in_its_place() -> None:

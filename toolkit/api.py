@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from toolkit.errors import VislamError
+from toolkit.errors import VislamError, did_you_mean
 from toolkit.estimate import Output, Run
 from toolkit.estimator import Build, defaults
 from toolkit.experiment import Comparison, Plan, Record
@@ -179,8 +179,6 @@ class _Values(Mapping[str, float | None]):
 
     def __getitem__(self, key: str) -> float | None:
         if key not in self._keys:
-            from toolkit.errors import did_you_mean
-
             raise KeyError(f"no metric is called {key}{did_you_mean(key, list(self._keys))}")
         return self._value_of(key)
 

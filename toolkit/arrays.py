@@ -48,9 +48,14 @@ def freeze_arrays(value: Any, **shapes: tuple[int | None, ...]) -> None:
         object.__setattr__(value, name, array)
 
 
+def rows_of(wanted: IntArray, ascending: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return in which rows (M,) of ascending values (N,) wanted ones (M,) stand, and whether they do (M,)."""
+    if not ascending.size:
+        return np.zeros(wanted.shape, dtype=np.int64), np.zeros(wanted.shape, dtype=bool)
+    rows = np.minimum(np.searchsorted(ascending, wanted), ascending.size - 1)
+    return rows, np.asarray(ascending[rows] == wanted)
+
+
 def is_among(ids: IntArray, others: IntArray) -> BoolArray:
     """Say which ids (N,) are among others (M,), each of which there is once; for some hundreds, where isin is slow."""
-    if not others.size:
-        return np.zeros(ids.shape, dtype=bool)
-    ascending = np.sort(others)
-    return np.asarray(ascending[np.minimum(np.searchsorted(ascending, ids), others.size - 1)] == ids)
+    return rows_of(ids, np.sort(others))[1]

@@ -21,6 +21,11 @@ from types import ModuleType
 from toolkit.errors import VislamError
 
 
+def shown_name(module: str) -> str:
+    """Return the name under which a user reads of a module: ``my_package.my_filter`` is ``my-filter``."""
+    return module.rpartition(".")[2].replace("_", "-")
+
+
 class MissingDependency(Exception):  # noqa: N818 - what a module needs and this installation lacks
     """Raised where a module cannot be imported because a package of another distribution is not installed."""
 
@@ -37,8 +42,8 @@ class FoundModule:
 
     @property
     def name(self) -> str:
-        """Return the name a user reads: ``my_filter.py`` is ``my-filter``."""
-        return self.module.rpartition(".")[2].replace("_", "-")
+        """Return the name a user reads."""
+        return shown_name(self.module)
 
     def tree(self) -> ast.Module:
         """Return the module's syntax tree, without importing it."""

@@ -14,6 +14,7 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.predicted_steps import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.sequence import Sequence
@@ -91,7 +92,7 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
     cov = _LUMP_FRAMES * noise
     if trajectory.cov is not None:
         cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], transition, noise)
-    return np.asarray((deviation * np.linalg.solve(cov, deviation[..., None])[..., 0]).sum(axis=1))
+    return mahalanobis_squared(deviation, cov)
 
 
 def _steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[_Step]:

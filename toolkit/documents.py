@@ -10,18 +10,23 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import msgspec
-from msgspec import inspect
+from msgspec import Meta, inspect
 
 from toolkit.errors import DataError, VislamError
+from toolkit.geometry import Array
 from toolkit.inputs import read_input
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
 Older = Mapping[str, Callable[[Json], Json]]
+Count = Annotated[int, Meta(ge=0)]
+# Of a metric; a count stays an integer when it is read and written again.
+Value = int | float | None
 
+_DIGITS = 6
 # What msgspec calls a type, in JSON's words.
 _KINDS = {
     "int": "integer",
@@ -46,6 +51,21 @@ def _as_it_is(value: Any) -> Any:
 def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is) -> Record:
     """Return the record whose fields are ``made`` of the attributes that a value has of the same names."""
     return record(**{name: made(getattr(value, name)) for name in record.__struct_fields__})
+
+
+def rounded(value: float) -> float:
+    """Return a value with the six digits that documents of long series have."""
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def number(value: float) -> float | None:
+    """Return a value with six digits, or None where it is not finite, for JSON has no word for that."""
+    return rounded(value) if math.isfinite(value) else None
+
+
+def numbers(values: Array) -> tuple[float | None, ...]:
+    """Return values (N,) with six digits, None for what is not finite."""
+    return tuple(map(number, values.tolist()))
 
 
 def to_text(record: msgspec.Struct) -> str:
@@ -124,10 +144,10 @@ class _NotFinite:
 
 def _decoded(content: bytes | str) -> object:
     """Return what a text in JSON holds; a place with NaN or infinity is left for the record to refuse and name."""
-    return json.loads(content, parse_constant=_NotFinite, parse_float=_number)
+    return json.loads(content, parse_constant=_NotFinite, parse_float=_finite_or_not)
 
 
-def _number(written: str) -> float | _NotFinite:
+def _finite_or_not(written: str) -> float | _NotFinite:
     value = float(written)
     return value if math.isfinite(value) else _NotFinite(written)
 

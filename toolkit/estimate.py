@@ -116,7 +116,7 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """What an estimator says when it has seen everything.
+    """What an estimator answers in the end, when it has seen everything.
 
     ``converged`` is False where a solve did not converge; ``log`` tells what was recovered on the way and how.
     """

@@ -162,6 +162,21 @@ def replaced_file(target: Path) -> Iterator[Path]:
         raise _unwritable(target, error, "file") from error
 
 
+def write_text(target: Path, text: str) -> None:
+    """Write a file in UTF-8 at once or not at all, in the place of an earlier one; raises as :func:`replaced_file`."""
+    with replaced_file(target) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def check_writable(target: Path) -> None:
+    """Raise OutputError unless a file can be written at a place; what is there stays."""
+    check_file(target)
+    try:
+        _probe(target.parent / "probe")
+    except OSError as error:
+        raise _unwritable(target, error, "file") from error
+
+
 def check_file(target: Path) -> None:
     """Raise OutputError where something that is no regular file stands at a place."""
     if target.is_dir():

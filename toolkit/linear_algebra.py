@@ -6,6 +6,9 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
+# What numeric libraries go by when they are loaded: the number of their threads in a process that is started.
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
 
 def on_one_thread() -> AbstractContextManager[object]:
     """Return a context in which the linear algebra of this process runs on one thread."""

@@ -104,14 +104,14 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         progress,
         compilation,
     )
-    clock, said = _Clock(), list[Estimate]()
+    clock, online = _Clock(), list[Estimate]()
     try:
         estimator = build(setup)
         clock.leave_out(compilation)
         for packet in packets:
             estimate = _timed_step(estimator, packet, clock)
             if estimate is not None:
-                said.append(estimate)
+                online.append(estimate)
             progress.advance(packet.index + 1, len(packets))
         began = time.perf_counter()
         finished = estimator.finish()
@@ -121,8 +121,8 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
     except Exception as error:
         if (interrupt := _interrupt_behind(error)) is not None:
             raise interrupt from None
-        return replace(_failed(name, said, clock.timings(), error), arithmetic=compilation.ran)
-    run = _ended(name, said, finished, clock.timings(), sequence)
+        return replace(_failed(name, online, clock.timings(), error), arithmetic=compilation.ran)
+    run = _ended(name, online, finished, clock.timings(), sequence)
     return replace(run, log=(*compilation.log, *run.log), arithmetic=compilation.ran)
 
 
@@ -140,23 +140,23 @@ def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate
     return estimate
 
 
-def _failed(name: str, said: list[Estimate], timings: Timings, error: Exception) -> Run:
+def _failed(name: str, online: list[Estimate], timings: Timings, error: Exception) -> Run:
     why = str(error) if isinstance(error, EstimatorError) else f"{type(error).__name__}: {error}"
-    log = [f"failed after {len(said)} estimates: {why}"]
+    log = [f"failed after {len(online)} estimates: {why}"]
     if not isinstance(error, EstimatorError):
         log += [line.rstrip() for line in traceback.format_exception(error)]
-    causal = Trajectory.of(said) if said else None
-    return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(said), tuple(log))
+    causal = Trajectory.of(online) if online else None
+    return Run(name, "failed", causal, None, Landmarks.none(), timings, _info(online), tuple(log))
 
 
-def _ended(name: str, said: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
-    causal = Trajectory.of(said) if said else None
+def _ended(name: str, online: list[Estimate], finished: Finished, timings: Timings, sequence: Sequence) -> Run:
+    causal = Trajectory.of(online) if online else None
     status: Status = "ok"
     log = list(finished.log)
     if not finished.converged:
         status = "failed"
         log.append("the solve did not converge; its result is shown but is no estimate to rely on")
-    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(said), tuple(log))
+    run = Run(name, status, causal, finished.trajectory, finished.landmarks, timings, _info(online), tuple(log))
     return with_divergence(run, sequence)
 
 
@@ -184,6 +184,6 @@ def _trajectories_to_check(run: Run) -> Iterator[Trajectory]:
         yield replace(run.final, cov=run.causal.cov) if lacks and run.causal is not None else run.final
 
 
-def _info(said: list[Estimate]) -> dict[str, Array]:
-    names = sorted({name for estimate in said for name in estimate.info})
-    return {name: np.array([e.info.get(name, np.nan) for e in said], dtype=float) for name in names}
+def _info(online: list[Estimate]) -> dict[str, Array]:
+    names = sorted({name for estimate in online for name in estimate.info})
+    return {name: np.array([e.info.get(name, np.nan) for e in online], dtype=float) for name in names}

@@ -252,6 +252,15 @@ class Sequence:
         """Return the seconds from the first frame to the last."""
         return float(self.frames_t_ns[-1] - self.frames_t_ns[0]) / NS_PER_S if self.frame_count else 0.0
 
+    @property
+    def frames_s(self) -> Array:
+        """Return the frames' times (K,) in seconds from the first."""
+        return self.elapsed_s(self.frames_t_ns)
+
+    def elapsed_s(self, t_ns: IntArray) -> Array:
+        """Return stamps (N,) in seconds from the first frame."""
+        return np.asarray((t_ns - self.frames_t_ns[:1]) / NS_PER_S)
+
     @cached_property
     def held_out(self) -> Observations:
         """The sightings of the tracks no estimator ever sees."""

@@ -39,7 +39,7 @@ import gate_pool
 from toolkit.gate import interleaved
 from toolkit.gate.baseline import DEFAULT_BOUNDS, FALSE_ALARM_RATE, Baseline, Case, Measured
 from toolkit.gate.judging import changed_metrics
-from toolkit.gate.significance import Pairs, Where, moved_p, rejected, worse_p
+from toolkit.gate.significance import Pairs, Where, holm, moved_p, worse_p
 from toolkit.progress import silent
 
 CASES = {"flight": 2.5, "drive": 25.0}
@@ -134,8 +134,8 @@ def drawn_checks(every: list[Column], size: Size, planted: tuple[str, str]) -> t
         moved[..., i], worse[..., i] = moved_p(pairs), worse_p(pairs)
     kept = slice(len(every))
     return (
-        rejected(moved, FALSE_ALARM_RATE)[..., kept] | rejected(worse, FALSE_ALARM_RATE / 2.0)[..., kept],
-        rejected(worse, FALSE_ALARM_RATE / 2.0)[..., kept],
+        (holm(moved) <= FALSE_ALARM_RATE)[..., kept] | (holm(worse) <= FALSE_ALARM_RATE / 2.0)[..., kept],
+        (holm(worse) <= FALSE_ALARM_RATE / 2.0)[..., kept],
     )
 
 

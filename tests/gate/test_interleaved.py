@@ -22,7 +22,10 @@ from toolkit.gate.interleaved import (
     timers,
     unpacked,
 )
+from toolkit.gate.measuring import recordings_of
+from toolkit.gate.timing_child import Timer
 from toolkit.progress import silent
+from toolkit.settings import changes_of, settings_of
 
 PROJECT = Path(__file__).parents[2]
 # Times of single runs on a machine that others use, too: a few percent, and now and then much more.
@@ -111,6 +114,22 @@ def test_old_and_new_code_take_turns_and_each_runs_its_own(tmp_path):
     assert -85.0 < speed.change_percent < -60.0
     assert "processor time of" in speed.words
     assert speeds.notes == ()
+
+
+def test_what_is_timed_is_read_as_what_is_measured(monkeypatch):
+    read = []
+    monkeypatch.setattr("toolkit.experiment.recording.prepare", read.append)
+    changed = {
+        "noise": {"motion_scale": 2.0},
+        "frontend": {"max_tracks": 50},
+        "tracks": {"budget": 20},
+        "start": "truth",
+    }
+    settings = settings_of(changed, "here")
+    (measured,) = recordings_of(Case("drive", True, (3,), ("ekf",), 1.0), settings)
+    asked = {"source": "drive", "seed": 3, "truth": None, "duration_s": 1.0, "settings": changes_of(settings)}
+    Timer().prepare(asked)
+    assert read == [measured]
 
 
 def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):

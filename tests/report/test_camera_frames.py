@@ -62,7 +62,7 @@ def test_the_images_are_those_of_the_frames_with_all_their_sightings(directory: 
     frames, sequence = frames_of(directory), filmed.sequence
     assert 2 <= len(frames) <= 4
     for frame in frames:
-        k = int(np.argmin(np.abs(filmed.frames_s - frame.t_s)))
+        k = int(np.argmin(np.abs(sequence.frames_s - frame.t_s)))
         here = sequence.observations.select(sequence.observations.frame == k)
         np.testing.assert_allclose(frame.u_px, here.uv_px[:, 0], rtol=1e-5)
         np.testing.assert_allclose(frame.v_px, here.uv_px[:, 2], rtol=1e-5)

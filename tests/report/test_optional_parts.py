@@ -6,7 +6,8 @@ import msgspec
 
 from toolkit.estimator import find_all
 from toolkit.experiment.pipeline import lacking, to_bridge
-from toolkit.report.messages import note_lines, rules_line
+from toolkit.report.header import rules_line
+from toolkit.report.messages import note_lines
 from toolkit.settings import DEFAULTS, Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
 from toolkit.simulation.track_faults import cut_tracks

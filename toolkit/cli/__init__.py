@@ -80,10 +80,10 @@ def _guarded(given: list[str]) -> int:
     try:
         return _run(given)
     except VislamError as error:
-        return _told(str(error), error.exit_status)
+        return _ended_with(str(error), error.exit_status)
     except KeyboardInterrupt:
         _forget_where_interrupted()
-        return _told("interrupted; what was not finished is not written", _INTERRUPTED)
+        return _ended_with("interrupted; what was not finished is not written", _INTERRUPTED)
     except BrokenPipeError:
         # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
         _give_up_output()
@@ -121,16 +121,18 @@ def _unexpected(error: Exception) -> int:
         traceback.print_exc()
     if isinstance(error, OSError) and error.filename is None and error.errno in _NOT_WRITTEN:
         _give_up_output()
-        return _told(f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status)
+        return _ended_with(
+            f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status
+        )
     if isinstance(error, MemoryError):
-        return _told("the memory does not suffice; use fewer --workers, or a part of the recording", _SYSTEM)
+        return _ended_with("the memory does not suffice; use fewer --workers, or a part of the recording", _SYSTEM)
     if isinstance(error, OSError):
-        return _told(f"the system refuses to go on: {error}", _SYSTEM)
+        return _ended_with(f"the system refuses to go on: {error}", _SYSTEM)
     if isinstance(error, UnicodeError):
-        return _told(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
+        return _ended_with(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
-    return _told(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
+    return _ended_with(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
 
 
 def _forget_where_interrupted() -> None:
@@ -147,7 +149,7 @@ def _give_up_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _told(message: str, status: int) -> int:
+def _ended_with(message: str, status: int) -> int:
     with suppress(OSError):
         print(f"vislam: error: {printable(' '.join(message.split()))}", file=sys.stderr)
     return status

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     # What argparse gives a module to add its own parser to; it has no public name and cannot be indexed at run time.
     Subcommands = argparse._SubParsersAction["Parser"]
 
+    from toolkit.experiment.recording import Recording
     from toolkit.gate.trajectory_check import GivenRuns, Truths
     from toolkit.settings import Settings
 
@@ -328,6 +329,16 @@ def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--no-repair", action="store_true", help="report the faults of a recording, repair none")
     group.add_argument("--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these (see list)")
+
+
+def recording_asked(options: argparse.Namespace) -> "Recording":
+    """Return the recording that SEQUENCE and --seed name, with what --no-repair, --keep, --tracks and --topics say."""
+    from toolkit.audit import faults
+    from toolkit.experiment.recording import Recording
+    from toolkit.settings import settings_of
+
+    frontend = settings_of(with_tracks({}, options), "the command line").frontend
+    return Recording(options.sequence, options.seed, keep=kept_faults(options, faults()), frontend=frontend)
 
 
 def kept_faults(options: argparse.Namespace, known: Collection[str]) -> frozenset[str]:

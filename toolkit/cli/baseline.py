@@ -108,11 +108,12 @@ def command(options: argparse.Namespace) -> int:
     if options.align or options.gap:
         raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
     from toolkit.experiment.workers import usable_cpus
+    from toolkit.files import check_writable, write_text
     from toolkit.gate.baseline import releases_in_a_name
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
     from toolkit.progress import of_this_process
-    from toolkit.report.gate import check_writable, made_here, write_text
+    from toolkit.report.manifest import made_here
 
     cases = _cases(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
@@ -127,10 +128,11 @@ def command(options: argparse.Namespace) -> int:
 
 
 def _of_trajectories(options: argparse.Namespace) -> int:
+    from toolkit.files import check_writable, write_text
     from toolkit.gate.trajectory_baseline import to_text
     from toolkit.gate.trajectory_check import new_trajectory_baseline
     from toolkit.gate.trajectory_files import Scoring
-    from toolkit.report.gate import check_writable, made_here, write_text
+    from toolkit.report.manifest import made_here
 
     if options.sequences or options.estimators or options.duration or options.set or options.config:
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")

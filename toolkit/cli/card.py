@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, kept_faults, with_tracks
+from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, recording_asked
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -33,24 +34,19 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Print the card and return 0."""
-    from toolkit.audit import faults
     from toolkit.documents import to_text
-    from toolkit.experiment.recording import Recording, recording_card
-    from toolkit.files import check_file, replaced_file
+    from toolkit.experiment.recording import recording_card
+    from toolkit.files import check_writable, write_text
     from toolkit.progress import of_this_process
     from toolkit.report.card import card_record, card_text
     from toolkit.report.prose import width_of_output
-    from toolkit.settings import settings_of
 
     if options.json is not None:
-        check_file(options.json)
-    keep = kept_faults(options, faults())
-    frontend = settings_of(with_tracks({}, options), "the command line").frontend
-    recording = Recording(options.sequence, options.seed, keep=keep, max_frames=options.max_frames, frontend=frontend)
+        check_writable(options.json)
+    recording = replace(recording_asked(options), max_frames=options.max_frames)
     with of_this_process()(options.sequence) as progress:
         sequence, card = recording_card(recording, progress)
     print(card_text(sequence, card, width_of_output()))
     if options.json is not None:
-        with replaced_file(options.json) as file:
-            file.write_text(to_text(card_record(card)), encoding="utf-8")
+        write_text(options.json, to_text(card_record(card)))
     return 0

@@ -74,7 +74,8 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Check, print and return 1 where anything fails."""
-    from toolkit.report.gate import check_writable, gate_text, write_check
+    from toolkit.files import check_writable
+    from toolkit.report.gate import gate_text, write_check
     from toolkit.report.prose import width_of_output
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}

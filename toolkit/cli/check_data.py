@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, kept_faults, with_tracks
+from toolkit.cli.arguments import add_repair_arguments, add_tracks_argument, at_least, epilog, recording_asked
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -31,16 +32,12 @@ def add_to(subcommands: Subcommands) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Print the audit and return 1 where a fault stays that must not."""
-    from toolkit.audit import faults
-    from toolkit.experiment.recording import Recording, audited_recording
+    from toolkit.experiment.recording import audited_recording
     from toolkit.progress import of_this_process
     from toolkit.report.prose import width_of_output
     from toolkit.report.terminal import audit_text
-    from toolkit.settings import settings_of
 
-    keep = kept_faults(options, faults())
-    frontend = settings_of(with_tracks({}, options), "the command line").frontend
-    recording = Recording(options.sequence, options.seed, options.truth, keep, frontend=frontend)
+    recording = replace(recording_asked(options), truth=options.truth)
     with of_this_process()(options.sequence) as progress:
         audited = audited_recording(recording, progress)
     print(audit_text(audited, width_of_output()))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     Interrupted,
+    UsageError,
     add_estimators_argument,
     add_part_arguments,
     add_repair_arguments,
@@ -26,7 +27,7 @@ from toolkit.cli.arguments import (
     names,
     with_tracks,
 )
-from toolkit.errors import printable
+from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -162,7 +163,7 @@ def command(options: argparse.Namespace) -> int:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
         stores = dict(zip(directories, stores_of(plan, cases, directories), strict=False))
-        open_files.enter_context(_told_where_to_go_on(stores))
+        open_files.enter_context(_kept_when_interrupted(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
             if not (options.json or options.quiet):
@@ -185,7 +186,7 @@ def _made_by(options: argparse.Namespace, asked: Configuration) -> MadeBy:
 
 
 @contextmanager
-def _told_where_to_go_on(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
+def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None]:
     """Say what of the kept outcomes is of no use and, after an interrupt, where others are; close them in the end.
 
     Raises Interrupted in the place of KeyboardInterrupt where any outcome is kept.
@@ -216,8 +217,6 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.cli.arguments import UsageError
-    from toolkit.errors import VislamError
     from toolkit.report.table import columns_asked
 
     try:
@@ -265,7 +264,6 @@ def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
 
 def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
     """Return the plan with where it is run."""
-    from toolkit.cli.arguments import UsageError
 
     if options.scheduler is not None and options.workers is not None:
         raise UsageError("--scheduler and --workers exclude each other: a cluster has its own workers")
@@ -274,7 +272,6 @@ def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
 
 def _plan(asked: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
-    from toolkit.cli.arguments import UsageError
     from toolkit.estimator import defaults
     from toolkit.experiment import Plan
     from toolkit.experiment.recording import Part
@@ -306,7 +303,6 @@ def _check_trajectory_names(trajectories: Mapping[str, str], estimators: Iterabl
     """Raise UsageError for a trajectory whose name stands for something else."""
     if not trajectories:
         return
-    from toolkit.cli.arguments import UsageError
     from toolkit.estimator import find_all
     from toolkit.experiment.comparison import plain_name
     from toolkit.report.export import TRUTH

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import UsageError, epilog, names
+from toolkit.errors import VislamError
 
 if TYPE_CHECKING:
     from toolkit.cli.arguments import Subcommands
@@ -37,7 +38,6 @@ def add_to(subcommands: Subcommands) -> None:
 def command(options: argparse.Namespace) -> int:
     """Compare and print; what differs is no failure."""
     from toolkit.documents import to_text
-    from toolkit.errors import VislamError
     from toolkit.metrics import known_metrics, metrics_called
     from toolkit.report.diff_text import diff_document, diff_text
     from toolkit.report.differences import differences

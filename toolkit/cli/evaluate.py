@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, add_workers_argument, at_least, epilog, names, positive_seconds
+from toolkit.cli.arguments import (
+    UsageError,
+    add_workers_argument,
+    at_least,
+    epilog,
+    known_names,
+    names,
+    positive_seconds,
+)
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -142,7 +150,6 @@ def _print(found: Evaluation, columns: tuple[Metric, ...], options: argparse.Nam
 
 def _metrics(keys: tuple[str, ...]) -> tuple[Metric, ...]:
     """Return metrics by their keys; raises UsageError for one that trajectories do not have."""
-    from toolkit.cli.arguments import known_names
     from toolkit.evaluation.scoring import METRICS
 
     if keys == ("all",):

@@ -13,9 +13,10 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from toolkit import documents
+from toolkit.documents import Count, Value, of_attributes
 from toolkit.errors import DataError
 from toolkit.estimate import Status
-from toolkit.evaluation.scoring import METRICS, Terms
+from toolkit.evaluation.scoring import METRICS
 from toolkit.evaluation.standings import Cell, EvaluatedRun, Evaluation, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import Values
@@ -23,8 +24,6 @@ from toolkit.gate.trajectory_baseline import ScoredSequence
 from toolkit.gate.trajectory_files import Scoring
 from toolkit.metrics import Metric
 
-Value = int | float | None
-Count = Annotated[int, Meta(ge=0)]
 _REMEDY = "make it with vislam evaluate --out"
 
 
@@ -139,7 +138,7 @@ def evaluation_document(evaluation: Evaluation) -> EvaluationRecord:
     metrics = evaluation.scored_metrics
     return EvaluationRecord(
         schema="vislam.evaluation/1",
-        terms=_terms(evaluation.terms),
+        terms=of_attributes(TermsRecord, evaluation.terms),
         ranked_by=evaluation.ranked_by.key,
         sequences=tuple(
             SequenceScored(
@@ -154,16 +153,6 @@ def evaluation_document(evaluation: Evaluation) -> EvaluationRecord:
         paired=tuple(map(_paired, evaluation.paired)),
         notes=evaluation.notes,
     )  # fmt: skip
-
-
-def _terms(terms: Terms) -> TermsRecord:
-    return TermsRecord(
-        max_dt_s=terms.max_dt_s,
-        offset_s=terms.offset_s,
-        gap_s=terms.gap_s,
-        level=terms.level,
-        least_coverage_percent=terms.least_coverage_percent,
-    )
 
 
 def _run(run: EvaluatedRun) -> RunRecord:
@@ -190,9 +179,7 @@ def _over_runs(cell: Cell, metrics: tuple[Metric, ...]) -> OverRuns:
 
 
 def _quartiles(found: QuantilesOfAll | None) -> Quartiles | None:
-    if found is None:
-        return None
-    return Quartiles(lower_quartile=found.lower_quartile, median=found.median, upper_quartile=found.upper_quartile)
+    return None if found is None else of_attributes(Quartiles, found)
 
 
 def _standing(standing: Standing) -> StandingRecord:

@@ -6,7 +6,7 @@ the rule of evo (Grupp, "evo: Python package for the evaluation of odometry and 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -141,10 +141,10 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     matched = _matched(estimate, truth, terms.max_dt_s)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
-        scores = _without(scores, _OF_THE_CLOCK, "the files have no stamps")
+        scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
     if turn is not None:
-        scores = _without(
-            scores, _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
+        scores = scores.without(
+            _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
         )
     return scores.remarked([_PAIRS.key], _how_matched(estimate, truth, terms.max_dt_s))
 
@@ -224,12 +224,7 @@ def _or_reason(score: Callable[[AgainstTruth], Scores], pairs: AgainstTruth, met
     try:
         return score(pairs)
     except Unavailable as reason:
-        keys = [metric.key for metric in metrics]
-        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(reason)))
-
-
-def _without(scores: Scores, keys: tuple[str, ...], reason: str) -> Scores:
-    return replace(scores, values=scores.values | dict.fromkeys(keys), notes=scores.notes | dict.fromkeys(keys, reason))
+        return Scores.none([metric.key for metric in metrics], str(reason))
 
 
 def _how_matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> str:

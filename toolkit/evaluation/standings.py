@@ -20,6 +20,7 @@ from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
 from toolkit.experiment.workers import Lost, results_of
+from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Metric
@@ -27,7 +28,6 @@ from toolkit.progress import SILENT, Progress
 
 METRIC_BY_KEY: Mapping[str, Metric] = {metric.key: metric for metric in METRICS}
 RANKED_BY = "ate_se3_m"
-FALSE_ALARM_RATE = 0.05
 # Processes take a second to start, in which so many files are scored.
 _WORTH_PROCESSES = 200
 # As many signs as are counted exactly; beyond it the smallest p-value is below 1e-300 anyway.

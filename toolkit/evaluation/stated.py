@@ -12,15 +12,17 @@ from toolkit.geometry import Array, se3_inverse, so3_log
 from toolkit.metrics import Scores, Unavailable
 from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.association import median_period_ns, poses_at
-from toolkit.metrics._shared.consistency import chi2_quantile, normalised
+from toolkit.metrics._shared.consistency import (
+    NOT_MET,
+    NOT_PLACED,
+    OTHER_WORLD,
+    PLACED,
+    chi2_quantile,
+)
+from toolkit.models.gating import mahalanobis_squared
 
 _KEYS = ("nees_ori_mean", "nees_pos_mean")
 _NONE = "the file states no covariance"
-_PLACED = (
-    "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
-)
-# A first pose this improbable under its own covariances is expressed in another world than the truth.
-_OTHER_WORLD = 1e-6
 
 
 def nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
@@ -32,7 +34,7 @@ def nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) 
     try:
         return _scores(file.covariances, estimate, truth, level=level)
     except Unavailable as reason:
-        return Scores(dict.fromkeys(_KEYS), dict.fromkeys(_KEYS, str(reason)))
+        return Scores.none(_KEYS, str(reason))
 
 
 def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
@@ -40,27 +42,27 @@ def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level:
         raise Unavailable(_NONE)
     met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
     if not met.any():
-        raise Unavailable("no pose has a true one at its time")
+        raise Unavailable(NOT_MET)
     poses, covs = estimate.poses[met], (stated.orientation[met], stated.position[met])
     bad = sum(int((~np.isfinite(cov).all(axis=(1, 2)) | (_least_eigenvalue(cov) <= 0.0)).sum()) for cov in covs)
     if bad:
         raise Unavailable(f"{bad} of {2 * len(poses)} covariances are not positive definite")
     first = _nees(true[:1], poses[:1], covs[0][:1], covs[1][:1])
-    placed = max(float(one[0]) for one in first) > chi2_quantile(1.0 - _OTHER_WORLD, 3) / 3.0
+    placed = max(float(one[0]) for one in first) > chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0
     if placed:
         if not met[0]:
-            raise Unavailable("the estimate has its own world frame, and the truth has no pose for its first one")
+            raise Unavailable(NOT_PLACED)
         # The truth moves into the estimate's world, in which the covariances are stated.
         true = (place_yaw if level else place_pose)(poses[0], true[0]).apply(true)
     orientation, position = _nees(true, poses, *covs)
     scores = Scores(dict(zip(_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
-    return scores.remarked(_KEYS, _PLACED if placed else "")
+    return scores.remarked(_KEYS, PLACED if placed else "")
 
 
 def _nees(true: Array, poses: Array, cov_orientation: Array, cov_position: Array) -> tuple[Array, Array]:
     turned = so3_log((se3_inverse(poses) @ true)[:, :3, :3])
     moved = true[:, :3, 3] - poses[:, :3, 3]
-    return normalised(turned, cov_orientation) / 3.0, normalised(moved, cov_position) / 3.0
+    return mahalanobis_squared(turned, cov_orientation) / 3.0, mahalanobis_squared(moved, cov_position) / 3.0
 
 
 def _least_eigenvalue(cov: Array) -> Array:

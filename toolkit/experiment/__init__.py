@@ -1,7 +1,8 @@
 """The one pipeline of every comparison: load, audit, start, run, score; one seed or many, here or on a cluster.
 
 Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
-kept of it) -> pipeline -> comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics.
+kept of it, under a key that code_version is part of) -> references (what other systems estimated) -> pipeline ->
+comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics. configuration: all as a file.
 What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
 """
 

@@ -19,7 +19,7 @@ NUMERIC_PACKAGES = {
     "numba": "numba",
 }
 # The toolkit's parts above the experiment, which it cannot import: they change no result.
-_ABOVE = ("api.py", "cli", "gate", "report")
+_ABOVE = ("api.py", "cli", "evaluation", "gate", "report", "verify")
 _CODE = (".py", ".so", ".pyd")
 _ANNOUNCED = (estimator.ENTRY_POINT_GROUP, metrics.ENTRY_POINT_GROUP, datasets.ENTRY_POINT_GROUP)
 

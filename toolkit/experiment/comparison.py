@@ -33,7 +33,6 @@ from toolkit.metrics import Metric, Scores, describe
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
 from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
-from toolkit.resampling import NS_PER_S
 from toolkit.settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:
@@ -141,8 +140,7 @@ class Row:
         scored = self.outcomes[0].outputs.get(self.output)
         if scored is not None:
             return scored.scores
-        keys = describe()
-        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, "the run gave no trajectory"))
+        return Scores.none(describe(), "the run gave no trajectory")
 
     @property
     def answered(self) -> bool:
@@ -307,13 +305,6 @@ class Comparison:
     def all_ok(self) -> bool:
         """Say whether every run under every seed ended well."""
         return all(outcome.status == "ok" for outcome in self.outcomes)
-
-    @property
-    def frames_s(self) -> Array:
-        """Return the frames' times (K,) s from the first."""
-        t_ns = self.sequence.frames_t_ns
-        seconds: Array = (t_ns - t_ns[0]) / NS_PER_S
-        return seconds
 
     @property
     def hashes(self) -> tuple[str | None, ...]:

@@ -11,7 +11,7 @@ from msgspec import Meta, Struct
 from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean
 from toolkit.inputs import read_text_input
-from toolkit.settings import Settings, SettingsError, as_values, read_toml, settings_of
+from toolkit.settings import Settings, SettingsError, read_toml, settings_of
 
 # The table of a configuration that says what to compare; all others are settings.
 COMPARE = "compare"
@@ -62,11 +62,6 @@ def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place
     except msgspec.ValidationError as error:
         raise SettingsError(f"{place}: {COMPARE}.{in_words(error, dict(request), Request)}") from error
     return Configuration(asked, settings_of(settings, place))
-
-
-def as_manifest(configuration: Configuration) -> dict[str, Any]:
-    """Return what a manifest holds so that the comparison can be repeated from it."""
-    return {COMPARE: msgspec.to_builtins(configuration.request), "settings": as_values(configuration.settings)}
 
 
 def _manifest(path: Path) -> dict[str, Any]:

@@ -211,9 +211,8 @@ def _first_seconds(sequence: Sequence, duration_s: float) -> Sequence:
 
 def _part(sequence: Sequence, part: Part) -> Sequence:
     """Return a part of the frames, which the facts tell; raises DataError where it has no two."""
-    elapsed_s = (sequence.frames_t_ns - sequence.frames_t_ns[:1]) / NS_PER_S
     end_s = np.inf if part.to_s is None else part.to_s
-    kept = np.flatnonzero((elapsed_s >= part.from_s) & (elapsed_s <= end_s))[:: part.every]
+    kept = np.flatnonzero((sequence.frames_s >= part.from_s) & (sequence.frames_s <= end_s))[:: part.every]
     if kept.size < 2:
         raise DataError(
             f"{sequence.name}: {part} it has {kept.size} frame(s), and two are needed; it has {sequence.frame_count} "

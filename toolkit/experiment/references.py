@@ -86,6 +86,6 @@ def _run(name: str, whole: Trajectory, sequence: Sequence, output: Output, read:
     log = [f"{read}, not run here: {_OTHER_TERMS}", *remarks]
     if not reached.any():
         log.append(f"none of its poses ({range_s(whole.t_ns)}) reaches one of the frames ({range_s(frames_t_ns)})")
-    said = Trajectory(frames_t_ns[reached], poses)
-    causal, final = (said, None) if output == "causal" else (None, said)
+    at_frames = Trajectory(frames_t_ns[reached], poses)
+    causal, final = (at_frames, None) if output == "causal" else (None, at_frames)
     return Run(name, "ok", causal, final, Landmarks.none(), timings=None, log=tuple(log))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from toolkit import runner
+from toolkit.arrays import rows_of
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Arithmetic, ArithmeticOfRuns, Output, Run, Status
 from toolkit.estimator import Build, find
@@ -72,6 +73,14 @@ class Outcome:
     tum: Mapping[Output, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     arithmetic: Arithmetic | None = None
+
+    @property
+    def why(self) -> str:
+        """Return in one line why the run did not end well; nothing where it did, or its log does not say."""
+        if self.status == "ok" or not self.log:
+            return ""
+        # A run that failed begins with the reason; the runner appends what diverged to the estimator's log.
+        return " ".join(self.log[0 if self.status == "failed" else -1].split())
 
 
 def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
@@ -159,6 +168,5 @@ def _nis_dof(evaluation: Evaluation) -> float | None:
 
 def _put(series: Array, frames_t_ns: IntArray, t_ns: IntArray, values: Array) -> None:
     """Enter values (n,) at stamps (n,) into a series (K,) by frame; what belongs to no frame is left out."""
-    row = np.minimum(np.searchsorted(frames_t_ns, t_ns), frames_t_ns.size - 1)
-    same = frames_t_ns[row] == t_ns
-    series[row[same]] = values[same]
+    row, is_frame = rows_of(t_ns, frames_t_ns)
+    series[row[is_frame]] = values[is_frame]

@@ -28,21 +28,18 @@ import numpy as np
 from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress
 
-R = TypeVar("R")
-
-# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
-    "LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)
-}
-_PARENT_POLL_S = 1.0
 T = TypeVar("T")
+R = TypeVar("R")
 Work = Callable[[T, Progress], R]
 # What a process keeps ready for the units for which this is equal; None where it is nothing.
 Needs = Callable[[T], Hashable]
 
-_POLL_S = 0.1
+# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
+_ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
+_PARENT_POLL_S, _POLL_S = 1.0, 0.1
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
@@ -198,9 +195,9 @@ class Workers:
             handing_out: _HandingOut[R] = _HandingOut(self._processes, tasks, [needs(unit) for unit in units])
             progress.advance(0, board.total)
             try:
-                for place, result in handing_out.results(lambda: progress.advance(*board.told())):
+                for place, result in handing_out.results(lambda: progress.advance(*board.progress())):
                     board.finish(place)
-                    progress.advance(*board.told())
+                    progress.advance(*board.progress())
                     yield place, result
             finally:
                 handing_out.stop()
@@ -334,7 +331,7 @@ class _Board:
         """Count a unit as done."""
         self._under_way[place] = False
 
-    def told(self) -> tuple[int, int, str]:
+    def progress(self) -> tuple[int, int, str]:
         """Return the steps that are done, of how many, and what the first smoother that has come to its end does."""
         entries = np.array(self._entries[: self._under_way.size])[self._under_way]
         shares = _share_done(entries["stages"], entries["done"], entries["total"])

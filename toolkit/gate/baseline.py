@@ -67,7 +67,8 @@ DEFAULT_BOUNDS = Bounds(
     coverage_points=1.0,
     speed_ratio=1.3,
 )
-COVERAGE = "coverage_percent"
+COVERAGE, SPEED = "coverage_percent", "speed"
+# Of all statistical tests together that are made at once.
 FALSE_ALARM_RATE = 0.05
 
 

@@ -26,15 +26,15 @@ from scipy.special import ndtri
 
 from toolkit.errors import printable
 from toolkit.gate import timing_child
-from toolkit.gate.baseline import Baseline, BaselineError, Case
+from toolkit.gate.baseline import SPEED, Baseline, BaselineError, Case
 from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
-from toolkit.progress import ProgressFor
+from toolkit.linear_algebra import THREAD_VARIABLES
+from toolkit.progress import Progress, ProgressFor
 from toolkit.settings import changes_of
 
-SPEED = "speed"
 # Slower by 5 % is nobody's concern; slower by 15 % must be seen.
 MARGIN, TO_SEE = 0.05, 0.15
 FEWEST_PAIRS, MOST_PAIRS = 16, 60
@@ -72,7 +72,6 @@ class Speeds:
 
     verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...]
-    tests: int
 
 
 def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
@@ -81,14 +80,14 @@ def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: P
     Raises BaselineError where the version cannot be had or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
-    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes, len(turns.timed))
+    return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes)
 
 
 def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -> Turns:
     """Time the estimators of a baseline in both versions; raises as :func:`compare_speed` does."""
     cases = [case for case, _ in baseline.cases if case.simulated] or [case for case, _ in baseline.cases]
     names = sorted({name for case in cases for name in case.estimators})
-    found: list[TimedPairs] = []
+    timed: list[TimedPairs | str] = []
     notes: list[str] = []
     with unpacked(version) as path, timers(path, (Path(timing_child.__file__).parents[2],)) as sides:
         lacking = _lacking(version, sides, names)
@@ -98,11 +97,9 @@ def timed_in_turn(baseline: Baseline, version: str, progress_for: ProgressFor) -
             present = [name for name in case.estimators if name not in lacking]
             with progress_for(f"{case.source}: speed against {version}") as progress:
                 _prepare(sides, case, baseline)
-                for done, name in enumerate(present):
-                    progress.advance(done, len(present))
-                    timed = _time(sides, case.source, name)
-                    (found if isinstance(timed, TimedPairs) else notes).append(timed)  # type: ignore[arg-type]
-    return Turns(tuple(found), tuple(notes))
+                timed += _timed(sides, case.source, present, progress)
+    notes += [why for why in timed if isinstance(why, str)]
+    return Turns(tuple(one for one in timed if isinstance(one, TimedPairs)), tuple(notes))
 
 
 def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iterator[Verdict]:
@@ -191,7 +188,7 @@ def timers(*paths: Sequence[Path]) -> Iterator[tuple[Process, ...]]:
 
 
 def _environment(path: Sequence[Path]) -> dict[str, str]:
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    single = dict.fromkeys(THREAD_VARIABLES, "1")
     before = os.environ.get("PYTHONPATH")
     return {**os.environ, **single, "PYTHONPATH": os.pathsep.join([*map(str, path), *([before] if before else [])])}
 
@@ -220,6 +217,15 @@ def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
             duration_s=min(LONGEST_S, case.duration_s or LONGEST_S),
             settings=changes_of(baseline.settings),
         )
+
+
+def _timed(
+    sides: Sequence[Process], source: str, estimators: Sequence[str], progress: Progress
+) -> Iterator[TimedPairs | str]:
+    """Yield the times of each estimator on the recording that is ready, or why it has none."""
+    for done, name in enumerate(estimators):
+        progress.advance(done, len(estimators))
+        yield _time(sides, source, name)
 
 
 def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | str:

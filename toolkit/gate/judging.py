@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from toolkit.estimate import ArithmeticOfRuns, Status
-from toolkit.gate.baseline import COVERAGE, Bounds, Case, Criterion, Measured, Series, Values
+from toolkit.gate.baseline import COVERAGE, SPEED, Bounds, Case, Criterion, Measured, Series, Values
 from toolkit.gate.significance import Pairs, Where
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
@@ -32,7 +32,6 @@ _SEVERITY: dict[Status, int] = {"ok": 0, "diverged": 1, "failed": 2}
 SHOWN = 1e-6
 # Fewer timed runs than this scatter too much to be judged (docs/gate.md).
 FEWEST_TIMED = 16
-_SPEED = "speed"
 Sides = tuple[Array, Array]
 
 _STILL, _MOVED = 1e-6, 1e-3
@@ -270,7 +269,7 @@ def judge_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
         "better": f"{old / new:.2f} times as fast",
     }.get(finding, "")
     allowed = 100.0 * (bounds.speed_ratio - 1.0)
-    yield Verdict(case.source, estimator, "", _SPEED, finding, words, old, new, 100.0 * (new / old - 1.0), allowed)
+    yield Verdict(case.source, estimator, "", SPEED, finding, words, old, new, 100.0 * (new / old - 1.0), allowed)
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:

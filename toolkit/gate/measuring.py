@@ -76,12 +76,16 @@ def recordings_of(case: Case, settings: Settings) -> list[Recording]:
 
 
 def located(source: str) -> str:
-    """Return a built-in name as it is, and a path where it leads: from here, or from the folder VISLAM_DATA."""
-    if source in built_ins():
-        return source
-    root, here = os.environ.get(DATA_ROOT), Path(source).expanduser()
-    places = [here] if root is None else [here, Path(root).expanduser() / source]
-    return next((str(place.absolute()) for place in places if place.exists()), source)
+    """Return the whole path to where a source leads (:func:`place_of`); a built-in name, or nowhere, as it is."""
+    place = None if source in built_ins() else place_of(source)
+    return source if place is None else str(place.absolute())
+
+
+def place_of(path: str) -> Path | None:
+    """Return where a path leads, from here or from the folder VISLAM_DATA; None where nothing is."""
+    root, here = os.environ.get(DATA_ROOT), Path(path).expanduser()
+    places = [here] if root is None else [here, Path(root).expanduser() / path]
+    return next((place for place in places if place.exists()), None)
 
 
 def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int, progress: Progress) -> Measured:
@@ -175,19 +179,12 @@ def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
     # A metric without any value, as a NEES without a covariance, is none that could get lost.
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
     status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
-    return Series(status, speed, kept, _why(outcomes), arithmetic_of(outcomes))
+    why = next((one.why for one in outcomes if one.why), "")
+    return Series(status, speed, kept, why, arithmetic_of(outcomes))
 
 
 def _repeated(outcome: Outcome) -> tuple[Output, ...]:
     return ("final",) if outcome.final_is_causal else ()
-
-
-def _why(outcomes: Several[Outcome]) -> str:
-    """Return what the first run that did not end well says of it, in one line."""
-    for one in outcomes:
-        if one.status != "ok" and one.log:
-            return " ".join(one.log[0 if one.status == "failed" else -1].split())
-    return ""
 
 
 def reference_s() -> float:

@@ -23,7 +23,7 @@ from scipy.special import stdtr, stdtrit
 
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
@@ -144,7 +144,7 @@ def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
     where = pairs.where
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, words,
-        before=_mean(pairs.before), after=_mean(pairs.after), change_percent=change,
+        before=geometric_mean(pairs.before), after=geometric_mean(pairs.after), change_percent=change,
         allowed_percent=pairs.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
     )  # fmt: skip
 
@@ -154,7 +154,7 @@ def percent_text(change: float) -> str:
     return f"{change:+.1f} %" if abs(change) >= 0.1 else f"{change:+.1g} %"
 
 
-def _mean(values: Array) -> float:
+def geometric_mean(values: Array) -> float:
     """Return the geometric mean, whose ratio is the mean change."""
     return float(np.exp(log_of(values).mean()))
 
@@ -196,11 +196,6 @@ def holm(p_values: Array) -> Array:
     adjusted = np.empty_like(given)
     np.put_along_axis(adjusted, order, np.minimum(stepped, 1.0), axis=-1)
     return adjusted
-
-
-def rejected(p_values: Array, rate: float) -> BoolArray:
-    """Return which of m null hypotheses (..., m) fall at a family-wise false-alarm rate."""
-    return np.asarray(holm(p_values) <= rate)
 
 
 def smallest_seen(differences: Array, rate: float, power: float) -> float:

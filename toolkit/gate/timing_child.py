@@ -42,15 +42,15 @@ class Timer:
 
         self._settings = settings_of(asked["settings"], "the baseline's settings")
         truth = None if asked["truth"] is None else Path(asked["truth"])
-        noise, start, tracks = self._settings.noise, self._settings.start, self._settings.tracks
         recording = Recording(
             asked["source"],
             asked["seed"],
             truth,
-            start=start,
+            start=self._settings.start,
             duration_s=asked["duration_s"],
-            noise=noise,
-            tracks=tracks,
+            noise=self._settings.noise,
+            frontend=self._settings.frontend,
+            tracks=self._settings.tracks,
         )
         self._prepared = prepare(recording)
         return {}

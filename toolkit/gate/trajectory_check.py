@@ -1,6 +1,5 @@
 """Hold a folder of trajectories against a baseline, or make the baseline of one."""
 
-import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ import numpy as np
 from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
-from toolkit.gate.measuring import DATA_ROOT
-from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, holm, percent_text
+from toolkit.gate.measuring import place_of
+from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, geometric_mean, holm, percent_text
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, ScoredSequence, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
 from toolkit.gate.verdict import Check, Finding, Verdict
@@ -74,7 +73,7 @@ class FolderOfRuns:
         if not files:
             raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files if before else ())}")
         given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
-        path = self.truths.of(sequence) if before is None or given else _located(before.truth)
+        path = self.truths.of(sequence) if before is None or given else place_of(before.truth) or Path(before.truth)
         truth = read_stamped(path)
         names = tuple(str(file.relative_to(self.folder)) for file in files)
         if before is not None and truth.digest != before.truth_hash:
@@ -155,13 +154,6 @@ def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scori
     return now.scores
 
 
-def _located(truth: str) -> Path:
-    """Return where a baseline's truth is: from here, or from the folder VISLAM_DATA."""
-    root = os.environ.get(DATA_ROOT)
-    places = [Path(truth), *([] if root is None else [Path(root).expanduser() / truth])]
-    return next((place for place in places if place.exists()), places[0])
-
-
 def _scores_of(files: tuple[Path, ...], truth: Poses, scoring: Scoring) -> dict[str, Values]:
     by_file = [scores(read_stamped(file), truth, scoring) for file in files]
     return {key: tuple(one[key] for one in by_file) for key in scoring.metrics}
@@ -217,7 +209,7 @@ def _tested(
     where = one.where
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, words,
-        before=float(np.exp(np.log(one.before).mean())), after=float(np.exp(np.log(one.after).mean())),
+        before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
         seen_percent=100.0 * float(np.expm1(spread.seen(one.margin, each))),
     )  # fmt: skip

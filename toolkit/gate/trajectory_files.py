@@ -118,8 +118,8 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
         )
     fit = _FITS[scoring.align]
     computed: dict[str, Callable[[], float]] = {
-        f"ate_{scoring.align}_m": lambda: position_rmse(matched, fit(*_positions(matched))),
-        "ate_se3_deg": lambda: rotation_rmse_deg(matched, fit_se3(*_positions(matched))),
+        f"ate_{scoring.align}_m": lambda: position_rmse(matched, fit(*matched.positions)),
+        "ate_se3_deg": lambda: rotation_rmse_deg(matched, fit_se3(*matched.positions)),
         "rpe_100m_percent": lambda: hundred_metres_percent(matched),
         TIME_COVERAGE: lambda: time_coverage_percent(estimate.t_ns, truth.t_ns, scoring.gap_s),
     }
@@ -149,10 +149,6 @@ def matched_poses(estimate: Poses, truth: Poses) -> Matched:
     met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, truth_period_ns)
     t_ns = estimate.t_ns[met]
     return Matched(t_ns, true, estimate.poses[met], np.interp(t_ns, truth.t_ns, path_m))
-
-
-def _positions(matched: Matched) -> tuple[Array, Array]:
-    return matched.truth[:, :3, 3], matched.estimate[:, :3, 3]
 
 
 def _unless_unavailable(compute: Callable[[], float]) -> float | None:

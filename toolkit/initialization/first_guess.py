@@ -55,7 +55,7 @@ class _Seen:
 def guess_from_vision(sequence: Sequence) -> FirstGuess:
     """Return the states that the tracks alone show; the world is the first IMU frame."""
     poses = np.array(list(accumulate(_seen(sequence).T_before_after, np.matmul, initial=np.eye(4))))
-    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    t_s = sequence.frames_s
     return FirstGuess(poses, np.gradient(poses[:, :3, 3], t_s, axis=0), np.zeros(6))
 
 

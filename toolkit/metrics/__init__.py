@@ -154,9 +154,8 @@ def score_run(
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
         for file in _files_of(only):
             scores = _score_file(file, evaluation, requested)
-            declared = [metric.key for metric in file.METRICS]
-            if list(scores.values) != declared:
-                raise ValueError(f"{file} scored {list(scores.values)}, it declares {declared}")
+            if list(scores.values) != _keys(file):
+                raise ValueError(f"{file} scored {list(scores.values)}, it declares {_keys(file)}")
             values |= scores.values
             notes |= scores.notes
     return Scores(values, notes)
@@ -172,24 +171,19 @@ def _files_of(names: Collection[str] | None) -> tuple[MetricFile, ...]:
 
 def repeated(causal: Scores) -> Scores:
     """Return the scores of a final output that only repeats the causal one: the same, but what is causal alone."""
-    values, notes = dict(causal.values), dict(causal.notes)
+    final = causal
     for file in _found().files:
         if reason := _causal_only(file):
-            keys = [metric.key for metric in file.METRICS]
-            values |= dict.fromkeys(keys)
-            notes |= dict.fromkeys(keys, reason)
-    return Scores(values, notes)
+            final = final.without(_keys(file), reason)
+    return final
 
 
 def without_requests(scores: Scores, requested: Collection[str]) -> Scores:
     """Return the scores as they are where no metrics on request but the ``requested`` were computed."""
-    values, notes = dict(scores.values), dict(scores.notes)
     for file in _found().files:
         if (switch := _on_request(file)) and switch not in requested:
-            keys = [metric.key for metric in file.METRICS]
-            values |= dict.fromkeys(keys)
-            notes |= dict.fromkeys(keys, _how_to_request(switch))
-    return Scores(values, notes)
+            scores = scores.without(_keys(file), _how_to_request(switch))
+    return scores
 
 
 def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[str]) -> Scores:
@@ -201,8 +195,11 @@ def _score_file(file: MetricFile, evaluation: Evaluation, requested: Collection[
             raise Unavailable(reason)
         return file.score(evaluation)
     except Unavailable as lacking:
-        keys = [metric.key for metric in file.METRICS]
-        return Scores(dict.fromkeys(keys), dict.fromkeys(keys, str(lacking)))
+        return Scores.none(_keys(file), str(lacking))
+
+
+def _keys(file: MetricFile) -> list[str]:
+    return [metric.key for metric in file.METRICS]
 
 
 def _causal_only(file: MetricFile) -> str:

@@ -74,8 +74,8 @@ def score(evaluation: AgainstTruth) -> Scores:
         {
             "ate_none_m": lambda: rmse(_distances(evaluation.compared, evaluation.placed)),
             "ate_se3_m": lambda: position_rmse(evaluation.compared, evaluation.se3_alignment),
-            "ate_yaw_m": lambda: position_rmse(evaluation.compared, fit_yaw(*_positions(evaluation))),
-            "ate_sim3_m": lambda: position_rmse(evaluation.compared, fit_sim3(*_positions(evaluation))),
+            "ate_yaw_m": lambda: position_rmse(evaluation.compared, fit_yaw(*evaluation.compared.positions)),
+            "ate_sim3_m": lambda: position_rmse(evaluation.compared, fit_sim3(*evaluation.compared.positions)),
             "ate_se3_deg": lambda: rotation_rmse_deg(evaluation.compared, evaluation.se3_alignment),
         }
     )
@@ -96,10 +96,6 @@ def _telling_tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float | None:
         return None
     tilt_deg = float(np.degrees(np.arccos(np.clip(evaluation.se3_alignment.rotation[2, 2], -1.0, 1.0))))
     return tilt_deg if tilt_deg >= _TILTED_DEG else None
-
-
-def _positions(evaluation: AgainstTruth) -> tuple[Array, Array]:
-    return evaluation.compared.truth[:, :3, 3], evaluation.compared.estimate[:, :3, 3]
 
 
 def _distances(matched: Matched, poses: Array) -> Array:

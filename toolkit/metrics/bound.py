@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics._shared.consistency import body_errors, normalised, stated_errors
+from toolkit.metrics._shared.consistency import body_errors, stated_errors
 from toolkit.metrics._shared.cramer_rao import claimed_bound, efficient
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 from toolkit.metrics._shared.state_errors import NO_SUCH_BLOCK, state_errors
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, POSITION, ROTATION, Layout
 
@@ -163,7 +164,8 @@ def _rms(bound: Array, block: slice) -> float:
 
 
 def _excess(excess: Array, bound: Array, block: slice) -> float:
-    return float(np.mean(normalised(excess[:, block], bound[:, block, block]))) / float(block.stop - block.start)
+    squared = mahalanobis_squared(excess[:, block], bound[:, block, block])
+    return float(np.mean(squared)) / float(block.stop - block.start)
 
 
 def _claimed(stated: Array, bound: Array, block: slice) -> float:

@@ -6,8 +6,8 @@ Needs no ground truth, and overfitting does not lower it: the points come from t
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS
-from toolkit.metrics._shared.residuals import median_px, rmse_px, scored_remark
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import pixel_scores
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 
 ORDER = 60
 METRICS = (
@@ -35,12 +35,8 @@ METRICS = (
 
 def score(evaluation: Evaluation) -> Scores:
     """Score how well the evaluated poses predict the withheld tracks."""
-    errors_px = errors(evaluation)
-    scores = evaluate(
-        {"heldout_reproj_median_px": lambda: median_px(errors_px), "heldout_reproj_rmse_px": lambda: rmse_px(errors_px)}
-    )
     lacking = f"belong to frames without a pose or to tracks with fewer than {FEWEST_VIEWS} posed views"
-    return scores.remarked(scores.values, scored_remark(errors_px, len(evaluation.sequence.held_out), lacking))
+    return pixel_scores("heldout_reproj", errors(evaluation), len(evaluation.sequence.held_out), lacking)
 
 
 def errors(evaluation: Evaluation) -> Array:

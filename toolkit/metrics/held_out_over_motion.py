@@ -16,7 +16,6 @@ from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS, errors_left_out
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 from toolkit.models.motion import belief_at, integrated, motion_model
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
 ORDER = 61
@@ -85,7 +84,7 @@ def _paired(evaluation: Evaluation) -> _Paired:
             f"{ids.size} withheld tracks have {FEWEST_VIEWS} views from frames with a pose; {_FEWEST_TRACKS} are needed"
         )
     apart = 0.5 * np.log((errors_px**2 + _FLOOR_PX**2) / (by_motion_px**2 + _FLOOR_PX**2))
-    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0])[tracks.frame] / NS_PER_S
+    t_s = sequence.frames_s[tracks.frame]
     return _Paired(np.bincount(track, apart) / count, np.bincount(track, t_s) / count)
 
 

@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.residuals import median_px, reprojection_errors_px, rmse_px, scored_remark
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics._shared.residuals import pixel_scores, reprojection_errors_px
+from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
 from toolkit.models import stereo
 
 ORDER = 50
@@ -30,10 +31,8 @@ METRICS = (
 
 def score(evaluation: Evaluation) -> Scores:
     """Score the reprojection of the run's landmarks from the evaluated poses."""
-    errors_px = errors(evaluation)
-    scores = evaluate({"reproj_median_px": lambda: median_px(errors_px), "reproj_rmse_px": lambda: rmse_px(errors_px)})
     lacking = "lack a landmark, a second sighting or a pose of their frame"
-    return scores.remarked(scores.values, scored_remark(errors_px, len(evaluation.sequence.visible), lacking))
+    return pixel_scores("reproj", errors(evaluation), len(evaluation.sequence.visible), lacking)
 
 
 def errors(evaluation: Evaluation) -> Array:
@@ -58,9 +57,8 @@ def _errors_of_sightings(evaluation: Evaluation) -> tuple[IntArray, Array]:
     if not len(landmarks):
         raise Unavailable("the estimator has no landmarks")
     observations = evaluation.sequence.visible
-    row = np.minimum(np.searchsorted(landmarks.track_ids, observations.track_id), len(landmarks) - 1)
-    known = (landmarks.track_ids[row] == observations.track_id) & evaluation.has_pose[observations.frame]
-    known &= _seen_again(observations.track_id)
+    row, has_landmark = rows_of(observations.track_id, landmarks.track_ids)
+    known = has_landmark & evaluation.has_pose[observations.frame] & _seen_again(observations.track_id)
     T_cam_world = se3_inverse(evaluation.poses_of_frames @ rig.T_imu_cam)
     points_cam = transform(T_cam_world[observations.frame[known]], landmarks.points_world[row[known]])
     uv_predicted_px = stereo.project(points_cam, rig)

@@ -5,7 +5,7 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 
 import numpy as np
 
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time
+from toolkit.metrics._shared.consistency import PLACED, POSE_DOF, nees_band, nees_over_time
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Metric, Scores
 
@@ -50,9 +50,6 @@ METRICS = (
         in_contract=True,
     ),
 )
-_PLACED = (
-    "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
-)
 
 
 def score(evaluation: Evaluation) -> Scores:
@@ -67,4 +64,4 @@ def score(evaluation: Evaluation) -> Scores:
             "nees_pose_in_band_percent": 100.0 * float(np.mean((nees.pose >= low) & (nees.pose <= high))),
         }
     )
-    return scores.remarked(scores.values, _PLACED if nees.placed else "")
+    return scores.remarked(scores.values, PLACED if nees.placed else "")

@@ -7,10 +7,11 @@ may state its pose honestly and its biases not; the error then shows in the pose
 from collections.abc import Callable
 
 from toolkit.geometry import Array
-from toolkit.metrics._shared.consistency import normalised, stated_errors
+from toolkit.metrics._shared.consistency import stated_errors
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.metrics._shared.state_errors import NO_SUCH_BLOCK, bias_errors, layout_of, velocity_errors
+from toolkit.models.gating import mahalanobis_squared
 
 ORDER = 76
 METRICS = tuple(
@@ -37,7 +38,7 @@ def score(evaluation: Evaluation) -> Scores:
     def mean(block: slice | None, errors: Callable[[], Array]) -> float:
         if block is None:
             raise Unavailable(NO_SUCH_BLOCK)
-        return float(normalised(errors(), stated.cov[:, block, block]).mean()) / 3.0
+        return float(mahalanobis_squared(errors(), stated.cov[:, block, block]).mean()) / 3.0
 
     return evaluate(
         {

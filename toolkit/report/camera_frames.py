@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.datasets import tracked_images
+from toolkit.documents import numbers
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.frontend import ImageRecording
@@ -19,8 +20,8 @@ from toolkit.frontend.tracking import read_pairs
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import errors_left_out
+from toolkit.report.curves import seconds
 from toolkit.report.records.report import CameraFrame, TrackErrors
-from toolkit.report.report_json import numbers, seconds
 from toolkit.sequence import Sequence
 
 FOLDER = "frames"
@@ -50,7 +51,7 @@ def camera_frames(comparison: Comparison) -> tuple[SeenFrame, ...]:
         here = np.flatnonzero(sequence.observations.frame == k)
         uv_px = sequence.observations.uv_px[here]
         frame = CameraFrame(
-            t_s=seconds(sequence.frames_t_ns[[k]], int(sequence.frames_t_ns[0]))[0],
+            t_s=seconds(sequence, sequence.frames_t_ns[[k]])[0],
             image=f"{FOLDER}/{int(sequence.frames_t_ns[k])}.jpg",
             width_px=image.shape[1],
             height_px=image.shape[0],

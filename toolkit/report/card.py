@@ -5,11 +5,12 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import UNSET
 
+from toolkit.documents import number, rounded
 from toolkit.geometry import Array
-from toolkit.report.messages import sequence_line
+from toolkit.report.header import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.records.card import CardRecord
-from toolkit.report.table import Table, as_text
+from toolkit.report.table import MISSING, Table, as_text
 from toolkit.sequence import Sequence
 from toolkit.track_errors import Card
 
@@ -17,7 +18,7 @@ from toolkit.track_errors import Card
 _MANY_AT_ODDS, _MANY_BLIND, _FEW_FRAMES = 0.05, 0.02, 5.0
 # A scale is off where it is so many standard errors and so much away from one.
 _SIGMAS, _SCALE_OFF = 3.0, 0.005
-_DIGITS = 6
+_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
 
 
 def card_lines(card: Card) -> Iterator[str]:
@@ -45,9 +46,6 @@ def card_lines(card: Card) -> Iterator[str]:
             "on the measured motion alone, and no smoother repairs what that gets wrong"
         )
     yield from _scale(card)
-
-
-_STRAYS = ": moving objects or mismatches that last; the outlier policy decides more than the estimator does"
 
 
 def _noise(card: Card) -> str:
@@ -109,7 +107,7 @@ def card_text(sequence: Sequence, card: Card, width: Width = WIDTH) -> str:
 
 
 def _cell(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else "-"
+    return f"{value:.2f}" if np.isfinite(value) else MISSING
 
 
 def card_record(card: Card) -> CardRecord:
@@ -118,7 +116,7 @@ def card_record(card: Card) -> CardRecord:
     return CardRecord(
         schema="vislam.card/1",
         tracks=card.tracks,
-        tracks_a_frame=_short(card.a_frame),
+        tracks_a_frame=rounded(card.a_frame),
         seen_frames=_three(card.seen_frames),
         depth_m=_three(card.depth_m),
         intervals=card.intervals,
@@ -127,33 +125,26 @@ def card_record(card: Card) -> CardRecord:
         white_px=_three(card.noise.white_px),
         walk_px=_three(card.noise.walk_px),
         offset_px=_three(card.noise.offset_px),
-        degrees_of_freedom=_short(card.degrees),
-        gain=_short(card.gain),
-        gain_error=_short(card.gain_error),
+        degrees_of_freedom=rounded(card.degrees),
+        gain=rounded(card.gain),
+        gain_error=rounded(card.gain_error),
         correlation=_lags(card.correlation),
         structure_px2=_lags(card.structure_px2),
         fitted_px2=_lags(card.fitted_px2),
-        left_right_correlation=_short(card.left_right),
-        tails=_short(card.tails),
-        at_odds=_short(card.at_odds),
-        scale=None if scale is None else _short(scale.value),
-        scale_error=None if scale is None else _short(scale.error),
-        left_out=UNSET if card.left_out is None else _short(card.left_out),
+        left_right_correlation=rounded(card.left_right),
+        tails=rounded(card.tails),
+        at_odds=rounded(card.at_odds),
+        scale=None if scale is None else rounded(scale.value),
+        scale_error=None if scale is None else rounded(scale.error),
+        left_out=UNSET if card.left_out is None else rounded(card.left_out),
         words=tuple(card_lines(card)),
     )
 
 
-def _short(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
-
-
 def _three(values: Array) -> tuple[float, float, float]:
-    first, second, third = map(_short, values.tolist())
+    first, second, third = map(rounded, values.tolist())
     return first, second, third
 
 
 def _lags(rows: Array) -> tuple[tuple[float | None, float | None, float | None], ...]:
-    def number(value: float) -> float | None:
-        return _short(value) if np.isfinite(value) else None
-
     return tuple((number(row[0]), number(row[1]), number(row[2])) for row in rows.tolist())

@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from toolkit import datasets
-from toolkit.discovery import FoundModule
+from toolkit.discovery import FoundModule, shown_name
 from toolkit.errors import VislamError, no_such
 from toolkit.estimator import discover
 from toolkit.report.records import read_manifest
@@ -72,7 +72,7 @@ def _meant(name: str, known: Mapping[str, FoundModule]) -> list[tuple[str, Found
         return [(name, known[name])]
     path = Path(name)
     if path.suffix == ".py" and path.is_file():
-        return [(path.stem.replace("_", "-"), FoundModule(path.stem, path))]
+        return [(shown_name(path.stem), FoundModule(path.stem, path))]
     if not path.is_dir():
         raise VislamError(f"{no_such('estimator or format', name, known)}, or name a run directory")
     manifest = read_manifest(path / MANIFEST)

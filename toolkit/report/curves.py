@@ -21,6 +21,7 @@ from toolkit.metrics._shared.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.sequence import Sequence, Truth
 
+_MICROSECONDS = 6
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
 
 
@@ -33,14 +34,14 @@ class Errors(NamedTuple):
     heading_deg: Array
 
 
-class Answer(NamedTuple):
+class ReferenceEstimate(NamedTuple):
     """A trajectory that others are measured against where there is no truth, and how to call it."""
 
     name: str
     trajectory: Trajectory
 
 
-def last_good_answer(comparison: Comparison) -> Answer | None:
+def reference_estimate(comparison: Comparison) -> ReferenceEstimate | None:
     """Return the last trajectory made here of a run that is ok: with the defaults, the smoother's.
 
     Only where there is none is it one that was read from a file; None where no run is ok.
@@ -49,7 +50,7 @@ def last_good_answer(comparison: Comparison) -> Answer | None:
     for row in reversed(made_here_last):
         trajectory = row.run.trajectory(row.output)
         if row.status == "ok" and trajectory is not None:
-            return Answer(f"{row.estimator} {row.output}", trajectory)
+            return ReferenceEstimate(f"{row.estimator} {row.output}", trajectory)
     return None
 
 
@@ -66,8 +67,7 @@ def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
     """Return the fit of a run to the truth, or no alignment where there is no truth or no fit."""
     fit = fit_yaw if sequence.motion_kind == "imu" else fit_se3
     try:
-        pairs = Evaluation(run, output, sequence).compared
-        return fit(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+        return fit(*Evaluation(run, output, sequence).compared.positions)
     except Unavailable:
         return NOT_ALIGNED
 
@@ -93,6 +93,11 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
         np.linalg.norm(aligned[:, :3, 3] - pairs.truth[:, :3, 3], axis=1),
         np.degrees((heading + np.pi) % (2.0 * np.pi) - np.pi),
     )
+
+
+def seconds(sequence: Sequence, t_ns: IntArray) -> tuple[float, ...]:
+    """Return stamps (N,) as seconds from the first frame, to the microsecond."""
+    return tuple(round(t, _MICROSECONDS) for t in sequence.elapsed_s(t_ns).tolist())
 
 
 def shown_output(run: Run) -> Output:
@@ -123,7 +128,7 @@ class ErrorCurves(NamedTuple):
 
 def error_curves(comparison: Comparison) -> ErrorCurves | None:
     """Return every row's errors (with truth) or differences (without), or None where no row has any."""
-    reference = _truth(comparison) or _answer(comparison)
+    reference = _from_truth(comparison) or _from_estimate(comparison)
     if reference is None:
         return None
     curves: list[tuple[Row, Errors]] = []
@@ -139,7 +144,7 @@ def error_curves(comparison: Comparison) -> ErrorCurves | None:
     return ErrorCurves(curves, reference.what, reference.caption) if curves else None
 
 
-def _truth(comparison: Comparison) -> _Reference | None:
+def _from_truth(comparison: Comparison) -> _Reference | None:
     sequence = comparison.sequence
     truth = truth_during(sequence)
     if truth is None:
@@ -151,16 +156,16 @@ def _truth(comparison: Comparison) -> _Reference | None:
     return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
 
 
-def _answer(comparison: Comparison) -> _Reference | None:
-    answer = last_good_answer(comparison)
-    if answer is None:
+def _from_estimate(comparison: Comparison) -> _Reference | None:
+    estimate = reference_estimate(comparison)
+    if estimate is None:
         return None
     caption = (
-        f"There is no truth: position and heading difference from {answer.name}, not aligned. "
+        f"There is no truth: position and heading difference from {estimate.name}, not aligned. "
         "A difference says that two estimators disagree, not which of them is right."
     )
-    as_truth = Truth(answer.trajectory.t_ns, answer.trajectory.T_world_imu)
-    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {answer.name}", caption, answer.trajectory)
+    as_truth = Truth(estimate.trajectory.t_ns, estimate.trajectory.T_world_imu)
+    return _Reference(as_truth, lambda _: NOT_ALIGNED, f"difference from {estimate.name}", caption, estimate.trajectory)
 
 
 class Components(NamedTuple):
@@ -176,7 +181,7 @@ class Components(NamedTuple):
 
 
 def components(comparison: Comparison, row: Row) -> Components | None:
-    """Return the errors of an output as the NEES takes them, or without truth its difference from the last answer.
+    """Return the errors of an output as the NEES takes them, or without truth its difference from the last estimate.
 
     Returns None where there is neither.
     """
@@ -194,7 +199,7 @@ def components(comparison: Comparison, row: Row) -> Components | None:
 
 
 def _difference(comparison: Comparison, row: Row) -> Components | None:
-    reference, trajectory = last_good_answer(comparison), row.run.trajectory(row.output)
+    reference, trajectory = reference_estimate(comparison), row.run.trajectory(row.output)
     if reference is None or trajectory is None or trajectory is reference.trajectory:
         return None
     t_ns, mine, theirs = np.intersect1d(trajectory.t_ns, reference.trajectory.t_ns, return_indices=True)

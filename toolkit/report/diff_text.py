@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from toolkit.documents import of_attributes
+from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric, known_metrics
-from toolkit.report.differences import FALSE_ALARM_RATE, Change, Differences, MetricChange
+from toolkit.report.differences import Change, Differences, MetricChange
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.table import MISSING, Table, as_text, cell
 

@@ -13,14 +13,13 @@ import numpy as np
 from msgspec import UNSET, to_builtins
 
 from toolkit.estimate import Status
-from toolkit.gate.baseline import Criterion
+from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.run_files import RunFiles, SeedsFiles
 
 Files = RunFiles | SeedsFiles
-FALSE_ALARM_RATE = 0.05
 _SAME = 1e-6
 _FEWEST_PAIRS = 2
 _COSTS = frozenset(metric.key for metric in cost.METRICS)

@@ -6,10 +6,11 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import FALSE_ALARM_RATE, Cell, Evaluation, PairedTest
+from toolkit.evaluation.standings import Cell, Evaluation, PairedTest
 from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
-from toolkit.report.prose import WIDTH, Width, filled, in_markdown, section
+from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
 from toolkit.report.table import MISSING, Table, as_latex, as_markdown, as_text, cell, heading
 
 # Beside the metric that ranks, where there are values.
@@ -87,13 +88,13 @@ def sequences_table(evaluation: Evaluation) -> Table:
     rows, best = [], set()
     for i, sequence in enumerate(evaluation.sequences):
         cells = [evaluation.cells[system, sequence] for system in systems]
-        rows.append((sequence, *(_told(one, metric) for one in cells)))
+        rows.append((sequence, *(_median_and_failures(one, metric) for one in cells)))
         if len(systems) > 1:
             best |= {(i, 1 + j) for j in _best([one.median(metric) for one in cells], metric)}
     return Table(heads, tuple(rows), labels=1, best=frozenset(best))
 
 
-def _told(runs: Cell, metric: Metric) -> str:
+def _median_and_failures(runs: Cell, metric: Metric) -> str:
     """Return the median of the runs of a system on a sequence, and how many of them failed."""
     failed = f"{runs.failed} of {len(runs.runs)} failed" if runs.failed else ""
     median = runs.median(metric)
@@ -204,13 +205,9 @@ def evaluation_markdown(evaluation: Evaluation, columns: tuple[Metric, ...] = ()
     parts.append(as_markdown(leaderboard_table(evaluation, columns)))
     if len(evaluation.sequences) > 1:
         parts += [f"## {evaluation.ranked_by.name} by sequence", as_markdown(sequences_table(evaluation))]
-    for title, lines in (
-        ("Pairs", paired_lines(evaluation)),
-        ("Failed", failure_lines(evaluation)),
-        ("Notes", note_lines(evaluation)),
-    ):
-        entries = [f"- {in_markdown(line)}" for line in lines]
-        parts += [f"## {title}", "\n".join(entries)] if entries else []
+    parts += markdown_section("Pairs", paired_lines(evaluation))
+    parts += markdown_section("Failed", failure_lines(evaluation))
+    parts += markdown_section("Notes", note_lines(evaluation))
     return "\n\n".join(parts) + "\n"
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
-from toolkit.files import replaced_file
+from toolkit.files import write_text
 from toolkit.report.records import Report
 from toolkit.report.run_files import SeedsFiles, read_run
 
@@ -29,8 +29,7 @@ def export(directory: Path, estimator: str | None, output: Output | None, format
     if format_name == "kitti":
         _check_every_frame(what, trajectory, run.scores.sequence.frames)
     text = FORMATS[format_name].text(trajectory)
-    with replaced_file(target) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(target, text)
     return f"{what}, {len(trajectory)} poses"
 
 

@@ -6,23 +6,20 @@ And the files it leaves behind, each only where it is asked for: JUnit XML, Mark
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
 from xml.etree import ElementTree
 
 from toolkit.documents import of_attributes, to_text
-from toolkit.errors import OutputError, printable
-from toolkit.files import check_parent, replaced_file
+from toolkit.errors import printable
+from toolkit.files import write_text
 from toolkit.gate.judging import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import known_metrics
-from toolkit.report.manifest import cpu_model, git_revision
 from toolkit.report.prose import WIDTH, Width, section
 from toolkit.report.records.check import CheckDocument, VerdictRecord
-from toolkit.report.table import Table, as_markdown, as_text, number
+from toolkit.report.table import MISSING, Table, as_markdown, as_text, number
 
-_MISSING = "-"
 _FAILED: Mapping[Finding, str] = {
     "regressed": "got worse",
     "moved": "moved",
@@ -61,18 +58,18 @@ def _row(verdict: Verdict) -> tuple[str, ...]:
         _percent(verdict.change_percent, sign="+"),
         _percent(verdict.allowed_percent),
         _percent(verdict.seen_percent),
-        _MISSING if verdict.p is None else f"{verdict.p:.2g}",
+        MISSING if verdict.p is None else f"{verdict.p:.2g}",
     )
-    return (*(_escaped(label) or _MISSING for label in labels), *numbers)
+    return (*(_escaped(label) or MISSING for label in labels), *numbers)
 
 
 def _value(value: float | None) -> str:
-    return _MISSING if value is None else number(value, 4)
+    return MISSING if value is None else number(value, 4)
 
 
 def _percent(value: float | None, sign: str = "") -> str:
     if value is None:
-        return _MISSING
+        return MISSING
     # A change that is shown must not be printed as none.
     small = 100.0 * SHOWN <= abs(value) < 0.05
     return f"{value:{sign}.0e}" if small else f"{value + 0.0:{sign}.1f}"
@@ -226,30 +223,7 @@ WRITERS: Mapping[str, Callable[[Check], str]] = {
 }
 
 
-def check_writable(path: Path) -> None:
-    """Raise OutputError unless a file can be written at ``path``; replaces nothing."""
-    if path.is_dir():
-        raise OutputError(f"{path} is a directory; name a file")
-    check_parent(path.parent)
-
-
 def write_check(check: Check, files: Mapping[str, Path]) -> None:
     """Write a check in each of the kinds of WRITERS that has a file; raise OutputError where one cannot be written."""
     for kind, path in files.items():
         write_text(path, WRITERS[kind](check))
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file at once or not at all, in the place of an earlier one if there is one."""
-    with replaced_file(path) as partial:
-        partial.write_text(text, encoding="utf-8")
-
-
-def made_here(command: str) -> dict[str, str]:
-    """Return what a baseline says of how, when and where it was made."""
-    return {
-        "command": command,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git_revision": git_revision() or "not from a checkout",
-        "cpu": cpu_model(),
-    }

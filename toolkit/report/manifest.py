@@ -1,4 +1,7 @@
-"""How a run can be repeated: the command, every version, the data's hash, seeds, threads and the machine."""
+"""How a run can be repeated: the command, every version, the data's hash, seeds, threads and the machine.
+
+And, in short, how a baseline was made.
+"""
 
 import os
 import platform
@@ -15,11 +18,12 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
 
 _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "TBB_NUM_THREADS")
+_THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")
 
 
 def manifest_document(comparison: Comparison, command: str, asked: Configuration) -> Manifest:
@@ -32,9 +36,9 @@ def manifest_document(comparison: Comparison, command: str, asked: Configuration
         command=command,
         compare=request,
         settings=asked.settings,
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        date=_now(),
         versions={"python": platform.python_version(), **versions},
-        git_revision=git_revision(),
+        git_revision=_git_revision(),
         sequence=_recording(comparison.sequence),
         start=comparison.prior.source,
         estimators=here,
@@ -42,9 +46,23 @@ def manifest_document(comparison: Comparison, command: str, asked: Configuration
         seeds=SeedsUsed(sequence=comparison.seeds[0], count=len(comparison.seeds) if comparison.over_seeds else UNSET),
         threads=_threads(comparison),
         arithmetic=_arithmetic(comparison),
-        cpu=cpu_model(),
+        cpu=_cpu_model(),
         os=platform.platform(),
     )
+
+
+def made_here(command: str) -> dict[str, str]:
+    """Return what a baseline says of how, when and where it was made."""
+    return {
+        "command": command,
+        "date": _now(),
+        "git_revision": _git_revision() or "not from a checkout",
+        "cpu": _cpu_model(),
+    }
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _run_here(comparison: Comparison) -> tuple[str, ...]:
@@ -73,7 +91,7 @@ def _recording(sequence: Sequence) -> Recording:
     )
 
 
-def git_revision() -> str | None:
+def _git_revision() -> str | None:
     """Return the commit the toolkit is checked out at, ``-dirty`` where it was edited, or None.
 
     A package installed somewhere inside another project's checkout is not at that project's revision.
@@ -94,7 +112,7 @@ def git_revision() -> str | None:
     return described.stdout.strip() or None
 
 
-def cpu_model() -> str:
+def _cpu_model() -> str:
     """Return the processor's name as the system tells it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()

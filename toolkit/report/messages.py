@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
@@ -11,10 +11,7 @@ from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
-from toolkit.report.scores_json import path_length_m
-from toolkit.report.table import Columns, cell, explained_metrics, number, shared_values, shown_metrics
-from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Window, outliers_in_words
+from toolkit.report.table import Columns, cell, explained_metrics, number, shown_metrics
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0
@@ -37,10 +34,6 @@ _MOST_SEEDS = 10_000
 # Remarks on these stand beside the table, the others at the end of the report only.
 _AGAINST_TRUTH = "ate_"
 _BLIND = "the recording has no image features: every estimator can only integrate the measured motion"
-_WITHOUT_TRUTH = (
-    "without ground truth the table shows how well an estimate explains tracks that none was given (held-out) and what "
-    "it cost, the notes whether its innovations fit its covariance; not how far it is from the true path"
-)
 _STATUS = {
     "diverged": (
         "diverged: it ran to the end, but its answers left what is physically plausible. That is a result, not a "
@@ -48,77 +41,6 @@ _STATUS = {
     ),
     "failed": "failed: it could not go on. What it had said until then, if anything, is kept and scored.",
 }
-
-
-def sequence_line(sequence: Sequence) -> str:
-    """Return the recording in one line: size, duration, true path, motion."""
-    path_m = path_length_m(sequence)
-    sightings = (
-        f"{len(sequence.observations)} stereo observations" if len(sequence.observations) else "no image features"
-    )
-    path = "no ground truth" if path_m is None else f"true path {path_m:.0f} m"
-    motion = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}[
-        sequence.motion_kind
-    ]
-    return f"{sequence.name}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, {sightings}, {motion}, {path}"
-
-
-def header_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield what stands above a table: the recording, pairs and coverage the rows share, the common rules, warnings.
-
-    The warnings are the audit's: they hold for every row, whatever its status.
-    """
-    seeds = f", seeds {comparison.seeds[0]} to {comparison.seeds[-1]}" if comparison.over_seeds else ""
-    yield sequence_line(comparison.sequence) + seeds
-    shared = ", ".join(shared_values(comparison, columns))
-    if shared:
-        yield f"scored: {shared}"
-    yield rules_line(comparison)
-    warnings = [finding.fault for finding in comparison.findings if finding.warning or finding.blocking]
-    if warnings:
-        yield f"whatever its status, no result stands without what the audit says of: {', '.join(warnings)}"
-    if comparison.sequence.truth is None and len(comparison.sequence.observations):
-        yield _WITHOUT_TRUTH
-
-
-def rules_line(comparison: Comparison) -> str:
-    """Return the rules that estimators had in common: the window, whether its cap binds, the outlier policy."""
-    settings, sequence = comparison.settings, comparison.sequence
-    window = settings.window
-    left_out = _left_out(sequence, window)
-    thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
-    return (
-        f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
-        f"outliers: {outliers_in_words(settings.outliers)}"
-        f"{_track_noise(settings.noise)}{_optional_parts(settings.noise)}"
-    )
-
-
-def _track_noise(noise: Noise) -> str:
-    """Say what the errors of a track are taken for, where they are not taken for white."""
-    if noise.tracks == "white":
-        return ""
-    if noise.tracks == "correlated":
-        return "; noise of tracks: correlated, as stated"
-    basis = "the whole recording" if noise.track_fit_s is None else f"the first {noise.track_fit_s:g} s"
-    return f"; noise of tracks: fitted to {basis}, which causal answers know too early"
-
-
-def _optional_parts(noise: Noise) -> str:
-    """Say what is taken into account besides, where it is not as by default."""
-    sigma = noise.disparity_scale
-    scale = "" if sigma is None else f"; disparities scaled by 0 +- {100.0 * sigma:g} %, a state"
-    return f"{scale}{'' if noise.bridge_gaps else '; gaps between tracks not bridged'}"
-
-
-def _left_out(sequence: Sequence, window: Window) -> int:
-    """Return how many frames have no state in a window, for it would hold too many."""
-    last, left_out = -1, 0
-    for since_ns in (sequence.frames_t_ns - sequence.frames_t_ns[:1]).tolist():
-        interval = window.interval(since_ns, sequence.motion_kind)
-        left_out += interval == last
-        last = interval
-    return left_out
 
 
 def finding_lines(comparison: Comparison) -> Iterator[str]:
@@ -184,11 +106,8 @@ def _ends_over_seeds(comparison: Comparison) -> Iterator[str]:
         for status in ("diverged", "failed"):
             bad = [o for o in comparison.outcomes if o.estimator == estimator and o.status == status]
             if bad:
-                log = bad[0].log
-                # A run that failed begins with the reason; the runner appends what diverged to the estimator's log.
-                why = f": {' '.join(log[0 if status == 'failed' else -1].split())}" if log else ""
-                seeds = f"seed{'s' if len(bad) > 1 else ''} {', '.join(str(o.seed) for o in bad)}"
-                yield f"{estimator} {status} under {seeds}{why}"
+                why = f": {bad[0].why}" if bad[0].why else ""
+                yield f"{estimator} {status} under {_seeds(o.seed for o in bad)}{why}"
     if not comparison.all_ok:
         yield "means and spreads are over the runs that are ok; seeds.json has every run's values"
         yield from _medians_of_all(comparison)
@@ -205,7 +124,7 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
         if found is not None:
             ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
             median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
-            told.append(f"{row.estimator}{'' if row.label == 'both' else f' {row.output}'} {median} ({ended})")
+            told.append(f"{_of(row)} {median} ({ended})")
     if told:
         what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
         yield f"{what}: {'; '.join(told)}"
@@ -252,8 +171,8 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
     for row in comparison.lines:
         harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
         if harmed and comparison.over_seeds:
-            under = f"seed{'s' if len(harmed) > 1 else ''} {', '.join(str(seed) for seed, _ in harmed)}"
-            yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {under}"
+            seeds = _seeds(seed for seed, _ in harmed)
+            yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {seeds}"
         elif harmed:
             yield f"{_of(row)} {harmed[0][1]}"
 
@@ -268,6 +187,12 @@ def _remark_on(key: str, scored: Scored | None) -> str:
 def _of(row: Row) -> str:
     """Name a row: by its estimator alone where one line serves for both outputs."""
     return row.estimator if row.label == "both" else f"{row.estimator} {row.output}"
+
+
+def _seeds(seeds: Iterable[int]) -> str:
+    """Name seeds: "seed 3", "seeds 3, 5"."""
+    given = list(map(str, seeds))
+    return f"seed{'s' if len(given) > 1 else ''} {', '.join(given)}"
 
 
 def _figure(value: float) -> str:
@@ -315,8 +240,7 @@ def paired_lines(comparison: Comparison) -> Iterator[str]:
         for row in rows[1:]:
             found = paired(row.good_values(metric.key), rows[0].good_values(metric.key))
             if found is not None:
-                who = f"{row.estimator}{'' if row.label == 'both' else f' {output}'}"
-                yield f"{who}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
+                yield f"{_of(row)}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
 
 
 def _difference(found: Paired, metric: Metric, best: str) -> str:

@@ -33,6 +33,14 @@ def in_markdown(text: str) -> str:
     return _MARKUP.sub(r"\\\g<0>", printable(text))
 
 
+def markdown_section(title: str, entries: Iterable[str]) -> Iterator[str]:
+    """Yield the heading and the list of a section of Markdown, each a paragraph; nothing where there is no entry."""
+    lines = [f"- {in_markdown(entry)}" for entry in entries]
+    if lines:
+        yield f"## {title}"
+        yield "\n".join(lines)
+
+
 def section(title: str, entries: Iterable[str], width: Width) -> Iterator[str]:
     """Yield entries under a title that stands before the first."""
     for i, entry in enumerate(entries):

@@ -1,15 +1,15 @@
 """What a report draws and says beyond the scores, as a record: ``report.json``, of one seed or over many."""
 
-import math
 from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from toolkit.documents import number, numbers, rounded
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
-from toolkit.geometry import Array, IntArray
+from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics._shared.scores import Unavailable
@@ -21,16 +21,16 @@ from toolkit.report.curves import (
     components,
     error_curves,
     onto_truth,
+    seconds,
     shown_output,
     truth_during,
 )
+from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
-    header_lines,
     note_lines,
     outcome,
     remark_lines,
-    sequence_line,
 )
 from toolkit.report.records.report import (
     AuditWords,
@@ -44,7 +44,6 @@ from toolkit.report.records.report import (
     MeanNeesSeries,
     NeesSeries,
     NisSeries,
-    Numbers,
     Report,
     SeedsReport,
     SeedsWords,
@@ -52,12 +51,10 @@ from toolkit.report.records.report import (
     Vector,
     Words,
 )
-from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence
 
 TRUTH_FILE = "trajectories/truth.tum"
 
-_SIGNIFICANT_DIGITS = 6
-_MICROSECONDS = 6
 
 Series = TypeVar("Series", NeesSeries, NisSeries)
 
@@ -94,7 +91,7 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
     """Return what the report over seeds draws and says; its runs are those of seeds.json, in its order."""
     return SeedsReport(
         schema="vislam.report/1",
-        t_s=tuple(_short(t) for t in over.frames_s.tolist()),
+        t_s=tuple(map(rounded, over.sequence.frames_s.tolist())),
         runs=tuple(_over_seeds(group) for group in over.rows),
         words=SeedsWords(
             sequence="; ".join(header_lines(over)),
@@ -144,7 +141,6 @@ def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
     alignment = onto_truth(row.run, row.output, comparison.sequence) if answered else None
     rotation = np.eye(3) if alignment is None else alignment.rotation
     translation_m = np.zeros(3) if alignment is None else alignment.translation
-    start_ns = int(comparison.sequence.frames_t_ns[0])
     return DrawnRun(
         estimator=row.estimator,
         output=row.output,
@@ -152,9 +148,9 @@ def _row(row: Row, comparison: Comparison, errors: Errors | None) -> DrawnRun:
         trajectory=trajectory_file(row.estimator, row.output) if answered else None,
         rotation=(_vector(rotation[0]), _vector(rotation[1]), _vector(rotation[2])),
         translation_m=_vector(translation_m),
-        errors=None if errors is None else _errors(errors, start_ns),
-        nees=_told_or_why(_nees, row, comparison),
-        nis=_told_or_why(_nis, row, comparison),
+        errors=None if errors is None else _errors(errors, comparison.sequence),
+        nees=_series_or_reason(_nees, row, comparison),
+        nis=_series_or_reason(_nis, row, comparison),
         components=UNSET if row.repeats_causal else _components(row, comparison),
     )
 
@@ -164,16 +160,16 @@ def _vector(values: Array) -> Vector:
     return x, y, z
 
 
-def _errors(errors: Errors, start_ns: int) -> ErrorSeries:
+def _errors(errors: Errors, sequence: Sequence) -> ErrorSeries:
     return ErrorSeries(
-        t_s=seconds(errors.t_ns, start_ns),
+        t_s=seconds(sequence, errors.t_ns),
         path_m=numbers(errors.path_m),
         position_m=numbers(errors.position_m),
         heading_deg=numbers(errors.heading_deg),
     )
 
 
-def _told_or_why(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
+def _series_or_reason(series: Callable[[Row, Comparison], Series], row: Row, comparison: Comparison) -> Series | str:
     """Return a series, or in words why there is none."""
     if row.run.trajectory(row.output) is None:
         return "the run gave no trajectory"
@@ -194,13 +190,13 @@ def _components(row: Row, comparison: Comparison) -> ComponentSeries | UnsetType
     names = ("about_x_deg", "about_y_deg", "about_z_deg", "x_m", "y_m", "z_m")  # as the columns stand in Components
     columns = {name: numbers(found.error[:, i]) for i, name in enumerate(names)}
     stated = {f"sigma_{name}": numbers(sigma[:, i]) for i, name in enumerate(names)}
-    return ComponentSeries(t_s=seconds(found.t_ns, int(comparison.sequence.frames_t_ns[0])), **columns, **stated)
+    return ComponentSeries(t_s=seconds(comparison.sequence, found.t_ns), **columns, **stated)
 
 
 def _nees(row: Row, comparison: Comparison) -> NeesSeries:
     nees = nees_over_time(Evaluation(row.run, row.output, comparison.sequence))
     return NeesSeries(
-        t_s=seconds(nees.t_ns, int(comparison.sequence.frames_t_ns[0])),
+        t_s=seconds(comparison.sequence, nees.t_ns),
         pose=numbers(nees.pose),
         orientation=numbers(nees.orientation),
         position=numbers(nees.position),
@@ -215,7 +211,7 @@ def _nis(row: Row, comparison: Comparison) -> NisSeries:
     assert causal is not None, "an output without estimates has no innovations"
     low, high = found.bands()
     return NisSeries(
-        t_s=seconds(causal.t_ns[found.rows], int(comparison.sequence.frames_t_ns[0])),
+        t_s=seconds(comparison.sequence, causal.t_ns[found.rows]),
         per_dof=numbers(found.nis / found.expected),
         low=numbers(low),
         high=numbers(high),
@@ -223,13 +219,12 @@ def _nis(row: Row, comparison: Comparison) -> NisSeries:
 
 
 def _steps(comparison: Comparison) -> Iterator[StepTimes]:
-    frames_t_ns = comparison.sequence.frames_t_ns
+    sequence = comparison.sequence
     for run in comparison.runs:
         if run.timings is not None and run.timings.step_s.size:
-            t_ns = frames_t_ns[: run.timings.step_s.size]
             yield StepTimes(
                 estimator=run.estimator,
-                t_s=seconds(t_ns, int(frames_t_ns[0])),
+                t_s=seconds(sequence, sequence.frames_t_ns[: run.timings.step_s.size]),
                 step_ms=numbers(1e3 * run.timings.step_s),
                 finish_s=number(run.timings.finish_s),
             )
@@ -258,22 +253,3 @@ def _rms_over_runs(errors: Array) -> Array:
     known = np.isfinite(errors)
     total, count = np.where(known, errors, 0.0) ** 2, known.sum(axis=0)
     return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
-
-
-def seconds(t_ns: IntArray, start_ns: int) -> tuple[float, ...]:
-    """Return stamps (N,) as seconds from a stamp, to the microsecond."""
-    return tuple(round(t / NS_PER_S, _MICROSECONDS) for t in (t_ns - start_ns).tolist())
-
-
-def numbers(values: Array) -> Numbers:
-    """Return values (N,) with six digits, None for what is not finite."""
-    return tuple(number(value) for value in values.tolist())
-
-
-def number(value: float) -> float | None:
-    """Return a value with six digits, or None where it is not finite."""
-    return _short(value) if math.isfinite(value) else None
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.{_SIGNIFICANT_DIGITS}g}")

@@ -1,18 +1,18 @@
 """``report.md``: the table, the figures and, in plain words, what they mean and how far to trust them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.card import card_lines
+from toolkit.report.header import header_lines
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
-    header_lines,
     note_lines,
     paired_lines,
     remark_lines,
 )
-from toolkit.report.prose import in_markdown
+from toolkit.report.prose import in_markdown, markdown_section
 from toolkit.report.table import as_markdown, comparison_table, explained_metrics
 
 _READ_BEFORE = """\
@@ -74,14 +74,14 @@ def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
         f"# {in_markdown(' / '.join(comparison.estimators) + ' on ' + comparison.name)}{seeds}",
         *(f"{in_markdown(line)}." for line in header_lines(comparison)),
         as_markdown(comparison_table(comparison)),
-        *_section("Who differs from the best?", paired_lines(comparison)),
-        *_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
-        *_section("Notes", note_lines(comparison)),
-        *_section("Remarks on single numbers", remark_lines(comparison)),
-        *_section("Where every estimator started", [comparison.prior.source]),
-        *_section("What the audit found in the recording", finding_lines(comparison)),
-        *_section("What to know about this recording", comparison.sequence.provenance.facts),
-        *_section("What its tracks are like", () if comparison.card is None else card_lines(comparison.card)),
+        *markdown_section("Who differs from the best?", paired_lines(comparison)),
+        *markdown_section("Is the stated uncertainty honest?", consistency_lines(comparison)),
+        *markdown_section("Notes", note_lines(comparison)),
+        *markdown_section("Remarks on single numbers", remark_lines(comparison)),
+        *markdown_section("Where every estimator started", [comparison.prior.source]),
+        *markdown_section("What the audit found in the recording", finding_lines(comparison)),
+        *markdown_section("What to know about this recording", comparison.sequence.provenance.facts),
+        *markdown_section("What its tracks are like", () if comparison.card is None else card_lines(comparison.card)),
         "## Figures",
         *(_figure(name, in_markdown(caption)) for name, caption in captions.items()),
         "## How to read the table",
@@ -97,10 +97,3 @@ def _figure(name: str, caption: str) -> str:
 def _meanings(comparison: Comparison) -> str:
     """Return a line for each metric of the table."""
     return "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison))
-
-
-def _section(title: str, entries: Iterable[str]) -> Iterator[str]:
-    lines = [f"- {in_markdown(entry)}" for entry in entries]
-    if lines:
-        yield f"## {title}"
-        yield "\n".join(lines)

@@ -6,9 +6,11 @@ from dataclasses import asdict, fields
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from toolkit.documents import Value, of_attributes
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
 from toolkit.metrics import Metric, describe, known_metrics
+from toolkit.report.curves import truth_during
 from toolkit.report.records.scores import (
     AuditEntry,
     Judged,
@@ -21,7 +23,6 @@ from toolkit.report.records.scores import (
     Seeds,
     SequenceOfSeeds,
     SequenceRead,
-    Value,
     WholeRuns,
 )
 from toolkit.sequence import Sequence
@@ -32,9 +33,7 @@ def metrics_document(comparison: Comparison) -> Metrics:
     return Metrics(
         schema="vislam.metrics/1",
         sequence=_sequence(comparison.sequence),
-        audit=tuple(
-            AuditEntry(fault=f.fault, count=f.count, repaired=f.repaired, detail=f.detail) for f in comparison.findings
-        ),
+        audit=tuple(of_attributes(AuditEntry, finding) for finding in comparison.findings),
         undecided=dict(comparison.undecided),
         runs=tuple(_run(row) for row in comparison.rows),
     )
@@ -47,8 +46,8 @@ def seeds_document(over: Comparison) -> Seeds:
         sequence=SequenceOfSeeds(
             name=over.name,
             source=over.source,
-            frames=over.frames_s.size,
-            duration_s=float(over.frames_s[-1]),
+            frames=over.sequence.frame_count,
+            duration_s=over.sequence.duration_s,
             motion=over.sequence.motion_kind,
         ),
         seeds=over.seeds,
@@ -56,9 +55,7 @@ def seeds_document(over: Comparison) -> Seeds:
         start=over.prior.source,
         estimators=over.estimators,
         runs=tuple(_run_over_seeds(group, over) for group in over.rows),
-        log=tuple(
-            LogEntry(estimator=o.estimator, seed=o.seed, status=o.status, log=o.log) for o in over.outcomes if o.log
-        ),
+        log=tuple(of_attributes(LogEntry, outcome) for outcome in over.outcomes if outcome.log),
     )
 
 
@@ -71,10 +68,8 @@ def path_length_m(sequence: Sequence) -> float | None:
     """Return the length of the true path while the camera ran, or None without truth or frames."""
     if sequence.truth is None or not sequence.frame_count:
         return None
-    t_ns = sequence.truth.t_ns
-    during = (t_ns >= sequence.frames_t_ns[0]) & (t_ns <= sequence.frames_t_ns[-1])
-    positions = sequence.truth.T_world_imu[during, :3, 3]
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    truth = truth_during(sequence)
+    return 0.0 if truth is None else float(np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1).sum())
 
 
 def _sequence(sequence: Sequence) -> SequenceRead:

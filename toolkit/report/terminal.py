@@ -6,14 +6,13 @@ from toolkit.audit import Audit, Finding
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.card import card_lines
+from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
-    header_lines,
     note_lines,
     outcome,
     paired_lines,
-    sequence_line,
     undecided_lines,
 )
 from toolkit.report.prose import WIDTH, Width, filled, section

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from toolkit.documents import of_attributes
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.table import Table, as_text
 from toolkit.verify.verification import Result, Verification
@@ -33,10 +34,7 @@ def verification_document(verification: Verification) -> VerificationRecord:
         schema="vislam.verification/1",
         estimator=verification.estimator,
         passed=verification.passed,
-        checks=tuple(
-            CheckRecord(name=check.name, result=check.result, found=check.found, remedy=check.remedy)
-            for check in verification.checks
-        ),
+        checks=tuple(of_attributes(CheckRecord, check) for check in verification.checks),
     )
 
 

@@ -8,6 +8,8 @@ from msgspec import Meta, Struct
 
 from toolkit.settings.records import Settings
 
+_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+
 
 class Described(NamedTuple):
     """One setting as documentation shows it: key, unit, default, range in words, what it is."""
@@ -43,9 +45,6 @@ def _one(key: str, hint: Any, default: Any) -> Described:
     meaning = next(meta.description for meta in metas if meta.description)
     shown = extra.get("none", "none") if default is None else _shown(default)
     return Described(key, extra.get("unit", ""), shown, ", ".join(words), meaning)
-
-
-_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def _shown(default: Any) -> str:

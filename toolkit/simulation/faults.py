@@ -16,7 +16,7 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Observations, Sequence
-from toolkit.simulation.spans import frames_s, ns, samples_s, span_s
+from toolkit.simulation.spans import ns, span_s
 from toolkit.simulation.standstill import standstill as standstill  # noqa: PLC0414 - an injector like those below
 
 Fault = Callable[[Sequence, float, int], Sequence]
@@ -40,7 +40,7 @@ def missing_right(sequence: Sequence, dose: float = 0.33, seed: int = 0) -> Sequ
 def blackout(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """See nothing for so many seconds, and new tracks after that: a tunnel, glare, a covered lens."""
     seen, begin_s, end_s = sequence.observations, *span_s(sequence, dose, seed)
-    time_s = frames_s(sequence)[seen.frame]
+    time_s = sequence.frames_s[seen.frame]
     later = time_s >= end_s
     track_id = np.where(later, seen.track_id + seen.track_id.max(initial=-1) + 1, seen.track_id)
     rows = (time_s < begin_s) | later
@@ -66,7 +66,7 @@ def moving_objects(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequ
     """
     seen, rig = sequence.observations, sequence.rig
     rng, (begin_s, end_s) = np.random.default_rng(seed), span_s(sequence, sequence.duration_s / 3.0, seed)
-    seen_s = frames_s(sequence)[seen.frame]
+    seen_s = sequence.frames_s[seen.frame]
     moves = _struck_tracks(sequence, dose, seed) & (seen.uv_px[:, 0] > seen.uv_px[:, 1])
     moves &= (seen_s >= begin_s) & (seen_s < end_s)
     angle, points = rng.uniform(0.0, 2.0 * np.pi), triangulate(seen.uv_px[moves], rig)
@@ -161,14 +161,14 @@ def exchanged_tracks(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Se
 def motion_gap(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Lose the motion samples of so many seconds: a full buffer, a loose cable."""
     begin_s, end_s = span_s(sequence, dose, seed)
-    t_s = samples_s(sequence)
+    t_s = sequence.elapsed_s(sequence.motion.t_ns)
     return _with_samples(sequence, (t_s <= begin_s) | (t_s >= end_s))
 
 
 def stuck_motion(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
     """Repeat the last motion sample for so many seconds: a driver that hangs."""
     begin_s, end_s = span_s(sequence, dose, seed)
-    t_s, values = samples_s(sequence), sequence.motion.values.copy()
+    t_s, values = sequence.elapsed_s(sequence.motion.t_ns), sequence.motion.values.copy()
     stuck = (t_s > begin_s) & (t_s < end_s)
     values[stuck] = values[max(int(np.argmax(stuck)) - 1, 0)]
     return _with_values(sequence, values)
@@ -191,7 +191,7 @@ def spike(sequence: Sequence, dose: float = 1e300, seed: int = 0) -> Sequence:
 def disturbed_motion(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Add so many m/s, or m/s^2, along an axis drawn to a third of the motion samples: wheels that slip, vibration."""
     begin_s, end_s = span_s(sequence, sequence.duration_s / 3.0, seed)
-    axis, t_s = np.random.default_rng(seed).standard_normal(3), samples_s(sequence)
+    axis, t_s = np.random.default_rng(seed).standard_normal(3), sequence.elapsed_s(sequence.motion.t_ns)
     added = np.concatenate([dose * axis / np.linalg.norm(axis), np.zeros(3)])
     return _with_values(sequence, sequence.motion.values + ((t_s >= begin_s) & (t_s < end_s))[:, None] * added)
 
@@ -200,7 +200,7 @@ def nan_span(sequence: Sequence, dose: float = 0.25, seed: int = 0) -> Sequence:
     """Write NaN for all motion samples and sightings of so many seconds: a driver that gives up and comes back."""
     begin_s, end_s = span_s(sequence, dose, seed)
     values, uv_px = sequence.motion.values.copy(), sequence.observations.uv_px.copy()
-    t_s, seen_s = samples_s(sequence), frames_s(sequence)[sequence.observations.frame]
+    t_s, seen_s = sequence.elapsed_s(sequence.motion.t_ns), sequence.frames_s[sequence.observations.frame]
     values[(t_s > begin_s) & (t_s < end_s)] = np.nan
     uv_px[(seen_s > begin_s) & (seen_s < end_s)] = np.nan
     return _with_values(_with_pixels(sequence, uv_px), values)

@@ -29,6 +29,8 @@ from toolkit.simulation.world import Camera
 from toolkit.track_noise import TrackNoise
 
 START_NS = 1_600_000_000 * NS_PER_S
+# The measurements of an hour take a gigabyte.
+LONGEST_S = 3600.0
 # Standard deviations of the prior: rotation (rad), position (m), velocity (m/s), all in the body frame.
 _PRIOR_SIGMA = np.repeat([0.002, 0.01, 0.05], 3)
 # No twist estimator has an accelerometer bias; its block of the prior must be positive definite all the same.
@@ -78,10 +80,6 @@ def noise_free(scenario: Scenario) -> Scenario:
 def _number(name: str) -> int:
     """Return what of a name goes into the seeds: 0 for drive, so that its draws are those of the seed alone."""
     return crc32(name.encode()) ^ crc32(b"drive")
-
-
-# The measurements of an hour take a gigabyte.
-LONGEST_S = 3600.0
 
 
 def simulate(scenario: Scenario, seed: int) -> Sequence:

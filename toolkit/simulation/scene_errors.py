@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.geometry import Array, se3_inverse, transform
 from toolkit.models import stereo
 from toolkit.sequence import Sequence
@@ -23,10 +24,8 @@ def errors_px(sequence: Sequence) -> Array:
     truth, seen, rig = sequence.truth, sequence.observations, sequence.rig
     if truth is None:
         return np.full((len(seen), 3), np.nan)
-    row = np.minimum(np.searchsorted(truth.t_ns, sequence.frames_t_ns), truth.t_ns.size - 1)
-    T_world_cam = np.where(
-        (truth.t_ns[row] == sequence.frames_t_ns)[:, None, None], truth.T_world_imu[row] @ rig.T_imu_cam, np.nan
-    )
+    row, is_true = rows_of(sequence.frames_t_ns, truth.t_ns)
+    T_world_cam = np.where(is_true[:, None, None], truth.T_world_imu[row] @ rig.T_imu_cam, np.nan)
     _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
     rays = np.stack(
         [

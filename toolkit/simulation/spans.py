@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from toolkit.geometry import Array
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
@@ -17,13 +16,3 @@ def span_s(sequence: Sequence, length_s: float, seed: int) -> tuple[float, float
 def ns(seconds: float) -> int:
     """Return seconds as whole nanoseconds."""
     return round(seconds * NS_PER_S)
-
-
-def frames_s(sequence: Sequence) -> Array:
-    """Return the stamps of the frames (K,), in seconds after the first."""
-    return np.asarray((sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S)
-
-
-def samples_s(sequence: Sequence) -> Array:
-    """Return the stamps of the motion samples (S,), in seconds after the first frame."""
-    return np.asarray((sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S)

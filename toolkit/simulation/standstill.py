@@ -10,7 +10,7 @@ from toolkit.geometry import BoolArray, IntArray
 from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, Truth
-from toolkit.simulation.spans import frames_s, ns, span_s
+from toolkit.simulation.spans import ns, span_s
 
 
 def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:
@@ -25,7 +25,7 @@ def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequenc
             f"{sequence.name}: a standstill can be planted between twists only; simulate a scene that halts"
         )
     rng, period_ns = np.random.default_rng(seed), int(np.median(np.diff(sequence.frames_t_ns)))
-    halt = int(np.searchsorted(frames_s(sequence), span_s(sequence, 0.0, seed)[0]))
+    halt = int(np.searchsorted(sequence.frames_s, span_s(sequence, 0.0, seed)[0]))
     pause = _Pause(sequence.frames_t_ns[halt], period_ns, round(ns(dose) / period_ns))
     t_ns, rows = pause.inserted(motion.t_ns)
     density = np.concatenate([noise.velocity_noise_density, noise.gyro_noise_density])

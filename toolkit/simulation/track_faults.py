@@ -11,7 +11,6 @@ import numpy as np
 from toolkit.errors import DataError
 from toolkit.geometry import Array
 from toolkit.models.stereo import project, triangulate
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.simulation.sensors import with_slips, with_track_noise
 from toolkit.track_noise import CHANNELS, TrackNoise
@@ -65,7 +64,7 @@ def moving_objects(sequence: Sequence, dose: float = 0.2, seed: int = 0) -> Sequ
     if truth is None or not np.isin(sequence.frames_t_ns, truth.t_ns).all():
         raise DataError(f"{sequence.name}: moving objects need the truth at every frame")
     poses = truth.T_world_imu[np.searchsorted(truth.t_ns, sequence.frames_t_ns)] @ sequence.rig.T_imu_cam
-    t_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
+    t_s = sequence.frames_s
     velocity = np.gradient(poses[:, :3, 3], t_s, axis=0)
     track, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
     begin = seen.frame[first]

@@ -76,15 +76,15 @@ class Card:
 def card_of(sequence: Sequence, fit: Fit) -> Card:
     """Return the card of a sequence whose noise of tracks was fitted."""
     seen, rig, state = sequence.visible, sequence.rig, fit.adjusted
-    groups = [_Left.of(group, state.T_world_middle, rig, state.freedom) for group in state.tracks]
+    groups = [_TrackResiduals.of(group, state.T_world_middle, rig, state.freedom) for group in state.tracks]
     spread_px = _spread_px(groups)
-    size = [np.sqrt(((left.fixed_px / spread_px) ** 2).sum(axis=(1, 2)) / left.equations) for left in groups]
+    size = [np.sqrt(((group.fixed_px / spread_px) ** 2).sum(axis=(1, 2)) / group.equations) for group in groups]
     usual = float(np.median(np.concatenate(size)))
     sound = [one < _ODDS * usual for one in size]
     common = np.bincount(neighbours(seen).interval, minlength=max(sequence.frame_count - 1, 0))
     disparity = disparity_px(seen.uv_px)
     depth_m = rig.fx_px * rig.baseline_m / disparity[disparity > LEAST_DISPARITY_PX]
-    off = np.concatenate([np.abs(left.fixed_px).reshape(-1, 3) for left in groups]) > _TAIL * spread_px
+    off = np.concatenate([np.abs(group.fixed_px).reshape(-1, 3) for group in groups]) > _TAIL * spread_px
     return Card(
         tracks=fit.tracks,
         a_frame=len(seen) / sequence.frame_count,
@@ -107,7 +107,7 @@ def card_of(sequence: Sequence, fit: Fit) -> Card:
 
 
 @dataclass(frozen=True, eq=False)
-class _Left:
+class _TrackResiduals:
     """Residuals (B, n, 3) px in c, d, v: about the fitted landmark, and about the one that white noise would put."""
 
     px: Array
@@ -115,7 +115,7 @@ class _Left:
     equations: int
 
     @classmethod
-    def of(cls, tracks: Tracklets, T_world_middle: Array, rig: StereoRig, freedom: float) -> "_Left":
+    def of(cls, tracks: Tracklets, T_world_middle: Array, rig: StereoRig, freedom: float) -> "_TrackResiduals":
         here = linearised(tracks, T_world_middle, rig)
         sigma_px = np.sqrt(np.diag(CHANNELS @ rig.cov_uv_px2 @ CHANNELS.T))
         count = len(here.residual_px)
@@ -125,27 +125,27 @@ class _Left:
         return cls(here.residual_px / np.sqrt(freedom), fixed / np.sqrt(freedom), tracks.equations)
 
 
-def _spread_px(groups: list[_Left]) -> Array:
-    every = np.abs(np.concatenate([left.fixed_px.reshape(-1, 3) for left in groups]))
+def _spread_px(groups: list[_TrackResiduals]) -> Array:
+    every = np.abs(np.concatenate([group.fixed_px.reshape(-1, 3) for group in groups]))
     return np.asarray(np.maximum(MAD_TO_SIGMA * np.median(every, axis=0), 1e-9))
 
 
-def _correlation(groups: list[_Left], sound: list[BoolArray]) -> Array:
+def _correlation(groups: list[_TrackResiduals], sound: list[BoolArray]) -> Array:
     """Return the autocorrelation (LAGS, 3) of sound tracks' residuals, NaN where too few are long enough."""
     rows = []
     for lag in range(1, LAGS + 1):
-        pairs = [_pairs(left.fixed_px[kept], lag) for left, kept in zip(groups, sound, strict=True)]
+        pairs = [_pairs(group.fixed_px[kept], lag) for group, kept in zip(groups, sound, strict=True)]
         first, second = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
         size = np.sqrt((first**2).mean(axis=0) * (second**2).mean(axis=0)) if len(first) >= _FEWEST_PAIRS else np.nan
         rows.append((first * second).mean(axis=0) / size if len(first) else np.full(3, np.nan))
     return np.stack(rows)
 
 
-def _structure(groups: list[_Left]) -> Array:
+def _structure(groups: list[_TrackResiduals]) -> Array:
     """Return half the mean square (LAGS, 3) px^2 of differences along tracks, from their median size."""
     rows = []
     for lag in range(1, LAGS + 1):
-        pairs = [_pairs(left.px, lag) for left in groups]
+        pairs = [_pairs(group.px, lag) for group in groups]
         apart = np.concatenate([np.abs(second - first) for first, second in pairs])
         enough = len(apart) >= _FEWEST_PAIRS
         rows.append(0.5 * (MAD_TO_SIGMA * np.median(apart, axis=0)) ** 2 if enough else np.full(3, np.nan))
@@ -157,8 +157,8 @@ def _pairs(residual_px: Array, lag: int) -> tuple[Array, Array]:
     return residual_px[:, :-lag].reshape(-1, 3), residual_px[:, lag:].reshape(-1, 3)
 
 
-def _left_right(groups: list[_Left], sound: list[BoolArray]) -> float:
-    every = np.concatenate([left.fixed_px[kept].reshape(-1, 3) for left, kept in zip(groups, sound, strict=True)])
+def _left_right(groups: list[_TrackResiduals], sound: list[BoolArray]) -> float:
+    every = np.concatenate([group.fixed_px[kept].reshape(-1, 3) for group, kept in zip(groups, sound, strict=True)])
     left_px, right_px = every[:, 0] + 0.5 * every[:, 1], every[:, 0] - 0.5 * every[:, 1]
     return float((left_px * right_px).mean() / np.sqrt((left_px**2).mean() * (right_px**2).mean()))
 

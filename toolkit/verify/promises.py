@@ -10,7 +10,7 @@ from itertools import zip_longest
 import numpy as np
 
 from toolkit.estimate import Estimate, Finished, Run
-from toolkit.estimator import Build, Setup
+from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import POSE_DOF, chi2_quantile
 from toolkit.sequence import Packet, Sequence
@@ -103,12 +103,7 @@ def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> 
 
 def other_answers(build: Build, watched: Watched) -> str:
     """Say where a second run over the same packets gives other answers."""
-    estimator = build(watched.setup)
-    for k, (packet, before) in enumerate(zip(watched.packets, watched.online, strict=True)):
-        if found := difference(estimator.step(packet), before):
-            return f"a second run answers otherwise to frame {k}: {found}"
-    found = difference(estimator.finish(), watched.finished)
-    return f"a second run ends otherwise: {found}" if found else ""
+    return _other_in_second_run(build(watched.setup), watched.packets, watched)
 
 
 def other_when_repeated(build: Build, watched: Watched) -> str:
@@ -119,12 +114,16 @@ def other_when_repeated(build: Build, watched: Watched) -> str:
     """
     counts = (2, len(watched.online) // 2, len(watched.online))
     cut = [list(watched.sequence.truncated(count).packets()) for count in counts]
-    packets = [packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:]]
-    estimator = build(watched.setup)
-    for k, (packet, before) in enumerate(zip(packets, watched.online, strict=True)):
+    packets = tuple(packet for known, part in zip((0, *counts), cut, strict=False) for packet in part[known:])
+    return _other_in_second_run(build(watched.setup), packets, watched)
+
+
+def _other_in_second_run(estimator: Estimator, packets: tuple[Packet, ...], first: Watched) -> str:
+    """Say where an estimator that reads packets answers otherwise than one did; nothing where nowhere."""
+    for k, (packet, before) in enumerate(zip(packets, first.online, strict=True)):
         if found := difference(estimator.step(packet), before):
             return f"a second run answers otherwise to frame {k}: {found}"
-    found = difference(estimator.finish(), watched.finished)
+    found = difference(estimator.finish(), first.finished)
     return f"a second run ends otherwise: {found}" if found else ""
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import cast
 
+from toolkit.discovery import shown_name
 from toolkit.errors import EstimatorError, no_such, printable
 from toolkit.estimator import Build, discover
 
@@ -31,13 +32,12 @@ def subject_of(word: str) -> Subject:
         path = Path(word)
         if not path.is_file():
             raise EstimatorError(f"{path}: there is no such file")
-        return Subject(printable(path.stem.replace("_", "-")), lambda: _build_of(lambda: _imported(path), word))
+        return Subject(printable(shown_name(path.stem)), lambda: _build_of(lambda: _imported(path), word))
     known = discover()
     if word in known:
         return Subject(word, known[word].load)
     if "." in word:
-        name = word.rpartition(".")[2].replace("_", "-")
-        return Subject(name, lambda: _build_of(lambda: importlib.import_module(word), word))
+        return Subject(shown_name(word), lambda: _build_of(lambda: importlib.import_module(word), word))
     raise EstimatorError(f"{no_such('estimator', word, known)}; a file ends in .py")
 
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from toolkit import runner
 from toolkit.errors import EstimatorError
+from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
 from toolkit.verify.promises import arrays_of
@@ -20,7 +21,6 @@ from toolkit.verify.subject import subject_of
 
 UNAVAILABLE = "unavailable"
 _DURATION_S, _SEED = 0.8, 4
-_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _TIMEOUT_S = 600
 
 
@@ -30,7 +30,7 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     Raises EstimatorError where the process does not end well.
     """
     # Idle threads sleep at once: spinning, they starve a busy machine.
-    environment = os.environ | dict.fromkeys(_LIMITS, str(threads)) | {"OPENBLAS_THREAD_TIMEOUT": "4"}
+    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"OPENBLAS_THREAD_TIMEOUT": "4"}
     words = [sys.executable, "-m", __name__, str(threads), *estimators]
     try:
         done = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=_TIMEOUT_S, check=False)

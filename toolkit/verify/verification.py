@@ -171,7 +171,7 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
             try:
                 watched.append(watch(build, simulate(scenario, SEED)))
             except Exception as error:  # anybody's code, which may raise anything
-                raised = raised or f"{scenario.name}: {_told(error)}"
+                raised = raised or f"{scenario.name}: {_error_in_words(error)}"
         checks = [
             CheckedPromise(
                 "it runs to the end", "failed" if raised else "passed", raised, _RUNS_REMEDY if raised else ""
@@ -209,11 +209,11 @@ def _check(name: str, remedy: str, find: Callable[[], str]) -> CheckedPromise:
     try:
         found = find()
     except Exception as error:  # anybody's code, which may raise anything
-        found = _told(error)
+        found = _error_in_words(error)
     return CheckedPromise(name, "failed", found, remedy) if found else CheckedPromise(name, "passed")
 
 
-def _told(error: Exception) -> str:
+def _error_in_words(error: Exception) -> str:
     if isinstance(error, EstimatorError):
         return str(error)
     frames = error.__traceback__
@@ -256,8 +256,7 @@ def _threads(word: str) -> CheckedPromise:
 
 
 def _faults(name: str, build: Build) -> CheckedPromise:
-    def told() -> str:
-        found = ends_by_fault(name, build)
-        return "; ".join(f"{fault}: {why}" for fault, why in found.items())
+    def broken() -> str:
+        return "; ".join(f"{fault}: {why}" for fault, why in ends_by_fault(name, build).items())
 
-    return _check(_TROUBLE, _TROUBLE_REMEDY, told)
+    return _check(_TROUBLE, _TROUBLE_REMEDY, broken)

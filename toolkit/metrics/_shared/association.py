@@ -34,6 +34,11 @@ class Matched:
     def __len__(self) -> int:
         return self.t_ns.size
 
+    @property
+    def positions(self) -> tuple[Array, Array]:
+        """The true and the estimated positions (n, 3) m, to fit the one to the other."""
+        return self.truth[:, :3, 3], self.estimate[:, :3, 3]
+
 
 def finite_poses(poses: Array) -> BoolArray:
     """Say for each pose (N, 4, 4) whether all its entries are finite."""

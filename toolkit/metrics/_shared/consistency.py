@@ -15,6 +15,7 @@ from toolkit.metrics._shared.alignment import place_pose, place_yaw
 from toolkit.metrics._shared.association import finite_poses, median_period_ns, truth_at
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Unavailable
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import Sequence
 
 POSE_DOF = 6
@@ -23,8 +24,11 @@ BAND_PROBABILITY = 0.95
 # The scatter of a run is told by what four in five of its steps change by, at least so many: 1.28 standard deviations.
 _USUAL_SHARE, _USUAL_SIGMAS, _FEWEST_FRAMES = 0.8, 1.2816, 20
 INNOVATIONS_ARE_CAUSAL = "innovations belong to the causal output"
-# A prior this improbable under its own covariance is expressed in another world frame than the truth.
-_OTHER_WORLD = 1e-6
+# A first pose this improbable under its own covariance is expressed in another world frame than the truth.
+OTHER_WORLD = 1e-6
+PLACED = "the estimate has its own world frame: its first pose is placed on the truth's, whose noise there counts fully"
+NOT_MET = "no pose has a true one at its time"
+NOT_PLACED = "the estimate has its own world frame, and the truth has no pose for its first one"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +175,11 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
     reached, true_poses = truth_at(estimate.t_ns[usable], truth, frame_period_ns)
     rows = usable[reached]
     if not rows.size:
-        raise Unavailable("no pose has a true one at its time")
+        raise Unavailable(NOT_MET)
     poses, placed = estimate.T_world_imu[rows], not starts_in_the_truths_world(evaluation.sequence)
     if placed:
         if rows[0] != 0:
-            raise Unavailable("the estimate has its own world frame, and the truth has no pose for its first one")
+            raise Unavailable(NOT_PLACED)
         place = place_yaw if evaluation.sequence.motion_kind == "imu" else place_pose
         poses = place(true_poses[0], poses[0]).apply(poses)
     return BodyErrors(estimate.t_ns[rows], rows, se3_inverse(poses) @ true_poses, poses, placed)
@@ -190,7 +194,8 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
     if not reached.any():
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])
-    return float(normalised(error[None], prior.cov[None, :6, :6])[0]) < chi2_quantile(1.0 - _OTHER_WORLD, POSE_DOF)
+    off = float(mahalanobis_squared(error[None], prior.cov[None, :6, :6])[0])
+    return off < chi2_quantile(1.0 - OTHER_WORLD, POSE_DOF)
 
 
 def stated_errors(evaluation: Evaluation) -> StatedErrors:
@@ -224,14 +229,8 @@ def nees_over_time(evaluation: Evaluation) -> Nees:
     xi = se3_log(errors.T_estimate_truth)
     return Nees(
         errors.t_ns,
-        normalised(xi, pose_cov) / POSE_DOF,
-        normalised(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
-        normalised(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
+        mahalanobis_squared(xi, pose_cov) / POSE_DOF,
+        mahalanobis_squared(xi[:, :3], pose_cov[:, :3, :3]) / 3.0,
+        mahalanobis_squared(xi[:, 3:], pose_cov[:, 3:, 3:]) / 3.0,
         errors.placed,
     )
-
-
-def normalised(errors: Array, cov: Array) -> Array:
-    """Return e^T P^-1 e (n,) of errors (n, d) with covariances (n, d, d)."""
-    solved = np.linalg.solve(cov, errors[:, :, None])[:, :, 0]
-    return np.asarray(np.einsum("ni,ni->n", errors, solved))

@@ -21,6 +21,7 @@ from functools import lru_cache
 import gtsam
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
@@ -106,8 +107,8 @@ def _problem_at_truth(sequence: Sequence) -> _Problem:
     if lacking:
         raise Unavailable(f"the ground truth lacks {' and '.join(lacking)}")
     assert truth.v_world is not None and truth.bias is not None
-    rows = np.minimum(np.searchsorted(truth.t_ns, sequence.frames_t_ns), truth.t_ns.size - 1)
-    if not np.array_equal(truth.t_ns[rows], sequence.frames_t_ns):
+    rows, there = rows_of(sequence.frames_t_ns, truth.t_ns)
+    if not there.all():
         raise Unavailable("the bound needs a truth at every frame's stamp")
     states = truth.T_world_imu[rows], truth.v_world[rows], truth.bias[rows]
     drawn = sequence.prior is not None and starts_in_the_truths_world(sequence)
@@ -122,8 +123,8 @@ def _problem_at_truth(sequence: Sequence) -> _Problem:
 
 @lru_cache(maxsize=1)
 def _problem_at_estimate(sequence: Sequence, at: Trajectory) -> _Problem:
-    rows = np.minimum(np.searchsorted(at.t_ns, sequence.frames_t_ns), len(at) - 1)
-    if len(at) == 0 or not np.array_equal(at.t_ns[rows], sequence.frames_t_ns):
+    rows, there = rows_of(sequence.frames_t_ns, at.t_ns)
+    if not there.all():
         raise Unavailable("the estimate lacks the state of a frame")
     imu = sequence.motion_kind == "imu"
     if at.bias is None or (imu and at.v_world is None):

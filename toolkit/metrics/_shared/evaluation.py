@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.metrics._shared.alignment import Alignment, fit_se3, place_pose, place_yaw
@@ -51,8 +52,7 @@ class AgainstTruth:
     @cached_property
     def se3_alignment(self) -> Alignment:
         """The rigid motion that fits the estimated positions to the true ones."""
-        pairs = self.compared
-        return fit_se3(pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3])
+        return fit_se3(*self.compared.positions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +109,8 @@ class Evaluation(AgainstTruth):
         """The estimated pose of every frame (K, 4, 4), NaN where there is none."""
         frames_t_ns, estimate = self.sequence.frames_t_ns, self.estimate
         poses = np.full((frames_t_ns.size, 4, 4), np.nan)
-        if len(estimate):
-            row = np.minimum(np.searchsorted(estimate.t_ns, frames_t_ns), len(estimate) - 1)
-            same = estimate.t_ns[row] == frames_t_ns
-            poses[same] = estimate.T_world_imu[row[same]]
+        row, said = rows_of(frames_t_ns, estimate.t_ns)
+        poses[said] = estimate.T_world_imu[row[said]]
         return poses
 
     @cached_property

@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
 from toolkit.metrics._shared.association import Matched
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics._shared.scores import Scores, Unavailable
 from toolkit.sequence import is_left_only
 
 # An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or
@@ -49,26 +49,19 @@ def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_fro
     return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
 
 
-def median_px(errors_px: Array) -> float:
-    """Return the median of errors (N,) px; raises Unavailable where there are none."""
+def pixel_scores(prefix: str, errors_px: Array, observation_count: int, why_left_out: str) -> Scores:
+    """Score the median and the root mean square of errors (N,) px, as the metrics PREFIX_median_px and PREFIX_rmse_px.
+
+    A remark says how many of the observations were scored, why others were not, and how many of those stand at the cap.
+    Raises Unavailable where there are none.
+    """
     if not errors_px.size:
         raise Unavailable("no observation could be reprojected")
-    return float(np.median(errors_px))
-
-
-def rmse_px(errors_px: Array) -> float:
-    """Return the root mean square of errors (N,) px; raises Unavailable where there are none."""
-    if not errors_px.size:
-        raise Unavailable("no observation could be reprojected")
-    return rmse(errors_px)
-
-
-def scored_remark(errors_px: Array, observation_count: int, why_left_out: str) -> str:
-    """Return how many of the observations were scored and how many of those stand at the cap; "" if all is well."""
     parts = []
     if errors_px.size < observation_count:
         parts.append(f"{errors_px.size} of {observation_count} observations scored, the others {why_left_out}")
     at_cap = int(np.count_nonzero(errors_px >= CAP_PX))
     if at_cap:
         parts.append(f"{at_cap} behind the camera or off by more than {CAP_PX:g} px, counted as {CAP_PX:g} px")
-    return "; ".join(parts)
+    scores = Scores({f"{prefix}_median_px": float(np.median(errors_px)), f"{prefix}_rmse_px": rmse(errors_px)})
+    return scores.remarked(scores.values, "; ".join(parts))

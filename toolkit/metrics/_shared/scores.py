@@ -57,6 +57,16 @@ class Scores:
         object.__setattr__(self, "values", self.values | dict.fromkeys(bad))
         object.__setattr__(self, "notes", self.notes | dict.fromkeys(bad, "the result is not finite"))
 
+    @classmethod
+    def none(cls, keys: Iterable[str], reason: str) -> "Scores":
+        """Return no value for any of the keys, for one reason."""
+        return cls({}).without(keys, reason)
+
+    def without(self, keys: Iterable[str], reason: str) -> "Scores":
+        """Return the scores without a value for the keys, for one reason."""
+        gone = tuple(keys)
+        return Scores(self.values | dict.fromkeys(gone), self.notes | dict.fromkeys(gone, reason))
+
     def remarked(self, keys: Iterable[str], remark: str) -> "Scores":
         """Return the scores with a remark on those of the keys that have a value; an empty remark adds nothing."""
         added = {key: remark for key in keys if remark and self.values[key] is not None}

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable
@@ -22,9 +21,9 @@ from toolkit.report.figures.style import (
     line_of,
     line_of_estimator,
     new_figure,
-    quiet,
+    shown_as,
+    style_axes,
 )
-from toolkit.resampling import NS_PER_S
 
 _CAPTION = (
     "How close to the limit. Black: the Cramér-Rao bound, one standard deviation (dashed: of what was known at the "
@@ -57,30 +56,25 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
         for row, one in found:
             _plot_estimator(axes, comparison, row, one, block, scale)
         _plot_bounds(axes, comparison, found, block, scale)
-    quiet(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
-    quiet(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
+    style_axes(position, f"{comparison.name}: position beyond the efficient estimate", "", "position [m]")
+    style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     bounds = [
         Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))
         for output in dict.fromkeys(row.output for row, _ in found)
     ]
-    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, _shown_as(row)) for row, _ in found]))
+    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found]))
     return NamedFigure("against_bound", _CAPTION, figure)
 
 
 def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
-    colour, t_s = colour_of(comparison, row.estimator), _seconds(comparison, one)
-    line, label = line_of_estimator(comparison, row.estimator, _shown_as(row)), f"{row.estimator} {row.label}"
+    colour, t_s = colour_of(comparison, row.estimator), comparison.sequence.elapsed_s(one.t_ns)
+    line, label = line_of_estimator(comparison, row.estimator, shown_as(row)), f"{row.estimator} {row.label}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
     axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=0.7)
-
-
-def _shown_as(row: Row) -> Output:
-    """Return the output whose line a row has: a filter's only answer is drawn as a final one."""
-    return "final" if row.label == "both" else row.output
 
 
 def _plot_bounds(
@@ -92,14 +86,10 @@ def _plot_bounds(
         one = next(one for row, one in found if row.output == output)
         sigma = scale * _sigma(one.bound, block)
         least = min(least, float(sigma.min()))
-        t_s, line = _seconds(comparison, one), line_of(output)
+        t_s, line = comparison.sequence.elapsed_s(one.t_ns), line_of(output)
         axes.plot(t_s, sigma, color=TRUTH_COLOUR, linestyle=line, linewidth=2.0, label=f"bound {output}")
     axes.set_yscale("log")
     axes.set_ylim(bottom=_LEAST_SHARE * least)
-
-
-def _seconds(comparison: Comparison, one: AgainstBound) -> Array:
-    return np.asarray((one.t_ns - int(comparison.sequence.frames_t_ns[0])) / NS_PER_S)
 
 
 def _sigma(covs: Array, block: slice) -> Array:

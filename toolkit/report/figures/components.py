@@ -10,8 +10,9 @@ from matplotlib.patches import Patch
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, plain_name
+from toolkit.geometry import Array
 from toolkit.models.state import POSITION, ROTATION
-from toolkit.report.curves import Components, components, last_good_answer
+from toolkit.report.curves import Components, components, reference_estimate
 from toolkit.report.figures.panels import COLOUR_OF
 from toolkit.report.figures.style import (
     TITLE_PT,
@@ -21,9 +22,8 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of,
     new_figure,
-    quiet,
+    style_axes,
 )
-from toolkit.resampling import NS_PER_S
 
 _SIGMAS = 3.0
 _ROWS = ("x", "y", "z")
@@ -36,12 +36,8 @@ _LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield a figure for each estimator with a trajectory that has something to be compared with."""
     for run in comparison.runs:
-        found: dict[Output, Components] = {}
-        for row in comparison.rows:
-            if row.run is run and not row.repeats_causal:
-                one = components(comparison, row)
-                if one is not None:
-                    found[row.output] = one
+        rows = [row for row in comparison.lines if row.run is run]
+        found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
         if found:
             yield _figure(comparison, run.estimator, run.final_is_causal, found)
 
@@ -50,14 +46,13 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
     figure = new_figure(4.6)
     grid = figure.subplots(3, 2, sharex=True)
     what = _what(comparison)
-    start_ns = int(comparison.sequence.frames_t_ns[0])
     for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
         for i, axis in enumerate(_ROWS):
             axes = grid[i, column]
             for output, one in found.items():
-                _plot(axes, one, block.start + i, start_ns, "final" if both else output)
+                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, "final" if both else output)
             _limit(axes, found.values(), block.start + i, least)
-            quiet(
+            style_axes(
                 axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
             )
     grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
@@ -69,12 +64,12 @@ def _figure(comparison: Comparison, name: str, both: bool, found: dict[Output, C
 
 def _what(comparison: Comparison) -> str:
     """Return how to call what is drawn: the error, or without truth the difference from whom."""
-    reference = None if comparison.sequence.truth is not None else last_good_answer(comparison)
+    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
     return "error" if reference is None else f"difference from {reference.name}"
 
 
-def _plot(axes: Axes, one: Components, i: int, start_ns: int, shown_as: Output) -> None:
-    t_s, colour, line = (one.t_ns - start_ns) / NS_PER_S, COLOUR_OF[shown_as], line_of(shown_as)
+def _plot(axes: Axes, t_s: Array, one: Components, i: int, shown_as: Output) -> None:
+    colour, line = COLOUR_OF[shown_as], line_of(shown_as)
     if one.sigma is not None:
         band = _SIGMAS * one.sigma[:, i]
         if shown_as == "final":
@@ -110,7 +105,7 @@ def _caption(comparison: Comparison, name: str) -> str:
     """Say what the panels show and how the band is to be read."""
     axes = "by component along and about the world's axes, z up"
     if comparison.sequence.truth is None:
-        reference = last_good_answer(comparison)
+        reference = reference_estimate(comparison)
         of_whom = "" if reference is None else f" from {reference.name}"
         return (
             f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "

@@ -32,7 +32,7 @@ from toolkit.report.figures.style import (
     WIDTH_IN,
     NamedFigure,
     new_figure,
-    quiet,
+    style_axes,
 )
 from toolkit.report.figures.view import (
     NOWHERE,
@@ -187,7 +187,7 @@ def _panels(runs: Sequence[Run], view: View) -> tuple[Figure, list[Axes]]:
     for axes in grid[len(runs) :]:
         axes.remove()
     for axes, run in zip(panels, runs, strict=True):
-        quiet(axes, run.estimator if run.status == "ok" else f"{run.estimator} ({run.status})", "", "")
+        style_axes(axes, run.estimator if run.status == "ok" else f"{run.estimator} ({run.status})", "", "")
         view.show(axes)
     for axes in panels[-columns:]:
         axes.tick_params(labelbottom=True)

@@ -17,10 +17,9 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of_estimator,
     new_figure,
-    quiet,
+    style_axes,
     width_of,
 )
-from toolkit.resampling import NS_PER_S
 
 # A run that is not ok is drawn up to this many times the largest error of the runs that are.
 _ROOM_FOR_DIVERGED = 1.5
@@ -39,17 +38,16 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
 def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     figure = new_figure(4.4)
     position, heading = figure.subplots(2, 1, sharex=True)
-    start_ns = int(comparison.sequence.frames_t_ns[0])
     for row, errors in curves.of_rows:
-        t_s, width = (errors.t_ns - start_ns) / NS_PER_S, width_of(comparison, row.estimator)
+        t_s, width = comparison.sequence.elapsed_s(errors.t_ns), width_of(comparison, row.estimator)
         look = {
             "color": colour_of(comparison, row.estimator),
             "linestyle": line_of_estimator(comparison, row.estimator, row.output),
         }
         position.plot(t_s, errors.position_m, linewidth=width, **look)
         heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
-    quiet(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
-    quiet(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
+    style_axes(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
+    style_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
     _limit_position(position, curves.of_rows)
     low, high = heading.get_ylim()
     heading.set_ylim(min(low, -_LEAST_HEADING_DEG), max(high, _LEAST_HEADING_DEG))

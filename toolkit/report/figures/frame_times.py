@@ -14,7 +14,7 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of_estimator,
     new_figure,
-    quiet,
+    style_axes,
     width_of,
 )
 
@@ -49,7 +49,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     axes.set_ylim(low / widened, high * widened)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-    quiet(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
+    style_axes(axes, f"{comparison.name}: time per frame", "frame", "time of a step [ms]")
     legend_below(figure, entries)
     caption = (
         "Wall-clock time of each step (dots) and its running median (lines). In the legend their mean, and the "

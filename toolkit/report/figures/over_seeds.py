@@ -9,14 +9,14 @@ from toolkit.experiment.comparison import Comparison, Row
 from toolkit.report.figures.panels import (
     COLOUR_OF,
     RANGE,
-    band_entry,
+    Drawn,
+    Normalised,
+    figure_with_bands,
     finish,
     output_entries,
     panels_of,
-    scale_by_decades,
-    tell_shares,
 )
-from toolkit.report.figures.style import BAND_COLOUR, NamedFigure, line_of
+from toolkit.report.figures.style import NamedFigure, line_of
 
 
 def draw(over: Comparison) -> Iterator[NamedFigure]:
@@ -37,7 +37,7 @@ def _errors(over: Comparison) -> NamedFigure:
         known = np.isfinite(errors_m).any(axis=0)
         lower, median, upper = np.nanpercentile(errors_m[:, known], [25.0, 50.0, 75.0], axis=0)
         kind = _shown_as(over, group)
-        axes, t_s, colour = panels[group.estimator], over.frames_s[known], COLOUR_OF[kind]
+        axes, t_s, colour = panels[group.estimator], over.sequence.frames_s[known], COLOUR_OF[kind]
         axes.fill_between(t_s, lower, upper, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
         kinds.add(kind)
@@ -52,30 +52,20 @@ def _errors(over: Comparison) -> NamedFigure:
 
 
 def _nees(over: Comparison) -> NamedFigure:
-    figure, panels = panels_of(over.estimators)
-    kinds: set[Output] = set()
-    shares: dict[str, list[float]] = {}
-    least, most = 1.0, 1.0
-    for group in over.rows:
-        nees = group.mean_nees
-        if nees is None or _repeats(over, group):
-            continue
-        axes = panels[group.estimator]
-        axes.fill_between(over.frames_s, nees.low, nees.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
-        kind, shown = _shown_as(over, group), np.clip(nees.mean, *RANGE)
-        axes.plot(over.frames_s, shown, color=COLOUR_OF[kind], linestyle=line_of(kind), linewidth=1.0)
-        shares.setdefault(group.estimator, []).append(nees.in_band_percent)
-        least, most = np.nanmin([least, *shown, *nees.low]), np.nanmax([most, *shown, *nees.high])
-        kinds.add(kind)
-    tell_shares(panels, shares)
-    scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
-    title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
-    finish(figure, panels, "pose NEES / 6", title, [*output_entries(kinds), band_entry()])
+    drawn = [
+        Drawn(
+            group.estimator, _shown_as(over, group), Normalised(over.sequence.frames_s, nees.mean, nees.low, nees.high)
+        )
+        for group in over.rows
+        if (nees := group.mean_nees) is not None and not _repeats(over, group)
+    ]
     caption = (
         f"Pose NEES over its 6 degrees of freedom on {over.name}, averaged over the runs that are ok of "
         f"{len(over.seeds)} seeds, and the 95 % chi-square band of a consistent estimator (grey). Above the band an "
         f"estimator is too sure of itself. What is beyond {RANGE[0]:g} and {RANGE[1]:g} is drawn there."
     )
+    title = f"{over.name}, {len(over.seeds)} seeds: mean pose NEES / 6"
+    figure = figure_with_bands(over.estimators, drawn, "pose NEES / 6", title)
     return NamedFigure("nees_over_seeds", caption, figure)
 
 

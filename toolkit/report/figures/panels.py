@@ -1,6 +1,7 @@
 """Small panels, one an estimator, all on the same axes: what fourteen lines in one panel would hide."""
 
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +11,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
 
 from toolkit.estimate import Output
+from toolkit.geometry import Array
 from toolkit.report.figures.style import (
     BAND_COLOUR,
     LABEL_PT,
@@ -22,7 +24,7 @@ from toolkit.report.figures.style import (
     legend_below,
     line_of,
     new_figure,
-    quiet,
+    style_axes,
 )
 
 # Okabe & Ito (2008). In panels of one estimator the colour tells the output.
@@ -45,7 +47,7 @@ def panels_of(names: Sequence[str], x_label: str = "time [s]") -> tuple[Figure, 
         axes.set_axis_off()
     panels = dict(zip(names, grid, strict=False))
     for name, axes in panels.items():
-        quiet(axes, name, "", "")
+        style_axes(axes, name, "", "")
     # A panel with nothing below it has the numbers of the axis, too.
     for axes in grid[: len(names)][-columns:]:
         axes.tick_params(labelbottom=True)
@@ -87,15 +89,53 @@ def scale_by_decades(axes: Axes, low: float, high: float) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def tell_shares(panels: dict[str, Axes], shares: dict[str, list[float]]) -> None:
-    """Say of each panel how many percent of what it shows are in the band."""
-    for name, percents in shares.items():
+class Normalised(NamedTuple):
+    """Squared errors over their expectation at times (n,) s, and the band (n,), (n,) of a consistent estimator.
+
+    What is NaN is not known.
+    """
+
+    t_s: Array
+    value: Array
+    low: Array
+    high: Array
+
+    @property
+    def in_band_percent(self) -> float:
+        """Return the share of the values that are in the band."""
+        known = ~np.isnan(self.value)
+        return 100.0 * float(np.mean(((self.value >= self.low) & (self.value <= self.high))[known]))
+
+
+class Drawn(NamedTuple):
+    """What a panel of an estimator shows, with the colour and the line of a kind of output."""
+
+    estimator: str
+    output: Output
+    series: Normalised
+
+
+def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: str, title: str) -> Figure:
+    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it."""
+    figure, panels = panels_of(panels_for)
+    shares: dict[str, list[float]] = {}
+    least = most = 1.0
+    for estimator, output, series in drawn:
+        axes, shown = panels[estimator], np.clip(series.value, *RANGE)
+        axes.fill_between(series.t_s, series.low, series.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
+        axes.plot(series.t_s, shown, color=COLOUR_OF[output], linestyle=line_of(output), linewidth=1.0)
+        shares.setdefault(estimator, []).append(series.in_band_percent)
+        least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
+    for estimator, percents in shares.items():
         words = ", ".join(f"{percent:.0f} %" for percent in percents)
-        tell(panels, name, (f"{words} in band", words))
+        annotate(panels, estimator, (f"{words} in band", words))
+    scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
+    finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
+    return figure
 
 
-def tell(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
-    """Say something in the upper right of a panel, above the data: the first of the words for which there is room."""
+def annotate(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
+    """Write above a panel, to the right: the first of the words for which there is room."""
     room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
     told = next((one for one in words if len(name) + len(one) <= room), words[-1])
     panels[name].set_title(told, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)

@@ -16,7 +16,7 @@ from toolkit.metrics import Evaluation, held_out, in_sample
 from toolkit.metrics._shared.residuals import CAP_PX
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.report.curves import shown_output
-from toolkit.report.figures.panels import finish, panels_of, tell
+from toolkit.report.figures.panels import annotate, finish, panels_of
 from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of
 
 # A logarithmic axis shows the bulk of a good estimator, that of a bad one and the mismatches in one picture.
@@ -35,7 +35,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         for kind, error_px in kinds.items():
             _histogram(panels[name], kind, error_px, colour_of(comparison, name))
         medians = " / ".join(f"{float(np.median(error_px)):.2f}" for error_px in kinds.values())
-        tell(panels, name, (f"median {medians} px", f"{medians} px"))
+        annotate(panels, name, (f"median {medians} px", f"{medians} px"))
     first = next(iter(panels.values()))
     first.set_xscale("log")
     first.set_xlim(_SMALLEST_PX, CAP_PX)

@@ -14,7 +14,7 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from toolkit.estimate import Output
-from toolkit.experiment.comparison import Comparison
+from toolkit.experiment.comparison import Comparison, Row
 
 DPI = 130
 WIDTH_IN = 7.16  # two columns of an IEEE paper
@@ -63,6 +63,11 @@ def line_of_estimator(comparison: Comparison, estimator: str, output: Output) ->
     return styles[order.index(estimator) // len(_COLOURS) % len(styles)]
 
 
+def shown_as(row: Row) -> Output:
+    """Return the kind of output whose line a row has: a filter's only answer is drawn as a final one."""
+    return "final" if row.label == "both" else row.output
+
+
 def width_of(comparison: Comparison, estimator: str) -> float:
     """Return the width of an estimator's line: each wider than the next, so that equal lines show as a border."""
     order = [run.estimator for run in comparison.runs]
@@ -76,7 +81,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
-def quiet(axes: Axes, title: str, x_label: str, y_label: str) -> None:
+def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
     """Label axes (with units), draw a light grid behind the data and no frame on the open sides."""
     axes.set_title(title, fontsize=TITLE_PT, loc="left")
     axes.set_xlabel(x_label, fontsize=LABEL_PT)

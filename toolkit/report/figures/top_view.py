@@ -22,7 +22,7 @@ from toolkit.report.figures.style import (
     legend,
     line_of_estimator,
     new_figure,
-    quiet,
+    style_axes,
     width_of,
 )
 from toolkit.report.figures.view import (
@@ -109,7 +109,7 @@ def _figure(
     for name, track in tracks.items():
         axes.plot(*track.xy[:1].T, "o", color=colour_of(comparison, name), ms=5.0, markeredgecolor="white", zorder=4)
     view.show(axes)
-    quiet(axes, title, "x [m]", "y [m]")
+    style_axes(axes, title, "x [m]", "y [m]")
     legend(beside, entries, columns=1, loc="upper left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.0)
     if under is not None and closer is not None:
         _look_closer(axes, under, closer, view)
@@ -180,7 +180,7 @@ def _draw_tracks(
 def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
     """Show a part of the map enlarged, and in the map where it is."""
     closer.show(under)
-    quiet(under, "", "", "")
+    style_axes(under, "", "", "")
     under.set_title("the square, enlarged", fontsize=SMALL_PT, loc="left")
     under.tick_params(labelsize=SMALL_PT, colors=MUTED_COLOUR)
     for axis in (under.xaxis, under.yaxis):

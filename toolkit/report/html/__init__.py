@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.errors import printable
-from toolkit.files import replaced_file
+from toolkit.files import write_text
 
 __all__ = ["write_html"]
 # In the order in which they build upon each other; together they are the body of one function.
@@ -53,9 +53,7 @@ def write_html(directories: Sequence[Path], target: Path) -> None:
     from toolkit.report.run_files import read_run
 
     runs = [read_run(directory) for directory in directories]
-    text = page_text(payload_of(runs))
-    with replaced_file(target) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(target, page_text(payload_of(runs)))
 
 
 def page_text(payload: dict[str, Any]) -> str:

@@ -35,27 +35,6 @@ svg .failed { stroke: var(--bad); stroke-width: 1.6; }
 """
 
 
-def leaderboard_page(evaluation: Evaluation) -> str:
-    """Return the page: leaderboard, a table by sequence, every run as a dot, tests, failures and notes."""
-    title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
-    if len(evaluation.sequences) > 3:
-        title += f" and {len(evaluation.sequences) - 3} more"
-    cards = [_card("Leaderboard", _paragraphs(header_lines(evaluation)) + html_table(leaderboard_table(evaluation)))]
-    if len(evaluation.sequences) > 1:
-        name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
-        cards.append(_card(name, html_table(sequences_table(evaluation))))
-    cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
-    for heading, lines in (
-        ("Is it more than chance?", paired_lines(evaluation)),
-        ("Runs that failed", failure_lines(evaluation, None)),
-        ("What to know", note_lines(evaluation)),
-    ):
-        entries = "".join(f"<li>{_text(line)}</li>" for line in lines)
-        cards += [_card(heading, f"<ul>{entries}</ul>")] if entries else []
-    style = files("toolkit.report.html").joinpath("style.css").read_text(encoding="utf-8") + _STYLE
-    return _PAGE.format(title=_text(title), style=style, cards="\n".join(cards))
-
-
 _PAGE = """<!doctype html>
 <html lang="en">
 <head>
@@ -76,6 +55,27 @@ _PAGE = """<!doctype html>
 </body>
 </html>
 """
+
+
+def leaderboard_page(evaluation: Evaluation) -> str:
+    """Return the page: leaderboard, a table by sequence, every run as a dot, tests, failures and notes."""
+    title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
+    if len(evaluation.sequences) > 3:
+        title += f" and {len(evaluation.sequences) - 3} more"
+    cards = [_card("Leaderboard", _paragraphs(header_lines(evaluation)) + html_table(leaderboard_table(evaluation)))]
+    if len(evaluation.sequences) > 1:
+        name = f"{evaluation.ranked_by.name} by sequence, median over the runs"
+        cards.append(_card(name, html_table(sequences_table(evaluation))))
+    cards.append(_card(f"{evaluation.ranked_by.name} of every run", _figure(evaluation)))
+    for heading, lines in (
+        ("Is it more than chance?", paired_lines(evaluation)),
+        ("Runs that failed", failure_lines(evaluation, None)),
+        ("What to know", note_lines(evaluation)),
+    ):
+        entries = "".join(f"<li>{_text(line)}</li>" for line in lines)
+        cards += [_card(heading, f"<ul>{entries}</ul>")] if entries else []
+    style = files("toolkit.report.html").joinpath("style.css").read_text(encoding="utf-8") + _STYLE
+    return _PAGE.format(title=_text(title), style=style, cards="\n".join(cards))
 
 
 def html_table(table: Table) -> str:

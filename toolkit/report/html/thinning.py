@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from toolkit.documents import number, numbers
 from toolkit.geometry import Array, IntArray
-from toolkit.report.report_json import number
 
 MOST_POSES = 1500
 MOST_SAMPLES = 1200
@@ -57,7 +57,7 @@ def running_median(values: Sequence[float | None]) -> list[float | None]:
     known = np.isfinite(windows).any(axis=1)
     medians = np.full(len(values), np.nan)
     medians[known] = np.nanmedian(windows[known], axis=1)
-    return [number(value) for value in medians.tolist()]
+    return list(numbers(medians))
 
 
 def coordinates(points: Array) -> dict[str, list[float | None]]:

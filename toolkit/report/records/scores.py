@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from toolkit.documents import Count, Value
 from toolkit.estimate import Output, Status
 from toolkit.metrics import contract_keys
 
@@ -17,9 +18,6 @@ ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": 
 
 MotionKind = Literal["twist", "imu", "none"]
 Motion = Annotated[MotionKind, Meta(description="body velocities or raw IMU between the frames")]
-Count = Annotated[int, Meta(ge=0)]
-# A count stays an integer when it is read and written again.
-Value = int | float | None
 Notes = Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on the value")]
 
 
