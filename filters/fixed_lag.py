@@ -28,8 +28,8 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 90, "+ relinearisation, every sighting kept at once, every landmark a variable"
-RULES = {"bridge_gaps": True}
+RUNG, CHANGE = 90, "+ relinearisation; each sighting kept at once, all landmarks; fourfold gate and loss"
+RULES = {"bridge_gaps": True, "match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:
@@ -65,7 +65,7 @@ class FixedLag:
         self._note(packet, recovery)
         self._read(packet)
         self._drop_landmarks(packet)
-        return self._states[-1]
+        return replace(self._states[-1], info=self._builder.info)
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""

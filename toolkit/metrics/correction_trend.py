@@ -5,7 +5,7 @@ track has so little of it that it passes its gate, and the innovations stay near
 state one way, frame after frame. The corrections of a consistent estimator are independent from frame to frame, and
 their sum over a stretch of time has the covariance that they took away (:mod:`toolkit.models.corrections`): its squared
 length is chi-square distributed. Corrections are the answers less what the measured motion predicts from the answers
-before; nothing else has to be reported.
+before, with the noise that the estimator took it for; where that is what is stated, nothing else has to be reported.
 """
 
 from collections.abc import Iterator
@@ -27,6 +27,7 @@ CAUSAL_ONLY = "corrections from frame to frame belong to the causal output"
 TREND, LIMIT = "correction_trend", "correction_trend_limit"
 # What all tracks of some frames share adds up within it; longer ones lose what biases absorb.
 _STRETCH_S = 1.0
+NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
 # A consistent estimator is beyond half of the limit less than once in a million runs. The other half is for filters
 # that linearise at estimates they have since corrected, and so count some information twice: chosen with 36 sound
 # simulated runs of each of three filters in view, one of which it leaves beyond the limit (docs/metrics.md).
@@ -57,14 +58,14 @@ def score(evaluation: Evaluation) -> Scores:
     """
     tests = [test for test in _tests(evaluation) if test.dof]
     if not tests:
-        raise Unavailable(f"nothing was corrected over {_STRETCH_S:g} s")
+        raise Unavailable(NOTHING_CORRECTED)
     nis, dof = np.sum(tests, axis=0)
     return Scores({TREND: float(nis / dof), LIMIT: _BY_LINEARISATION * float(chdtri(dof, _BY_CHANCE) / dof)})
 
 
 def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
     """Yield the test of the summed corrections of each whole stretch."""
-    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence))
+    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence, _noise_scale(evaluation)))
     cov = _stated_cov(evaluation.estimate, steps)
     total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
     for step in steps:
@@ -75,6 +76,12 @@ def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
         if since_s > _STRETCH_S - 1e-6:
             yield total.test(np.sqrt(sigma2))
             total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
+
+
+def _noise_scale(evaluation: Evaluation) -> Array | None:
+    """Return how many times its stated variance the run took the noise of the motion up to each row (N,) for."""
+    scale = evaluation.run.info.get("motion_noise_scale")
+    return None if scale is None else np.nan_to_num(scale, nan=1.0)
 
 
 def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:
