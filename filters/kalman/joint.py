@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Self
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csr_array
 
@@ -169,6 +169,24 @@ def divided_by_root(root: Array, right: Array) -> Array:
     """Return ``C^-1 B`` of a lower triangular root C (n, n) and right sides B (n, m), which may be overwritten."""
     # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
     result: Array = dtrsm(1.0, root.T, right.T, side=1, overwrite_b=1).T
+    return result
+
+
+def times_root(left: Array, root: Array) -> Array:
+    """Return ``A C`` of A (m, n), which may be overwritten, and a lower triangular C (n, n)."""
+    result: Array = dtrmm(1.0, root.T, left.T, overwrite_b=1).T if len(left) else left
+    return result
+
+
+def transposed_root_times(root: Array, right: Array) -> Array:
+    """Return ``C^T B`` of a lower triangular C (n, n) and B (n, m), which may be overwritten."""
+    result: Array = dtrmm(1.0, root.T, right.T, side=1, trans_a=1, overwrite_b=1).T
+    return result
+
+
+def without_products(matrix: Array, rows: Array) -> Array:
+    """Return the symmetric ``A - E^T E`` in its lower half, of A (n, n), which may be overwritten, and E (m, n)."""
+    result: Array = dsyrk(-1.0, rows.T, 1.0, matrix.T, overwrite_c=1).T if len(rows) else matrix
     return result
 
 

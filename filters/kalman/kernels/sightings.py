@@ -150,9 +150,9 @@ def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
 
 
 @compiled
-def step(points: Array, f: int, nearest_m: float, N: Array) -> None:
-    """Move a track's point by the solution of the first row of N, no longer than a fifth of the least depth."""
-    x, y, z = solved_3(N, 0, 0.0, 0.0)
+def step(points: Array, f: int, nearest_m: float, N: Array, at: int) -> None:
+    """Move a track's point by the solution of row ``at`` of N, no longer than a fifth of the least depth."""
+    x, y, z = solved_3(N, at, 0.0, 0.0)
     share = min(1.0, 0.2 * nearest_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
     points[f, 0] += share * x
     points[f, 1] += share * y
@@ -164,4 +164,4 @@ def refine(points: Array, f: int, nearest_m: float, H_point: Array, n: int) -> N
     """Move a track's point by one step of ``multiview.refined``: Gauss-Newton on n independent rows ``[H r]``."""
     N = np.zeros((1, 10))
     add_products(H_point, 0, n, N, 0)
-    step(points, f, nearest_m, N)
+    step(points, f, nearest_m, N, 0)
