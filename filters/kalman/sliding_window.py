@@ -14,6 +14,9 @@ track that lives on after it was used starts anew at its age, and the error it h
 anew.
 """
 
+from collections.abc import Callable
+from typing import cast
+
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview, track_error_states
@@ -28,6 +31,7 @@ from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
 from filters.kalman.tracks_in_view import TracksInView, tell
 from toolkit.arrays import is_among
+from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -36,7 +40,7 @@ from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet, StereoFrame
+from toolkit.sequence import Packet, StereoFrame, StereoRig
 from toolkit.track_noise import TrackNoise
 
 
@@ -64,6 +68,7 @@ class SlidingWindowFilter:
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup)
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._learn = learning(setup.compilation)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:
@@ -135,7 +140,7 @@ class SlidingWindowFilter:
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
         joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
-        self._correlation.learn(accepted.sightings, accepted.points, joint.clones)
+        self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
 
     def _correct_by_bridge(self, packet: Packet) -> None:
         """Correct the last three poses where no track leads from one of them to the next."""
@@ -159,6 +164,17 @@ class SlidingWindowFilter:
             self._joint.forget_clones(which)
             self._tracks.drop_columns(which)
             self._clone_t_ns = self._clone_t_ns[~which]
+
+
+Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
+
+
+def learning(compilation: Compilation) -> Learn:
+    """Return what has a correlation learn of tracks: compiled where that is asked for and possible, else itself."""
+    compiled = compilation.module("filters.kalman.compiled_residuals")
+    if compiled is None:
+        return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
+    return cast(Learn, compiled.learn)
 
 
 class WindowTracks:

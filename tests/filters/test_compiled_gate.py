@@ -13,6 +13,7 @@ from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
 from filters.kalman.multiview import TrackSightings
+from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_gate import Window
 from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow
 from filters.kalman.triangulation import nearest_view
@@ -32,9 +33,9 @@ CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0
 @pytest.fixture(scope="module")
 def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    from filters.kalman import compiled_gate, compiled_in_view
+    from filters.kalman import compiled_gate, compiled_in_view, compiled_residuals
 
-    return compiled_gate, compiled_in_view
+    return compiled_gate, compiled_in_view, compiled_residuals
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +114,21 @@ def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noi
     assert ((ours.weights[some] > 0.0) & (ours.weights[some] < 1.0)).any() == (huber is not None)
     assert np.tril(ours.matrix) == pytest.approx(np.tril(theirs.matrix), abs=TOLERANCE * np.abs(ours.matrix).max())
     assert ours.vector == pytest.approx(theirs.vector, abs=TOLERANCE * np.abs(ours.matrix).max())
+
+
+def test_compiled_and_numpy_learn_the_same_correlation_of_residuals(kernels, flight):
+    """Of tracks with gaps and of too few sightings, whose errors walk."""
+    rig, window = flight
+    sightings = sightings_in(rig, window)
+    sightings.uvs_px[8:] += np.cumsum(np.random.default_rng(7).normal(0.0, 3.0, (TRACKS - 8, WINDOW, 3)), axis=1)
+    sightings = sightings.select(np.arange(8, TRACKS))
+    points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
+    ours, theirs = ResidualCorrelation(rig), ResidualCorrelation(rig)
+    ours.learn(sightings, points, window.poses)
+    kernels[2].learn(theirs, sightings, points, window.poses, rig)
+    assert 0.0 < ours.correlation < 0.98
+    assert theirs.correlation == pytest.approx(ours.correlation, rel=TOLERANCE)
+    assert theirs.share == pytest.approx(ours.share, rel=TOLERANCE)
 
 
 def followed_in(rig, window: Window) -> FollowedTracks:
