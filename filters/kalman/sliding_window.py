@@ -23,7 +23,7 @@ from filters.kalman import joint_landmarks, multiview, track_error_states
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.motion_noise import MatchedNoise
+from filters.kalman.motion_noise import MatchedNoise, test_of_corrections
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.residual_correlation import ResidualCorrelation
@@ -66,7 +66,7 @@ class SlidingWindowFilter:
         self._track_test = track_test(setup.compilation)
         self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
         self._memory = LandmarkMemory()
-        self._noise = MatchedNoise.of(setup)
+        self._noise = MatchedNoise.of(setup, test_of_corrections(setup.compilation))
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
         self._learn = learning(setup.compilation)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
