@@ -5,13 +5,26 @@ import numpy as np
 from filters.kalman import tracks_in_view
 from filters.kalman.compiled_gate import camera_of, given
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import times_root, transposed_root_times, without_products
+from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
 from filters.kalman.kernels import tracks_in_view as kernel
+from filters.kalman.multiview import TrackSightings
 from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow, Told
-from toolkit.models.gating import LEAST_DEPTH_M, huber_threshold
+from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, LEAST_DISPARITY_PX, huber_threshold
 from toolkit.sequence import StereoRig
 
 COMPILED = kernel.COMPILED
+
+
+def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig) -> FollowedTracks:
+    """Return tracks with their landmarks: ``tracks_in_view.followed``, compiled where no right image is missing."""
+    if sightings.left_only.any():
+        return tracks_in_view.followed(known, sightings, joint, rig)
+    before = given((known.sightings.track_ids, known.clone_frames, known.points, known.weights))
+    now = given((sightings.track_ids, joint.clone_frames, sightings.uvs_px, sightings.seen))
+    found, points, weights = kernel.follow(
+        before, now, np.ascontiguousarray(joint.clones), camera_of(rig), FEWEST_SIGHTINGS, LEAST_DISPARITY_PX
+    )
+    return FollowedTracks(sightings, joint.clone_frames, points, weights).select(found)
 
 
 def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Told:

@@ -29,7 +29,7 @@ from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
-from filters.kalman.tracks_in_view import TracksInView, tell
+from filters.kalman.tracks_in_view import TracksInView, steps
 from toolkit.arrays import is_among
 from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
@@ -64,7 +64,7 @@ class SlidingWindowFilter:
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
         self._tracks = WindowTracks()
         self._track_test = track_test(setup.compilation)
-        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
+        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, steps(setup.compilation))
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup, test_of_corrections(setup.compilation))
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)

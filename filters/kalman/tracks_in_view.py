@@ -13,7 +13,7 @@ as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -105,6 +105,8 @@ class Told(NamedTuple):
     vector: Array
 
 
+# Finds the landmarks of tracks among those known before, or anew.
+Follow = Callable[[FollowedTracks, TrackSightings, JointBelief, StereoRig], FollowedTracks]
 # Gates the newest sightings of tracks and says what the tracks tell of a window.
 Tell = Callable[[FollowedTracks, RootedWindow, StereoRig, FrameGate], Told]
 
@@ -125,10 +127,35 @@ def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: Fra
     return Told(points, weights, usable, matrix, window.root.T @ vector)
 
 
-def tell(compilation: Compilation) -> Tell:
-    """Return what is to say what tracks tell: compiled where that is asked for and possible, else the definition."""
+def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig) -> FollowedTracks:
+    """Return tracks with their landmarks, as last known or as a first triangulation has them: the definition."""
+    sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+    rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
+    points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
+    still = is_among(known.clone_frames, joint.clone_frames)
+    here = is_among(joint.clone_frames, known.clone_frames)
+    points[before] = known.points[rows[before]]
+    weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
+    reliable, new = before.copy(), sightings.select(~before)
+    points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, rig)
+    reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
+    return FollowedTracks(sightings, joint.clone_frames, points, weights).select(reliable)
+
+
+class Steps(NamedTuple):
+    """What finds the landmarks of tracks that have two sightings or more, and what says what they tell."""
+
+    follow: Follow
+    tell: Tell
+
+
+NUMPY = Steps(followed, told)
+
+
+def steps(compilation: Compilation) -> Steps:
+    """Return what is to be done with tracks in view: compiled where that is asked for and possible, else as defined."""
     compiled = compilation.module("filters.kalman.compiled_in_view")
-    return told if compiled is None else cast(Tell, compiled.told)
+    return NUMPY if compiled is None else Steps(compiled.followed, compiled.told)
 
 
 class TracksInView:
@@ -138,8 +165,8 @@ class TracksInView:
     gated once, at its frame, against the window and the earlier sightings of its track; what it counts for then stays.
     """
 
-    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, tell: Tell = told) -> None:
-        self._at, self._rig, self._outliers, self._tell = at, rig, outliers, tell
+    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, steps: Steps = NUMPY) -> None:
+        self._at, self._rig, self._outliers, self._steps = at, rig, outliers, steps
         self._known = FollowedTracks.none()
 
     def corrected(self, joint: JointBelief, sightings: TrackSightings, share: float = 1.0) -> Belief:
@@ -147,32 +174,18 @@ class TracksInView:
 
         ``share`` is the share of its information that each counts for.
         """
-        tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
+        tracks = self._steps.follow(self._known, sightings, joint, self._rig)
         if not len(tracks.points):
             self._known = tracks
             return joint.core
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         window = RootedWindow.of(Window.of(joint, self._at))
-        told = self._tell(tracks, window, self._rig, gate)
+        told = self._steps.tell(tracks, window, self._rig, gate)
         tracks.weights[:, -1] = told.weights
         self._known = tracks._replace(points=told.points).select(told.usable)
         if not told.usable.any():
             return joint.core
         return _informed(joint, window.root, np.multiply(told.matrix, share, out=told.matrix), share * told.vector)
-
-    def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "FollowedTracks":
-        """Return the tracks with their landmarks: as last known, or as a first triangulation has them."""
-        known = self._known
-        rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
-        points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
-        still = is_among(known.clone_frames, joint.clone_frames)
-        here = is_among(joint.clone_frames, known.clone_frames)
-        points[before] = known.points[rows[before]]
-        weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
-        reliable, new = before.copy(), sightings.select(~before)
-        points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
-        reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
-        return FollowedTracks(sightings, joint.clone_frames, points, weights).select(reliable)
 
 
 class _Rows(NamedTuple):

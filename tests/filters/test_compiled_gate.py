@@ -4,6 +4,7 @@ import importlib
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,6 +146,22 @@ def followed_in(rig, window: Window) -> FollowedTracks:
     return FollowedTracks(sightings, np.arange(WINDOW), points + 0.1 * rng.normal(size=points.shape), weights)
 
 
+def test_compiled_and_numpy_follow_the_same_landmarks(kernels, flight):
+    """Of tracks known before, in another order and from other poses, and of new ones, seen once or too far away too."""
+    rig, window = flight
+    joint = SimpleNamespace(clones=window.poses, clone_frames=np.arange(3, 3 + WINDOW))
+    known, sightings = followed_in(rig, window), sightings_in(rig, window)
+    sightings.seen[35:37] = np.arange(WINDOW) == 4
+    known = known._replace(clone_frames=np.arange(1, 1 + WINDOW)).select(np.arange(TRACKS) % 3 > 0)
+    now = sightings.select(np.random.default_rng(8).permutation(TRACKS))
+    ours, theirs = (follow(known, now, joint, rig) for follow in (tracks_in_view.followed, kernels[1].followed))
+    assert 25 < len(ours.points) < TRACKS
+    assert ours.sightings.track_ids.tolist() == theirs.sightings.track_ids.tolist()
+    assert ours.points == pytest.approx(theirs.points, rel=TOLERANCE)
+    assert (ours.weights < 1.0).any()
+    np.testing.assert_array_equal(ours.weights, theirs.weights)
+
+
 def test_nothing_is_told_by_no_track(kernels, flight):
     rig, window = flight
     none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
@@ -164,7 +181,7 @@ def test_no_track_is_no_row(compiled, flight):
 def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
     for compilation in (Compilation(), Compilation("numpy")):
         assert track_gate.track_test(compilation) is track_gate.tested
-        assert tracks_in_view.tell(compilation) is tracks_in_view.told
+        assert tracks_in_view.steps(compilation) is tracks_in_view.NUMPY
         assert compilation.ran == "numpy"
 
 

@@ -5,8 +5,9 @@ newest last. Of them are made ``[H_f r]^T [H_f r]`` and ``B = H_f^T J``, and of 
 is left on the poses, ``J^T J - B^T V B`` and ``J^T r - B^T V H_f^T r`` (Triggs, McLauchlan, Hartley & Fitzgibbon 2000,
 "Bundle adjustment - a modern synthesis", section 6.1).
 
-There are two kernels, for between them BLAS takes the rows of all tracks at once to errors whose covariance is one:
-:func:`normals_of_tracks` forms B without the newest sightings, :func:`told_by_newest` tests and adds these.
+:func:`follow` finds the landmarks of the frame before. What is told takes two kernels, for between them BLAS takes the
+rows of all tracks at once to errors whose covariance is one: :func:`normals_of_tracks` forms B without the newest
+sightings, :func:`told_by_newest` tests and adds these.
 """
 
 import math
@@ -14,7 +15,7 @@ import math
 import numpy as np
 from numba import types
 
-from filters.kalman.kernels.algebra import inverses, solved_3
+from filters.kalman.kernels.algebra import inverses, products, solved_3
 from filters.kalman.kernels.compiling import (
     CAMERA,
     COUNTS,
@@ -30,6 +31,7 @@ from filters.kalman.kernels.compiling import (
 from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
+    first_guess,
     linearise,
     noise_roots,
     own_jacobians,
@@ -48,6 +50,65 @@ NEWEST_SIGNATURE = (
     ROW,
 )
 LEAST_DEPTH, BOUND, HUBER_THRESHOLD = range(3)
+# Of tracks known before: ids (K,), frames of the poses (V,), points (K, 3), what sightings count for (K, V). Of those
+# now: ids (A,), frames (W,), (uL, uR, v) (A, W, 3) px and which were seen (A, W). Poses (W, 4, 4), camera; how many
+# sightings a track needs, and what disparity px.
+_IDS = types.int64[::1]
+FOLLOWING = (
+    types.Tuple((_IDS, _IDS, MATRIX, MATRIX)),
+    types.Tuple((_IDS, _IDS, STACK, MASK)),
+    STACK,
+    CAMERA,
+    types.int64,
+    types.float64,
+)
+
+
+@compiled
+def place_of(wanted: int, ids: IntArray, first: int) -> int:
+    """Return where an id stands among ids, looked for from some place on and then before it; -1 where it does not."""
+    for k in range(ids.size):
+        at = first + k if first + k < ids.size else first + k - ids.size
+        if ids[at] == wanted:
+            return at
+    return -1
+
+
+@compiled
+def places_of(frames: IntArray, known: IntArray) -> IntArray:
+    """Return where frames (W,) stand among known ones, -1 where they do not."""
+    places = np.empty(frames.size, dtype=np.int64)
+    for j in range(frames.size):
+        places[j] = place_of(frames[j], known, j if j < known.size else 0)
+    return places
+
+
+@kept(FOLLOWING)
+def follow(known: Arrays, now: Arrays, poses: Array, camera: Arrays, fewest: int, least_px: float) -> Arrays:
+    """Return which of A tracks have a landmark (A,), the points (A, 3), and what sightings count for (A, W).
+
+    They are those known before, and of new tracks where the sighting with the largest disparity puts them.
+    """
+    known_ids, known_frames, known_points, known_weights = known
+    ids, frames, uvs_px, seen = now
+    (count, window), at, places = seen.shape, 0, places_of(frames, known_frames)
+    T_world_cam = products(poses, camera[1])
+    found, points, weights = np.empty(count, dtype=np.bool_), np.zeros((count, 3)), np.ones((count, window))
+    for f in range(count):
+        found[f] = sighted(seen, f).size >= fewest
+        if found[f]:
+            row = place_of(ids[f], known_ids, at)
+            if row >= 0:
+                at = row + 1
+                for i in range(3):
+                    points[f, i] = known_points[row, i]
+                for j in range(window):
+                    if places[j] >= 0:
+                        weights[f, j] = known_weights[row, places[j]]
+            else:
+                points[f, 0] = least_px
+                found[f] = first_guess(uvs_px, seen, f, T_world_cam, camera[0], points) > least_px
+    return found, points, weights
 
 
 @compiled
@@ -255,4 +316,4 @@ def told_by_newest(normals: Arrays, by_root: Arrays, rules: Array) -> Arrays:
     return stepped, newest, in_front, e, blocks_times_root(D, R)
 
 
-COMPILED = what_was_compiled(told_by_newest, "what tracks in view tell was")
+COMPILED = what_was_compiled(follow, "what tracks in view tell was")
