@@ -6,7 +6,7 @@ is estimated now, and as it was first estimated; which of the two a Jacobian use
 
 from copy import copy
 from dataclasses import replace
-from typing import Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
@@ -15,6 +15,13 @@ from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import POSE, Belief, Prediction
+
+
+class Rows(Protocol):
+    """A matrix (m, k) that is multiplied from the left: an array, a sparse one, or a triangle."""
+
+    def __matmul__(self, right: Any, /) -> Any:
+        """Return the product with an array (k, n)."""
 
 
 class JointBelief:
@@ -104,13 +111,13 @@ class JointBelief:
         own = _symmetric(jacobian @ cross.T + cov)
         self._cov = np.block([[self._cov, cross.T], [cross, own]])
 
-    def update(self, H: Array | csr_array, residual: Array, columns: slice) -> None:
+    def update(self, H: Rows, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
-    def reduce_covariance(self, H: Array | csr_array, columns: slice) -> None:
+    def reduce_covariance(self, H: Rows, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
         self._reduce(self._half_gain(H, columns)[1])
 
@@ -119,7 +126,7 @@ class JointBelief:
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
 
-    def _half_gain(self, H: Array | csr_array, columns: slice) -> tuple[Array, Array]:
+    def _half_gain(self, H: Rows, columns: slice) -> tuple[Array, Array]:
         """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
         carried = np.asarray(H @ self._cov[columns])
         innovation_cov = np.asarray(H @ carried[:, columns].T)

@@ -139,7 +139,9 @@ class SlidingWindowFilter:
             self._add_landmarks(
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
-        joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
+        first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
+        H, residuals = multiview.compressed(accepted.H[:, first:], accepted.residuals)
+        joint.update(H, residuals, slice(joint.clone_columns.start + first, joint.clone_columns.stop))
         self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
 
     def _correct_by_bridge(self, packet: Packet) -> None:
