@@ -4,6 +4,7 @@ Only this class touches the covariance. Every quantity that measurements lineari
 is estimated now, and as it was first estimated; which of the two a Jacobian uses is the filter's choice.
 """
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from typing import Any, Protocol, Self
@@ -37,6 +38,8 @@ class JointBelief:
         self.points: Array = np.empty((0, 3))
         self.first_points: Array = np.empty((0, 3))
         self._cov = _symmetric(core.cov)
+        # Makes motions (N, 4, 4) of twists (N, 6).
+        self.exponentials: Callable[[Array], Array] = se3_exp
 
     @property
     def core(self) -> Belief:
@@ -146,7 +149,7 @@ class JointBelief:
 
     def _displace(self, delta: Array) -> None:
         d, clones = self._core.layout.size, self.clone_columns
-        steps = se3_exp(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
+        steps = self.exponentials(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
         self._core = self._core.displaced(delta[:d], steps[0])
         self.clones = self.clones @ steps[1:]
         self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)

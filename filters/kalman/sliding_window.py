@@ -34,7 +34,7 @@ from toolkit.arrays import is_among
 from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
 from toolkit.models.gap_bridge import gap_bridge_for
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
@@ -62,6 +62,7 @@ class SlidingWindowFilter:
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
+        self._joint.exponentials = exponentials(setup.compilation)
         self._tracks = WindowTracks()
         self._track_test = track_test(setup.compilation)
         self._in_view = TracksInView(linearisation, setup.rig, self._outliers, steps(setup.compilation))
@@ -179,6 +180,12 @@ def learning(compilation: Compilation) -> Learn:
     return cast(Learn, compiled.learn)
 
 
+def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
+    """Return the exponential map of poses: compiled where that is asked for and possible, else NumPy's."""
+    compiled = compilation.module("filters.kalman.compiled_exponentials")
+    return se3_exp if compiled is None else cast(Callable[[Array], Array], compiled.exponentials)
+
+
 class WindowTracks:
     """The tracks not yet used: sightings of A tracks from the W poses of the window, one column a clone."""
 
@@ -236,4 +243,6 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of the state's landmarks."""
+    if not len(joint.landmark_ids):
+        return frame
     return frame.select(~is_among(frame.track_ids, joint.landmark_ids))

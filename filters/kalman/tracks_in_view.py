@@ -13,6 +13,7 @@ as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
-from toolkit.models.state import Belief
+from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoRig
 from toolkit.settings import Outliers
 
@@ -327,7 +328,9 @@ def _informed(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> 
     matrix.flat[:: len(matrix) + 1] += 1.0
     halves = divided_by_root(cholesky_root(matrix), np.column_stack([to_core, vector]))
     half = halves[:, :-1]
-    return core.moved(half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half)
+    delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
+    moved = core.displaced(delta, joint.exponentials(delta[None, POSE])[0])
+    return replace(moved, cov=0.5 * (cov + cov.T))
 
 
 def _no_longer_than(most_m: Array, steps: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A correction that is tested compiled has the length and the degrees of freedom that NumPy finds."""
+"""A correction that is tested or made compiled is that of NumPy."""
 
 from dataclasses import replace
 
@@ -42,6 +42,13 @@ def test_compiled_and_numpy_test_corrections_alike(compiled, layout, turn_rad):
         ours, theirs = correction_test(before, after), compiled(before, after)
         assert theirs.dof == ours.dof == 4
         assert theirs.nis == pytest.approx(ours.nis, rel=1e-9)
+
+
+def test_compiled_and_numpy_make_the_same_motions_of_twists(compiled):
+    from filters.kalman.compiled_exponentials import exponentials
+
+    twists = np.random.default_rng(2).normal(size=(40, 6)) * np.geomspace(1e-12, 3.0, 40)[:, None]
+    assert exponentials(twists) == pytest.approx(se3_exp(twists), abs=1e-14)
 
 
 def test_what_has_no_variance_is_left_out(compiled):
