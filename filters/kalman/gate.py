@@ -33,6 +33,10 @@ class FrameGate:
     accepted: int = 0
     unconverged: int = 0
 
+    def bounds(self, most: int) -> Array:
+        """Return the NIS that is just accepted at each number of degrees of freedom up to the most, (most + 1,)."""
+        return self._table(most).bound[: most + 1]
+
     def bound(self, dof: IntArray | int) -> Array:
         """Return the NIS that is just accepted at each number of degrees of freedom (N,)."""
         return np.asarray(self._table(dof).bound[dof])

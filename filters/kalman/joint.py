@@ -4,17 +4,25 @@ Only this class touches the covariance. Every quantity that measurements lineari
 is estimated now, and as it was first estimated; which of the two a Jacobian uses is the filter's choice.
 """
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from typing import Self
+from typing import Any, Protocol, Self
 
 import numpy as np
-from scipy.linalg.blas import dtrsm
+from scipy.linalg.blas import dsyrk, dtrmm, dtrsm
 from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import POSE, Belief, Prediction
+
+
+class Rows(Protocol):
+    """A matrix (m, k) that is multiplied from the left: an array, a sparse one, or a triangle."""
+
+    def __matmul__(self, right: Any, /) -> Any:
+        """Return the product with an array (k, n)."""
 
 
 class JointBelief:
@@ -30,6 +38,8 @@ class JointBelief:
         self.points: Array = np.empty((0, 3))
         self.first_points: Array = np.empty((0, 3))
         self._cov = _symmetric(core.cov)
+        # Makes motions (N, 4, 4) of twists (N, 6).
+        self.exponentials: Callable[[Array], Array] = se3_exp
 
     @property
     def core(self) -> Belief:
@@ -104,13 +114,13 @@ class JointBelief:
         own = _symmetric(jacobian @ cross.T + cov)
         self._cov = np.block([[self._cov, cross.T], [cross, own]])
 
-    def update(self, H: Array | csr_array, residual: Array, columns: slice) -> None:
+    def update(self, H: Rows, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
 
-    def reduce_covariance(self, H: Array | csr_array, columns: slice) -> None:
+    def reduce_covariance(self, H: Rows, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
         self._reduce(self._half_gain(H, columns)[1])
 
@@ -119,7 +129,7 @@ class JointBelief:
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
 
-    def _half_gain(self, H: Array | csr_array, columns: slice) -> tuple[Array, Array]:
+    def _half_gain(self, H: Rows, columns: slice) -> tuple[Array, Array]:
         """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
         carried = np.asarray(H @ self._cov[columns])
         innovation_cov = np.asarray(H @ carried[:, columns].T)
@@ -139,7 +149,7 @@ class JointBelief:
 
     def _displace(self, delta: Array) -> None:
         d, clones = self._core.layout.size, self.clone_columns
-        steps = se3_exp(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
+        steps = self.exponentials(np.concatenate([delta[POSE], delta[clones]]).reshape(-1, 6))
         self._core = self._core.displaced(delta[:d], steps[0])
         self.clones = self.clones @ steps[1:]
         self.points = self.points + delta[self.landmark_columns].reshape(-1, 3)
@@ -169,6 +179,24 @@ def divided_by_root(root: Array, right: Array) -> Array:
     """Return ``C^-1 B`` of a lower triangular root C (n, n) and right sides B (n, m), which may be overwritten."""
     # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
     result: Array = dtrsm(1.0, root.T, right.T, side=1, overwrite_b=1).T
+    return result
+
+
+def times_root(left: Array, root: Array) -> Array:
+    """Return ``A C`` of A (m, n), which may be overwritten, and a lower triangular C (n, n)."""
+    result: Array = dtrmm(1.0, root.T, left.T, overwrite_b=1).T if len(left) else left
+    return result
+
+
+def transposed_root_times(root: Array, right: Array) -> Array:
+    """Return ``C^T B`` of a lower triangular C (n, n) and B (n, m), which may be overwritten."""
+    result: Array = dtrmm(1.0, root.T, right.T, side=1, trans_a=1, overwrite_b=1).T
+    return result
+
+
+def without_products(matrix: Array, rows: Array) -> Array:
+    """Return the symmetric ``A - E^T E`` in its lower half, of A (n, n), which may be overwritten, and E (m, n)."""
+    result: Array = dsyrk(-1.0, rows.T, 1.0, matrix.T, overwrite_c=1).T if len(rows) else matrix
     return result
 
 

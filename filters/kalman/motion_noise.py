@@ -11,12 +11,14 @@ what is stated. It begins where the corrections of a window add up to what chanc
 stays, to the bit, what it is without.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 from scipy.special import chdtri
 
+from toolkit.compilation import Compilation
 from toolkit.estimator import Setup
 from toolkit.measured_motion import with_noise_scaled
 from toolkit.models.corrections import CorrectionTest, correction_test
@@ -32,19 +34,29 @@ _MOST = 1e4
 _LEAST_TOLD = 1.05
 
 
+# Tests what measurements made of a belief.
+Test = Callable[[Belief, Belief], CorrectionTest]
+
+
+def test_of_corrections(compilation: Compilation) -> Test:
+    """Return what is to test corrections: compiled where that is asked for and possible, else the definition."""
+    compiled = compilation.module("filters.kalman.compiled_corrections")
+    return correction_test if compiled is None else cast(Test, compiled.correction_test)
+
+
 class MatchedNoise:
     """Matches the variance of an IMU's white noise to the corrections of so many latest seconds as a window has."""
 
-    def __init__(self, window_s: float, matches: bool = True) -> None:
-        self._window_ns, self._matches = round(window_s * NS_PER_S), matches
+    def __init__(self, window_s: float, matches: bool = True, test: Test = correction_test) -> None:
+        self._window_ns, self._matches, self._test = round(window_s * NS_PER_S), matches, test
         self._scales, self._applied = [1.0], 1.0
         self._tests: list[tuple[int, CorrectionTest]] = []
 
     @classmethod
-    def of(cls, setup: Setup) -> Self:
+    def of(cls, setup: Setup, test: Test = correction_test) -> Self:
         """Return that of an estimator; twists, whose noise is measured from their own scatter, are believed."""
         kind, settings = setup.motion_kind, setup.settings
-        return cls(settings.window.seconds(kind), settings.noise.match_imu and kind == "imu")
+        return cls(settings.window.seconds(kind), settings.noise.match_imu and kind == "imu", test)
 
     @property
     def scale(self) -> float:
@@ -77,7 +89,7 @@ class MatchedNoise:
     def learn(self, t_ns: int, predicted: Belief, corrected: Belief) -> None:
         """Take in what a frame's tracks made of the state that was predicted for it."""
         if self._matches:
-            self.take(t_ns, correction_test(predicted, corrected))
+            self.take(t_ns, self._test(predicted, corrected))
 
     def take(self, t_ns: int, test: CorrectionTest) -> None:
         """Take in the test of one more frame.

@@ -5,10 +5,10 @@ Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter fo
 navigation", eqs. 17-26; the stereo measurement replaces their monocular one.
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dgeqrf
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
@@ -223,7 +223,21 @@ def _reflectors(linearised: Linearised) -> tuple[Array, Array]:
     return np.swapaxes(packed, 1, 2), np.swapaxes(triangle, 1, 2) @ packed
 
 
-def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:
+class Triangle(NamedTuple):
+    """An upper triangular matrix (n, n): of its products BLAS leaves out the other half, which may hold anything."""
+
+    matrix: Array
+
+    def __matmul__(self, right: Array) -> Array:
+        if right.flags.c_contiguous:
+            # BLAS takes columns where NumPy has rows: to it all is transposed, and the triangle a lower one.
+            result: Array = dtrmm(1.0, self.matrix.T, right.T, side=1, lower=1).T
+        else:
+            result = dtrmm(1.0, self.matrix.T, right, trans_a=1, lower=1)
+        return result
+
+
+def compressed(H: Array, residuals: Array) -> tuple[Array | Triangle, Array]:
     """Return an equivalent system (k, n), (k,) with no more rows than columns, by QR (MSCKF, eqs. 28-30)."""
     count, columns = H.shape
     if count <= columns:
@@ -233,11 +247,4 @@ def compressed(H: Array, residuals: Array) -> tuple[Array, Array]:
     system = np.empty((columns + 1, count))
     system[:-1], system[-1] = H.T, residuals
     packed = dgeqrf(system.T, lwork=32 * (columns + 1), overwrite_a=1)[0]
-    triangle = np.where(_upper(columns), packed[:columns], 0.0)
-    return triangle[:, :-1], triangle[:, -1]
-
-
-@lru_cache(maxsize=64)
-def _upper(count: int) -> BoolArray:
-    """Return which elements (n, n + 1) stand on or above the diagonal."""
-    return np.asarray(np.triu(np.ones((count, count + 1), dtype=bool)))
+    return Triangle(np.ascontiguousarray(packed[:columns, :-1])), packed[:columns, -1].copy()

@@ -14,29 +14,33 @@ track that lives on after it was used starts anew at its age, and the error it h
 anew.
 """
 
+from collections.abc import Callable
+from typing import cast
+
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview, track_error_states
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.motion_noise import MatchedNoise
+from filters.kalman.motion_noise import MatchedNoise, test_of_corrections
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
-from filters.kalman.tracks_in_view import TracksInView, tell
+from filters.kalman.tracks_in_view import TracksInView, steps
 from toolkit.arrays import is_among
+from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray, IntArray
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
 from toolkit.models.gap_bridge import gap_bridge_for
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet, StereoFrame
+from toolkit.sequence import Packet, StereoFrame, StereoRig
 from toolkit.track_noise import TrackNoise
 
 
@@ -58,12 +62,14 @@ class SlidingWindowFilter:
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
         self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
+        self._joint.exponentials = exponentials(setup.compilation)
         self._tracks = WindowTracks()
         self._track_test = track_test(setup.compilation)
-        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, tell(setup.compilation))
+        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, steps(setup.compilation))
         self._memory = LandmarkMemory()
-        self._noise = MatchedNoise.of(setup)
+        self._noise = MatchedNoise.of(setup, test_of_corrections(setup.compilation))
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._learn = learning(setup.compilation)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:
@@ -134,8 +140,10 @@ class SlidingWindowFilter:
             self._add_landmarks(
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
-        joint.update(*multiview.compressed(accepted.H, accepted.residuals), joint.clone_columns)
-        self._correlation.learn(accepted.sightings, accepted.points, joint.clones)
+        first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
+        H, residuals = multiview.compressed(accepted.H[:, first:], accepted.residuals)
+        joint.update(H, residuals, slice(joint.clone_columns.start + first, joint.clone_columns.stop))
+        self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
 
     def _correct_by_bridge(self, packet: Packet) -> None:
         """Correct the last three poses where no track leads from one of them to the next."""
@@ -159,6 +167,23 @@ class SlidingWindowFilter:
             self._joint.forget_clones(which)
             self._tracks.drop_columns(which)
             self._clone_t_ns = self._clone_t_ns[~which]
+
+
+Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
+
+
+def learning(compilation: Compilation) -> Learn:
+    """Return what has a correlation learn of tracks: compiled where that is asked for and possible, else itself."""
+    compiled = compilation.module("filters.kalman.compiled_residuals")
+    if compiled is None:
+        return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
+    return cast(Learn, compiled.learn)
+
+
+def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
+    """Return the exponential map of poses: compiled where that is asked for and possible, else NumPy's."""
+    compiled = compilation.module("filters.kalman.compiled_exponentials")
+    return se3_exp if compiled is None else cast(Callable[[Array], Array], compiled.exponentials)
 
 
 class WindowTracks:
@@ -218,4 +243,6 @@ def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
 
 def _without(frame: StereoFrame, joint: JointBelief) -> StereoFrame:
     """Return the frame without the sightings of the state's landmarks."""
+    if not len(joint.landmark_ids):
+        return frame
     return frame.select(~is_among(frame.track_ids, joint.landmark_ids))

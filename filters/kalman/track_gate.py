@@ -160,7 +160,7 @@ class TrackGate:
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
         """Return the tracks that pass as they are, and those that fail by far less their worst sighting."""
-        bounds = gate.bound(np.arange(3 * sightings.seen.shape[1] + 1))
+        bounds = gate.bounds(3 * sightings.seen.shape[1])
         tracks = self._test(sightings, self._window, self._rig, bounds)
         dof = tracks.sightings.degrees_of_freedom
         accepted = gate.accepts(tracks.nis, dof)

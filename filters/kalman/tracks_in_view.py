@@ -13,13 +13,20 @@ as ``P_xc (1 + L P_cc)^-1 n`` and takes ``P_xc (1 + L P_cc)^-1 L P_cx`` off its 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief, cholesky_root, divided_by_root
+from filters.kalman.joint import (
+    JointBelief,
+    cholesky_root,
+    divided_by_root,
+    times_root,
+    transposed_root_times,
+)
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import Window
@@ -29,7 +36,7 @@ from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
-from toolkit.models.state import Belief
+from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoRig
 from toolkit.settings import Outliers
 
@@ -68,11 +75,28 @@ class FollowedTracks(NamedTuple):
         return FollowedTracks(self.sightings.select(rows), self.clone_frames, self.points[rows], self.weights[rows])
 
 
+class RootedWindow(NamedTuple):
+    """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the root R (6 W, 6 W) of their cov."""
+
+    poses: Array
+    poses_at: Array
+    root: Array
+
+    @classmethod
+    def of(cls, window: Window) -> "RootedWindow":
+        """Return that of a window's covariance, every variance larger by what keeps it from being singular."""
+        cov = window.cov.copy()
+        cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
+        return cls(window.poses, window.poses_at, cholesky_root(cov))
+
+
 class Told(NamedTuple):
     """What F tracks tell of W poses: information matrix (6 W, 6 W) and vector (6 W,), free of the landmarks.
 
-    ``weights`` (F,) is what the newest sightings count for, ``points`` (F, 3) the landmarks after a Gauss-Newton step.
-    Tracks that are not ``usable`` (F,), in front of all their cameras and of a known place, tell nothing.
+    Both are of errors u of unit covariance, of which those of the poses are ``R u``; of the matrix the lower half
+    counts. ``weights`` (F,) is what the newest sightings count for, ``points`` (F, 3) the landmarks after a
+    Gauss-Newton step. Tracks that are not ``usable`` (F,), in front of all their cameras and of a known place, tell
+    nothing.
     """
 
     points: Array
@@ -82,28 +106,57 @@ class Told(NamedTuple):
     vector: Array
 
 
+# Finds the landmarks of tracks among those known before, or anew.
+Follow = Callable[[FollowedTracks, TrackSightings, JointBelief, StereoRig], FollowedTracks]
 # Gates the newest sightings of tracks and says what the tracks tell of a window.
-Tell = Callable[[FollowedTracks, Window, StereoRig, FrameGate], Told]
+Tell = Callable[[FollowedTracks, RootedWindow, StereoRig, FrameGate], Told]
 
 
-def told(tracks: FollowedTracks, window: Window, rig: StereoRig, gate: FrameGate) -> Told:
+def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Told:
     """Gate the newest sightings and return what the tracks tell: the definition, in NumPy, all tracks at once."""
     rows, usable = _rows(tracks, window, rig)
     points, weights = tracks.points.copy(), np.zeros(len(usable))
     normals = _Normals.of(rows.select(usable))
-    nis = normals.newest_nis(window.cov)
+    nis = normals.newest_nis(window.root)
     dof = left_only.degrees_of_freedom(tracks.sightings.uvs_px[usable, -1])
     weights[usable] = gate.weights(nis, dof, gate.accepts(nis, dof))
     normals = normals.newest_weighed(weights[usable])
     most_m = 0.2 * rows.depth_m[usable].min(axis=1)
     points[usable] += _no_longer_than(most_m, normals.point_steps())
-    return Told(points, weights, usable, *normals.of_clones())
+    matrix, vector = normals.of_clones()
+    matrix = transposed_root_times(window.root, times_root(matrix, window.root))
+    return Told(points, weights, usable, matrix, window.root.T @ vector)
 
 
-def tell(compilation: Compilation) -> Tell:
-    """Return what is to say what tracks tell: compiled where that is asked for and possible, else the definition."""
+def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig) -> FollowedTracks:
+    """Return tracks with their landmarks, as last known or as a first triangulation has them: the definition."""
+    sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+    rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
+    points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
+    still = is_among(known.clone_frames, joint.clone_frames)
+    here = is_among(joint.clone_frames, known.clone_frames)
+    points[before] = known.points[rows[before]]
+    weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
+    reliable, new = before.copy(), sightings.select(~before)
+    points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, rig)
+    reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
+    return FollowedTracks(sightings, joint.clone_frames, points, weights).select(reliable)
+
+
+class Steps(NamedTuple):
+    """What finds the landmarks of tracks that have two sightings or more, and what says what they tell."""
+
+    follow: Follow
+    tell: Tell
+
+
+NUMPY = Steps(followed, told)
+
+
+def steps(compilation: Compilation) -> Steps:
+    """Return what is to be done with tracks in view: compiled where that is asked for and possible, else as defined."""
     compiled = compilation.module("filters.kalman.compiled_in_view")
-    return told if compiled is None else cast(Tell, compiled.told)
+    return NUMPY if compiled is None else Steps(compiled.followed, compiled.told)
 
 
 class TracksInView:
@@ -113,8 +166,8 @@ class TracksInView:
     gated once, at its frame, against the window and the earlier sightings of its track; what it counts for then stays.
     """
 
-    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, tell: Tell = told) -> None:
-        self._at, self._rig, self._outliers, self._tell = at, rig, outliers, tell
+    def __init__(self, at: Linearisation, rig: StereoRig, outliers: Outliers, steps: Steps = NUMPY) -> None:
+        self._at, self._rig, self._outliers, self._steps = at, rig, outliers, steps
         self._known = FollowedTracks.none()
 
     def corrected(self, joint: JointBelief, sightings: TrackSightings, share: float = 1.0) -> Belief:
@@ -122,26 +175,18 @@ class TracksInView:
 
         ``share`` is the share of its information that each counts for.
         """
-        tracks = self._followed(joint, sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS))
+        tracks = self._steps.follow(self._known, sightings, joint, self._rig)
+        if not len(tracks.points):
+            self._known = tracks
+            return joint.core
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
-        told = self._tell(tracks, Window.of(joint, self._at), self._rig, gate)
+        window = RootedWindow.of(Window.of(joint, self._at))
+        told = self._steps.tell(tracks, window, self._rig, gate)
         tracks.weights[:, -1] = told.weights
         self._known = tracks._replace(points=told.points).select(told.usable)
-        return _informed(joint, share * told.matrix, share * told.vector) if told.usable.any() else joint.core
-
-    def _followed(self, joint: JointBelief, sightings: TrackSightings) -> "FollowedTracks":
-        """Return the tracks with their landmarks: as last known, or as a first triangulation has them."""
-        known = self._known
-        rows, before = _rows_in(known.sightings.track_ids, sightings.track_ids)
-        points, weights = np.zeros((len(rows), 3)), np.ones(sightings.seen.shape)
-        still = is_among(known.clone_frames, joint.clone_frames)
-        here = is_among(joint.clone_frames, known.clone_frames)
-        points[before] = known.points[rows[before]]
-        weights[np.ix_(before, here)] = known.weights[np.ix_(rows[before], still)]
-        reliable, new = before.copy(), sightings.select(~before)
-        points[~before], wide = nearest_view(new.uvs_px, new.seen, joint.clones, self._rig)
-        reliable[~before] = wide | lacking(new.uvs_px, new.seen, wide)
-        return FollowedTracks(sightings, joint.clone_frames, points, weights).select(reliable)
+        if not told.usable.any():
+            return joint.core
+        return _informed(joint, window.root, np.multiply(told.matrix, share, out=told.matrix), share * told.vector)
 
 
 class _Rows(NamedTuple):
@@ -173,7 +218,7 @@ class _Rows(NamedTuple):
         return _Rows(residuals, H_point, H_pose.reshape(tracks, window, 3, 6 * window), self.depth_m)
 
 
-def _rows(tracks: FollowedTracks, window: Window, rig: StereoRig) -> tuple[_Rows, BoolArray]:
+def _rows(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig) -> tuple[_Rows, BoolArray]:
     """Return the tracks' rows, zero where rejected, and which tracks (F,) all their cameras have in front.
 
     Where right images are missing, the sightings before the newest must tell where the landmark is.
@@ -211,10 +256,11 @@ class _Normals(NamedTuple):
         right = (H_transposed @ rows.residuals[..., None])[..., 0]
         return cls(rows, H_transposed @ rows.H_point, right, H_transposed @ rows.H_pose)
 
-    def newest_nis(self, cov_clones: Array) -> Array:
+    def newest_nis(self, root: Array) -> Array:
         """Return the NIS (F,) of the newest sightings, each given the window and the others of its track.
 
-        The others put the landmark at ``V (b + B x)``, V being ``N^-1``, of which the newest sees ``H V (b + B x)``.
+        ``root`` (6 W, 6 W) is that of the covariance of the poses. The others put the landmark at ``V (b + B x)``, V
+        being ``N^-1``, of which the newest sees ``H V (b + B x)``.
         """
         rows, (tracks, window) = self.rows, self.b.shape[:2]
         toward = -rows.H_point[:, -1] @ np.linalg.inv(self.N[:, :-1].sum(axis=1))
@@ -223,9 +269,9 @@ class _Normals(NamedTuple):
         H = toward @ _to_all_poses(others)
         H[..., -rows.H_pose.shape[3] :] += rows.H_pose[:, -1]
         innovations = rows.residuals[:, -1] + (toward @ self.b[:, :-1].sum(axis=1)[..., None])[..., 0]
-        carried = (H.reshape(3 * tracks, 6 * window) @ cov_clones).reshape(H.shape)
+        by_root = times_root(H.reshape(3 * tracks, 6 * window), root).reshape(H.shape)
         noise = np.eye(3) - toward @ np.swapaxes(rows.H_point[:, -1], 1, 2)
-        return mahalanobis_squared(innovations, carried @ np.swapaxes(H, 1, 2) + noise)
+        return mahalanobis_squared(innovations, by_root @ np.swapaxes(by_root, 1, 2) + noise)
 
     def newest_weighed(self, weights: Array) -> "_Normals":
         """Return these with each track's newest sighting weighed (F,)."""
@@ -272,19 +318,19 @@ def _of_poses(rows: _Rows) -> tuple[Array, Array]:
     return matrix.reshape(6 * window, 6 * window), vector.reshape(6 * window)
 
 
-def _informed(joint: JointBelief, matrix: Array, vector: Array) -> Belief:
-    """Return the state now given information (6 W, 6 W), (6 W,) on the clones."""
-    core, clones = joint.core, joint.clone_columns
-    cov, cross = joint.cov[clones, clones].copy(), joint.cov[clones, : core.layout.size].copy()
-    cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
-    root = cholesky_root(cov)
-    to_core = divided_by_root(root, cross)
-    spread = root.T @ matrix @ root
-    spread.flat[:: len(spread) + 1] += 1.0
-    spread_root = cholesky_root(spread)
-    halves = divided_by_root(spread_root, np.column_stack([to_core, root.T @ vector]))
+def _informed(joint: JointBelief, root: Array, matrix: Array, vector: Array) -> Belief:
+    """Return the state now given information (6 W, 6 W), (6 W,) on what the clones' errors are ``root`` times of.
+
+    The matrix is overwritten.
+    """
+    core = joint.core
+    to_core = divided_by_root(root, joint.cov[joint.clone_columns, : core.layout.size].copy())
+    matrix.flat[:: len(matrix) + 1] += 1.0
+    halves = divided_by_root(cholesky_root(matrix), np.column_stack([to_core, vector]))
     half = halves[:, :-1]
-    return core.moved(half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half)
+    delta, cov = half.T @ halves[:, -1], core.cov - to_core.T @ to_core + half.T @ half
+    moved = core.displaced(delta, joint.exponentials(delta[None, POSE])[0])
+    return replace(moved, cov=0.5 * (cov + cov.T))
 
 
 def _no_longer_than(most_m: Array, steps: Array) -> Array:

@@ -122,6 +122,17 @@ def test_an_update_by_tracks_is_one_gauss_newton_step(scenario, kept, oracle):
     oracle.assert_covariances_agree(joint.cov[6:, 6:], cov, 1e-6)
 
 
+def test_what_many_rows_are_compressed_to_tells_the_same_in_products_from_either_side():
+    rng = np.random.default_rng(4)
+    rows, residuals, P = rng.normal(size=(50, 12)), rng.normal(size=50), rng.normal(size=(30, 30))
+    triangle, compressed = multiview.compressed(rows, residuals)
+    H = triangle @ np.eye(12)
+    np.testing.assert_allclose(H.T @ H, rows.T @ rows, atol=1e-12 * 50)
+    np.testing.assert_allclose(H.T @ compressed, rows.T @ residuals, atol=1e-12 * 50)
+    np.testing.assert_allclose(triangle @ P[3:15], H @ P[3:15], atol=1e-12)
+    np.testing.assert_allclose(triangle @ P[:, 3:15].T, H @ P[:, 3:15].T, atol=1e-12)
+
+
 def scenario_of(scenario, frames):
     """Return a scenario of so many frames; exact IMU samples integrate to the truth only in the limit of their rate."""
     camera = replace(scenario.camera, max_tracks=30)

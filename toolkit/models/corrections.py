@@ -16,7 +16,7 @@ from toolkit.models.state import Belief
 
 # Directions in which a correction takes away less of the variance than this are told by rounding, and in smoothers by
 # what is linearised anew: of six tests that made a sound IMU doubtful all had their length from shares below 4e-4.
-_LEAST_TAKEN = 1e-3
+LEAST_TAKEN = 1e-3
 
 
 class CorrectionTest(NamedTuple):
@@ -46,7 +46,7 @@ class Correction:
         per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
         shares, axes = np.linalg.eigh(per_sigma[:, None] * self.taken * per_sigma)
         # What is linearised anew may add to a covariance; less taken away than was added elsewhere tells nothing.
-        told = shares > max(_LEAST_TAKEN, -shares[0])
+        told = shares > max(LEAST_TAKEN, -shares[0])
         length = axes[:, told].T @ (per_sigma * self.moved)
         return CorrectionTest(float((length**2 / shares[told]).sum()), int(told.sum()))
 

@@ -1,4 +1,4 @@
-"""The exponential map of SE(3) compiled, its right Jacobian and adjoint: ``toolkit.geometry`` of one twist at a time.
+"""The exponential map of SE(3) compiled, its inverse, right Jacobian and adjoint: ``toolkit.geometry``, one at a time.
 
 Twists are [rotation, translation]. Source: Barfoot, "State Estimation for Robotics" (2017), eqs. 7.33, 7.85-7.86.
 """
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from filters.kalman.kernels.algebra import multiply
+from filters.kalman.kernels.algebra import multiply, solve
 from filters.kalman.kernels.compiling import compiled
 from toolkit.geometry import Array
 
@@ -99,3 +99,47 @@ def adjoint_of_inverse(T: Array, A: Array) -> None:
         A[3 + i, 0] = z * T[0, 1, 3] - y * T[0, 2, 3]
         A[3 + i, 1] = x * T[0, 2, 3] - z * T[0, 0, 3]
         A[3 + i, 2] = y * T[0, 0, 3] - x * T[0, 1, 3]
+
+
+@compiled
+def rotation_vector(T: Array, phi: Array) -> None:
+    """Put the rotation vector of a motion (1, 4, 4), of length at most pi, in the first three elements of phi.
+
+    Goes through the unit quaternion, of which the largest element is taken first (Shepperd 1978).
+    """
+    q, trace, largest = np.empty(4), T[0, 0, 0] + T[0, 1, 1] + T[0, 2, 2], 3
+    for i in range(3):
+        # Of 4 q q^T the diagonal is 1 + 2 T_ii - trace, and 1 + trace.
+        if T[0, i, i] >= (trace if largest == 3 else T[0, largest, largest]):
+            largest = i
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        if largest == 3:
+            q[i] = T[0, k, j] - T[0, j, k]
+        elif largest == i:
+            q[i], q[3] = 1.0 + 2.0 * T[0, i, i] - trace, T[0, k, j] - T[0, j, k]
+        else:
+            q[i] = T[0, i, largest] + T[0, largest, i]
+    if largest == 3:
+        q[3] = 1.0 + trace
+    length, sign = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]), 1.0 if q[3] >= 0.0 else -1.0
+    angle = 2.0 * math.atan2(length, abs(q[3]))
+    for i in range(3):
+        phi[i] = sign * q[i] * (angle / length if length > 1e-9 * abs(q[3]) else 2.0 / abs(q[3]))
+
+
+@compiled
+def logarithm(T: Array, xi: Array) -> None:
+    """Put the twist of a motion (1, 4, 4), of which three rows count, in the first six elements of xi."""
+    X, XX, c, rho = np.empty((3, 3)), np.empty((3, 3)), np.empty(5), np.empty((3, 1))
+    rotation_vector(T, xi)
+    skew(xi, 0, 1.0, X)
+    multiply(X, X, XX)
+    coefficients(xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2], c)
+    for i in range(3):
+        rho[i, 0] = T[0, i, 3]
+        for j in range(3):
+            X[i, j] = (1.0 if i == j else 0.0) + c[1] * X[i, j] + c[2] * XX[i, j]
+    solve(X, rho)
+    for i in range(3):
+        xi[3 + i] = rho[i, 0]

@@ -25,6 +25,27 @@ def sighted(seen: BoolArray, f: int) -> IntArray:
 
 
 @compiled
+def first_guess(uvs_px: Array, seen: BoolArray, f: int, T_world_cam: Array, intrinsics: Array, points: Array) -> float:
+    """Put in ``points[f]`` where the sighting of a track with the largest disparity says it is; return that disparity.
+
+    One of no more than ``points[f, 0]`` px is taken for a pixel in the centre of the image.
+    """
+    least_px, nearest, largest = points[f, 0], seen.shape[1] - 1, -np.inf
+    for j in range(seen.shape[1]):
+        disparity = uvs_px[f, j, 0] - uvs_px[f, j, 1]
+        if seen[f, j] and disparity > largest:
+            nearest, largest = j, disparity
+    fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
+    if largest > least_px:
+        z = fx * baseline_m / largest
+        x, y = (uvs_px[f, nearest, 0] - cx) * z / fx, (uvs_px[f, nearest, 2] - cy) * z / fy
+    else:
+        x, y, z = baseline_m, 0.0, fx * baseline_m
+    points[f, 0], points[f, 1], points[f, 2] = moved(T_world_cam, nearest, x, y, z)
+    return largest
+
+
+@compiled
 def project(intrinsics: Array, x: float, y: float, z: float, J: Array) -> None:
     """Put the Jacobian of (uL, uR, v) to a point in camera coordinates in J (4, 4), the image in its last column.
 
@@ -150,9 +171,9 @@ def add_products(rows: Array, first: int, end: int, N: Array, at: int) -> None:
 
 
 @compiled
-def step(points: Array, f: int, nearest_m: float, N: Array) -> None:
-    """Move a track's point by the solution of the first row of N, no longer than a fifth of the least depth."""
-    x, y, z = solved_3(N, 0, 0.0, 0.0)
+def step(points: Array, f: int, nearest_m: float, N: Array, at: int) -> None:
+    """Move a track's point by the solution of row ``at`` of N, no longer than a fifth of the least depth."""
+    x, y, z = solved_3(N, at, 0.0, 0.0)
     share = min(1.0, 0.2 * nearest_m / max(math.sqrt(x * x + y * y + z * z), 1e-9))
     points[f, 0] += share * x
     points[f, 1] += share * y
@@ -164,4 +185,4 @@ def refine(points: Array, f: int, nearest_m: float, H_point: Array, n: int) -> N
     """Move a track's point by one step of ``multiview.refined``: Gauss-Newton on n independent rows ``[H r]``."""
     N = np.zeros((1, 10))
     add_products(H_point, 0, n, N, 0)
-    step(points, f, nearest_m, N)
+    step(points, f, nearest_m, N, 0)

@@ -39,6 +39,7 @@ from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
     decorrelate_transposed,
+    first_guess,
     linearise,
     noise_roots,
     own_jacobians,
@@ -52,27 +53,6 @@ from toolkit.geometry import Array, BoolArray, IntArray
 # numbered below, and bounds (3 W - 2,) of the NIS by degrees of freedom.
 SIGNATURE = (types.Tuple((STACK, MASK, COUNTS)), WINDOW, CAMERA, ROW, ROW)
 ITERATIONS, FIRST_DAMPING, RELATIVE_DECREASE, ROUNDING, LEAST_DISPARITY, LEAST_DEPTH, REFINEMENTS, MISMATCHED = range(8)
-
-
-@compiled
-def first_guess(uvs_px: Array, seen: BoolArray, f: int, T_world_cam: Array, intrinsics: Array, points: Array) -> float:
-    """Put in ``points[f]`` where the sighting of a track with the largest disparity says it is; return that disparity.
-
-    One of no more than ``points[f, 0]`` px is taken for a pixel in the centre of the image.
-    """
-    least_px, nearest, largest = points[f, 0], seen.shape[1] - 1, -np.inf
-    for j in range(seen.shape[1]):
-        disparity = uvs_px[f, j, 0] - uvs_px[f, j, 1]
-        if seen[f, j] and disparity > largest:
-            nearest, largest = j, disparity
-    fx, fy, cx, cy, baseline_m = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3], intrinsics[4]
-    if largest > least_px:
-        z = fx * baseline_m / largest
-        x, y = (uvs_px[f, nearest, 0] - cx) * z / fx, (uvs_px[f, nearest, 2] - cy) * z / fy
-    else:
-        x, y, z = baseline_m, 0.0, fx * baseline_m
-    points[f, 0], points[f, 1], points[f, 2] = moved(T_world_cam, nearest, x, y, z)
-    return largest
 
 
 @compiled

@@ -4,6 +4,10 @@ A track's rows are ``[H_f r]`` (3 m, 4) and J (3 m, 6 m), to its landmark and to
 newest last. Of them are made ``[H_f r]^T [H_f r]`` and ``B = H_f^T J``, and of these with ``V = (H_f^T H_f)^-1`` what
 is left on the poses, ``J^T J - B^T V B`` and ``J^T r - B^T V H_f^T r`` (Triggs, McLauchlan, Hartley & Fitzgibbon 2000,
 "Bundle adjustment - a modern synthesis", section 6.1).
+
+:func:`follow` finds the landmarks of the frame before. What is told takes two kernels, for between them BLAS takes the
+rows of all tracks at once to errors whose covariance is one: :func:`normals_of_tracks` forms B without the newest
+sightings, :func:`told_by_newest` tests and adds these.
 """
 
 import math
@@ -11,7 +15,7 @@ import math
 import numpy as np
 from numba import types
 
-from filters.kalman.kernels.algebra import clear, inverses, solved_3
+from filters.kalman.kernels.algebra import inverses, products, solved_3
 from filters.kalman.kernels.compiling import (
     CAMERA,
     COUNTS,
@@ -19,7 +23,6 @@ from filters.kalman.kernels.compiling import (
     MATRIX,
     ROW,
     STACK,
-    WINDOW,
     Arrays,
     compiled,
     kept,
@@ -28,6 +31,7 @@ from filters.kalman.kernels.compiling import (
 from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
+    first_guess,
     linearise,
     noise_roots,
     own_jacobians,
@@ -36,66 +40,186 @@ from filters.kalman.kernels.sightings import (
 )
 from toolkit.geometry import Array, IntArray
 
-# Tracks: (uL, uR, v) (F, W, 3) px, which count (F, W), their ages (F, W), what for (F, W), points (F, 3). Then window
-# and camera, and rules as numbered below.
-SIGNATURE = (types.Tuple((STACK, MASK, COUNTS, MATRIX, MATRIX)), WINDOW, CAMERA, ROW)
+# Tracks: (uL, uR, v) (F, W, 3) px, which count (F, W), their ages (F, W), what for (F, W), points (F, 3). Then poses
+# (W, 4, 4), poses to linearise at (W, 4, 4), camera, and rules as numbered below.
+SIGNATURE = (types.Tuple((STACK, MASK, COUNTS, MATRIX, MATRIX)), types.Tuple((STACK, STACK)), CAMERA, ROW)
+# What :func:`normals_of_tracks` returns; R (6 W, 6 W), J R of the newest sightings and B R (3 F, 6 W); rules.
+NEWEST_SIGNATURE = (
+    types.Tuple((MATRIX, ROW, MATRIX, MATRIX, MATRIX, MATRIX, STACK, ROW)),
+    types.Tuple((MATRIX, MATRIX, MATRIX)),
+    ROW,
+)
 LEAST_DEPTH, BOUND, HUBER_THRESHOLD = range(3)
+# Of tracks known before: ids (K,), frames of the poses (V,), points (K, 3), what sightings count for (K, V). Of those
+# now: ids (A,), frames (W,), (uL, uR, v) (A, W, 3) px and which were seen (A, W). Poses (W, 4, 4), camera; how many
+# sightings a track needs, and what disparity px.
+_IDS = types.int64[::1]
+FOLLOWING = (
+    types.Tuple((_IDS, _IDS, MATRIX, MATRIX)),
+    types.Tuple((_IDS, _IDS, STACK, MASK)),
+    STACK,
+    CAMERA,
+    types.int64,
+    types.float64,
+)
 
 
 @compiled
-def add_normals(rows: Arrays, first: int, end: int, N: Array, B: Array) -> None:
-    """Add some rows of a track to ``[H_f r]^T [H_f r]`` in the first row of N, and to B (3, 6 m)."""
-    A, J, dense = rows
-    add_products(A, first, end, N, 0)
-    for i in range(first, end):
-        for a in range(3):
-            for c in range(0 if dense else 6 * (i // 3), 6 * (i // 3) + 6):
-                B[a, c] += A[i, a] * J[i, c]
+def place_of(wanted: int, ids: IntArray, first: int) -> int:
+    """Return where an id stands among ids, looked for from some place on and then before it; -1 where it does not."""
+    for k in range(ids.size):
+        at = first + k if first + k < ids.size else first + k - ids.size
+        if ids[at] == wanted:
+            return at
+    return -1
 
 
 @compiled
-def given_others(rows: Arrays, n: int, N: Array, B: Array, H: Array, S: Array) -> None:
-    """Put the newest sighting's Jacobian to the poses, given the others, in H (3, 6 m); its noise and innovation in S.
+def places_of(frames: IntArray, known: IntArray) -> IntArray:
+    """Return where frames (W,) stand among known ones, -1 where they do not."""
+    places = np.empty(frames.size, dtype=np.int64)
+    for j in range(frames.size):
+        places[j] = place_of(frames[j], known, j if j < known.size else 0)
+    return places
 
-    N and B are of the others, which put the landmark at ``V (b + B x)``; of it the newest sees ``H_f V (b + B x)``.
-    S has ``[covariance, innovation]`` in its first row as ``solved_3`` takes them.
+
+@kept(FOLLOWING)
+def follow(known: Arrays, now: Arrays, poses: Array, camera: Arrays, fewest: int, least_px: float) -> Arrays:
+    """Return which of A tracks have a landmark (A,), the points (A, 3), and what sightings count for (A, W).
+
+    They are those known before, and of new tracks where the sighting with the largest disparity puts them.
     """
-    A, J, _ = rows
-    T, at = np.empty((3, 3)), 0
+    known_ids, known_frames, known_points, known_weights = known
+    ids, frames, uvs_px, seen = now
+    (count, window), at, places = seen.shape, 0, places_of(frames, known_frames)
+    T_world_cam = products(poses, camera[1])
+    found, points, weights = np.empty(count, dtype=np.bool_), np.zeros((count, 3)), np.ones((count, window))
+    for f in range(count):
+        found[f] = sighted(seen, f).size >= fewest
+        if found[f]:
+            row = place_of(ids[f], known_ids, at)
+            if row >= 0:
+                at = row + 1
+                for i in range(3):
+                    points[f, i] = known_points[row, i]
+                for j in range(window):
+                    if places[j] >= 0:
+                        weights[f, j] = known_weights[row, places[j]]
+            else:
+                points[f, 0] = least_px
+                found[f] = first_guess(uvs_px, seen, f, T_world_cam, camera[0], points) > least_px
+    return found, points, weights
+
+
+@compiled
+def scale(rows: Arrays, first: int, end: int, columns: int, factor: float) -> None:
+    """Multiply some rows of a track, the first columns of J."""
+    A, J = rows
+    for i in range(first, end):
+        for c in range(4):
+            A[i, c] *= factor
+        for c in range(columns):
+            J[i, c] *= factor
+
+
+@compiled
+def add_normals(f: int, where: IntArray, rows: Arrays, n: int, dense: bool, sums: Arrays) -> None:
+    """Add n rows of track f to ``[H_f r]^T [H_f r]``, to B, and to ``J^T J`` and ``J^T r`` of all tracks.
+
+    Of J a row has the Jacobian to the pose of its sighting alone (3 m, 6) or, if dense, to all (3 m, 6 m). ``J^T J``
+    is (W, 6, 6) or (1, 6 W, 6 W).
+    """
+    A, J = rows
+    N, B, D, d = sums
+    add_products(A, 0, n, N, f)
+    for i in range(n):
+        begin = 0 if dense else i // 3
+        for k in range(begin, where.size if dense else begin + 1):
+            block, shift = (0, 6 * where[k]) if dense else (where[k], 0)
+            for a in range(6):
+                value, column = J[i, 6 * (k - begin) + a], 6 * where[k] + a
+                d[column] += value * A[i, 3]
+                for b in range(3):
+                    B[3 * f + b, column] += A[i, b] * value
+                for j in range(begin, k + 1):
+                    for c in range(6):
+                        at = 6 * where[j] + c if dense else c
+                        D[block, shift + a, at] += value * J[i, 6 * (j - begin) + c]
+
+
+@compiled
+def put_newest(f: int, where: IntArray, rows: Arrays, dense: bool, A_newest: Array, J_newest: Array) -> None:
+    """Put the last three rows of a track with those of the newest sightings: J (3 F, 6), or (3 F, 6 W) if dense."""
+    A, J = rows
+    for a in range(3):
+        i = 3 * where.size - 3 + a
+        for c in range(4):
+            A_newest[3 * f + a, c] = A[i, c]
+        for c in range(6 * where.size if dense else 6):
+            J_newest[3 * f + a, 6 * where[c // 6] + c % 6 if dense else c] = J[i, c]
+
+
+@kept(SIGNATURE)
+def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array) -> Arrays:
+    """Return the normal equations of F tracks without their newest sightings, and the rows of these.
+
+    These are, for :func:`told_by_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]`` (F + 1,
+    10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the newest pose
+    or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, a block (W, 6, 6) a pose or
+    the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that a camera has behind it adds nothing.
+    """
+    uvs_px, counted, ages, weights, points = tracks
+    poses, poses_at = window
+    intrinsics, T_imu_cam, whitener, variances, channels = camera
+    (count, longest), dense = counted.shape, variances.shape[0] > 0
+    inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
+    views, eye = (inverses_now, poses_at, inverses_at), (intrinsics, T_cam_imu, channels if dense else whitener)
+    most, k = 3 * longest, 6 * longest if dense else 6
+    depths, N, B = np.empty(count), np.zeros((count + 1, 10)), np.zeros((3 * count, 6 * longest))
+    A_newest, J_newest = np.empty((3 * count, 4)), np.zeros((3 * count, k))
+    D, d = np.zeros((1 if dense else longest, k, k)), np.zeros(6 * longest)
+    H_pose, A, roots, J = np.empty((most, 6)), np.empty((most, 4)), np.empty((most, longest)), np.empty((most, k))
+    for f in range(count):
+        where = sighted(counted, f)
+        m, rows = where.size, (A, J if dense else H_pose)
+        depths[f] = linearise(points, f, uvs_px, where, views, eye, (H_pose, A))
+        if depths[f] > rules[LEAST_DEPTH]:
+            if dense:
+                noise_roots(ages, f, where, variances, roots)
+                decorrelate(roots, m, A, A.shape[1])
+                own_jacobians(H_pose, m, roots, dense, J)
+            for i in range(m - 1):
+                if weights[f, where[i]] < 1.0:
+                    scale(rows, 3 * i, 3 * i + 3, 6 * m if dense else 6, math.sqrt(weights[f, where[i]]))
+            put_newest(f, where, rows, dense, A_newest, J_newest)
+            add_normals(f, where, rows, 3 * m - 3, dense, (N, B, D, d))
+    return points, depths, N, B, A_newest, J_newest, D, d
+
+
+@compiled
+def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array, S: Array) -> None:
+    """Put the innovation of a track's newest sighting, given the others, and its covariance in the first row of S.
+
+    The others put the landmark at ``V (b + B x)``, of which the newest sees ``H_f V (b + B x)``. H (3, 6 W) gets its
+    Jacobian to errors of unit covariance; S has ``[covariance, innovation]`` as ``solved_3`` takes them.
+    """
+    T, at, last = np.empty((3, 3)), 0, N.shape[0] - 1
     for a in range(3):
         for c in range(6):
-            N[1, c] = N[0, c]
+            N[last, c] = N[f, c]
         for d in range(3):
-            N[1, 6 + d] = A[n - 3 + a, d]
-        x, y, z = solved_3(N, 1, 0.0, 0.0)
+            N[last, 6 + d] = A[3 * f + a, d]
+        x, y, z = solved_3(N, last, 0.0, 0.0)
         T[a, 0], T[a, 1], T[a, 2] = x, y, z
-        for c in range(2 * n):
-            H[a, c] = J[n - 3 + a, c] - x * B[0, c] - y * B[1, c] - z * B[2, c]
-        S[0, 6 + a] = A[n - 3 + a, 3] - x * N[0, 6] - y * N[0, 7] - z * N[0, 8]
+        for c in range(JR.shape[1]):
+            H[a, c] = JR[3 * f + a, c] - x * BR[3 * f, c] - y * BR[3 * f + 1, c] - z * BR[3 * f + 2, c]
+        S[0, 6 + a] = A[3 * f + a, 3] - x * N[f, 6] - y * N[f, 7] - z * N[f, 8]
         for b in range(a + 1):
             S[0, at] = 1.0 if a == b else 0.0
             for d in range(3):
-                S[0, at] += T[a, d] * A[n - 3 + b, d]
-            at += 1
-
-
-@compiled
-def add_carried(where: IntArray, H: Array, P: Array, T: Array, S: Array) -> None:
-    """Add ``T H^T``, with ``T = H P`` (3, 6 W) and H (3, 6 m) to the poses ``where`` (m,), to what S has of it.
-
-    Rows of P are added up, which a processor does four numbers at a time.
-    """
-    at = 0
-    for a in range(3):
-        for c in range(P.shape[1]):
-            T[a, c] = 0.0
-        for k in range(6 * where.size):
-            row, factor = 6 * where[k // 6] + k % 6, H[a, k]
-            for c in range(P.shape[1]):
-                T[a, c] += factor * P[row, c]
-        for b in range(a + 1):
-            for k in range(6 * where.size):
-                S[0, at] += T[a, 6 * where[k // 6] + k % 6] * H[b, k]
+                S[0, at] += T[a, d] * A[3 * f + b, d]
+            for c in range(JR.shape[1]):
+                S[0, at] += H[a, c] * H[b, c]
             at += 1
 
 
@@ -108,107 +232,88 @@ def weight_of(S: Array, bound: float, huber_threshold: float) -> float:
 
 
 @compiled
-def scale(rows: Arrays, first: int, end: int, factor: float) -> None:
-    """Multiply some rows of a track."""
-    A, J, dense = rows
-    for i in range(first, end):
-        for c in range(4):
-            A[i, c] *= factor
-        for c in range(0 if dense else 6 * (i // 3), 6 * (i // 3) + 6):
-            J[i, c] *= factor
+def add_newest(f: int, weight: float, rows: Arrays, JR: Array, BR: Array, sums: Arrays) -> None:
+    """Add a track's newest sighting, weighed, to ``[H_f r]^T [H_f r]``, to B R, and to ``J^T J`` and ``J^T r``."""
+    A, J = rows
+    N, D, d = sums
+    scale(rows, 3 * f, 3 * f + 3, J.shape[1], math.sqrt(weight))
+    add_products(A, 3 * f, 3 * f + 3, N, f)
+    shift, last = d.size - J.shape[1], D.shape[0] - 1
+    for i in range(3 * f, 3 * f + 3):
+        for b in range(3):
+            factor = math.sqrt(weight) * A[i, b]
+            for c in range(BR.shape[1]):
+                BR[3 * f + b, c] += factor * JR[i, c]
+        for a in range(J.shape[1]):
+            d[shift + a] += J[i, a] * A[i, 3]
+            for c in range(a + 1):
+                D[last, a, c] += J[i, a] * J[i, c]
 
 
 @compiled
-def add_products_of_poses(where: IntArray, rows: Arrays, n: int, told: Arrays) -> None:
-    """Add ``J^T J`` and ``J^T r`` of n rows to the lower half of what is told of all poses.
-
-    r is the last column of A; unless dense, a row depends on its own pose alone.
-    """
-    A, J, dense = rows
-    matrix, vector = told
-    for i in range(n):
-        for k in range(0 if dense else i // 3, where.size if dense else i // 3 + 1):
-            for a in range(6 * k, 6 * k + 6):
-                row, value = 6 * where[k] + a - 6 * k, J[i, a]
-                vector[row] += value * A[i, 3]
-                for j in range(0 if dense else k, k + 1):
-                    for c in range(6 * j, 6 * j + 6):
-                        matrix[row, 6 * where[j] + c - 6 * j] += value * J[i, c]
-
-
-@compiled
-def eliminated_rows(N: Array, B: Array, where: IntArray, E: Array, first: int) -> None:
-    """Put ``C^-1 [B, H_f^T r]``, C being the root of ``H_f^T H_f``, in three rows of E (., 6 W + 1) from ``first`` on.
-
-    N has ``[H_f r]^T [H_f r]`` in its first row; B (3, 6 m) is to the poses ``where`` (m,).
-    """
-    l00 = math.sqrt(N[0, 0])
-    l10, l20 = N[0, 1] / l00, N[0, 3] / l00
-    l11 = math.sqrt(N[0, 2] - l10 * l10)
-    l21 = (N[0, 4] - l20 * l10) / l11
-    l22 = math.sqrt(N[0, 5] - l20 * l20 - l21 * l21)
-    for k in range(6 * where.size + 1):
-        own = k < 6 * where.size
-        column = 6 * where[k // 6] + k % 6 if own else E.shape[1] - 1
-        x = (B[0, k] if own else N[0, 6]) / l00
-        y = ((B[1, k] if own else N[0, 7]) - l10 * x) / l11
-        z = ((B[2, k] if own else N[0, 8]) - l20 * x - l21 * y) / l22
-        E[first, column], E[first + 1, column], E[first + 2, column] = x, y, z
+def eliminate(f: int, N: Array, E: Array, e: Array) -> None:
+    """Put ``C^-1 B R``, C being the root of a track's ``H_f^T H_f``, in the place of B R, and ``C^-1 H_f^T r`` in e."""
+    l00 = math.sqrt(N[f, 0])
+    l10, l20 = N[f, 1] / l00, N[f, 3] / l00
+    l11 = math.sqrt(N[f, 2] - l10 * l10)
+    l21 = (N[f, 4] - l20 * l10) / l11
+    l22 = math.sqrt(N[f, 5] - l20 * l20 - l21 * l21)
+    for c in range(E.shape[1]):
+        x = E[3 * f, c] / l00
+        y = (E[3 * f + 1, c] - l10 * x) / l11
+        E[3 * f, c], E[3 * f + 1, c] = x, y
+        E[3 * f + 2, c] = (E[3 * f + 2, c] - l20 * x - l21 * y) / l22
+    e[3 * f] = N[f, 6] / l00
+    e[3 * f + 1] = (N[f, 7] - l10 * e[3 * f]) / l11
+    e[3 * f + 2] = (N[f, 8] - l20 * e[3 * f] - l21 * e[3 * f + 1]) / l22
 
 
 @compiled
 def mirror(A: Array) -> None:
-    """Put the lower half of a symmetric matrix (n, n) in its upper half."""
-    for i in range(A.shape[0]):
-        for j in range(i):
-            A[j, i] = A[i, j]
+    """Put the lower halves of symmetric matrices (., n, n) in their upper halves."""
+    for k in range(A.shape[0]):
+        for i in range(A.shape[1]):
+            for j in range(i):
+                A[k, j, i] = A[k, i, j]
 
 
-@kept(SIGNATURE)
-def told_by_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array) -> Arrays:
-    """Gate the newest sightings of F tracks and return what the tracks tell of the W poses; see :data:`SIGNATURE`.
+@compiled
+def blocks_times_root(D: Array, R: Array) -> Array:
+    """Return the product of what has blocks D (., k, k) along its diagonal with a lower triangular R (n, n)."""
+    result = np.zeros(R.shape)
+    for block in range(D.shape[0]):
+        first = block * D.shape[1]
+        for a in range(D.shape[1]):
+            for b in range(D.shape[1]):
+                for c in range(first + b + 1):
+                    result[first + a, c] += D[block, a, b] * R[first + b, c]
+    return result
+
+
+@kept(NEWEST_SIGNATURE)
+def told_by_newest(normals: Arrays, by_root: Arrays, rules: Array) -> Arrays:
+    """Gate the newest sightings of F tracks and finish what the tracks tell; see :data:`NEWEST_SIGNATURE`.
 
     Returns points (F, 3) after a step, what the newest sightings count for (F,), which tracks all their cameras have
-    in front (F,): of others nothing is told; ``J^T J`` (6 W, 6 W) and ``J^T r`` (6 W,) of all tracks, and what the
-    landmarks take of both, ``E^T E``, as the rows E (3 F, 6 W + 1): a product of whole matrices is left to BLAS.
+    in front (F,), what the landmarks take of the vector, e (3 F,), and ``J^T J R`` (6 W, 6 W) of all sightings, whose
+    ``J^T r`` takes the place of that of the others, and E (3 F, 6 W) that of ``B R``: what is told is ``R^T J^T J R -
+    E^T E`` and ``R^T J^T r - E^T e``.
     """
-    uvs_px, counted, ages, weights, points = tracks
-    poses, poses_at, P = window
-    intrinsics, T_imu_cam, whitener, variances, channels = camera
-    (count, longest), correlated = counted.shape, variances.shape[0] > 0
-    inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
-    views, eye = (inverses_now, poses_at, inverses_at), (intrinsics, T_cam_imu, channels if correlated else whitener)
-    newest, in_front, stepped = np.zeros(count), np.empty(count, dtype=np.bool_), points.copy()
-    told, most = (np.zeros((6 * longest, 6 * longest)), np.zeros(6 * longest)), 3 * longest
-    H_pose, A, J = np.empty((most, 6)), np.empty((most, 4)), np.empty((most, 2 * most))
-    roots, H, B = np.empty((most, longest)), np.empty((3, 2 * most)), np.empty((3, 2 * most))
-    N, S, T, E = np.empty((2, 10)), np.empty((1, 10)), np.empty((3, 2 * most)), np.zeros((3 * count, 2 * most + 1))
+    points, depths, N, _, A, J, D, d = normals
+    R, JR, BR = by_root
+    count = depths.size
+    newest, in_front, stepped, e = np.zeros(count), np.empty(count, dtype=np.bool_), points.copy(), np.zeros(3 * count)
+    H, S = np.empty((3, JR.shape[1])), np.empty((1, 10))
     for f in range(count):
-        where = sighted(counted, f)
-        m, n, rows = where.size, 3 * where.size, (A, J, correlated)
-        nearest_m = linearise(points, f, uvs_px, where, views, eye, (H_pose, A))
-        in_front[f] = nearest_m > rules[LEAST_DEPTH]
+        in_front[f] = depths[f] > rules[LEAST_DEPTH]
         if in_front[f]:
-            if correlated:
-                noise_roots(ages, f, where, variances, roots)
-                decorrelate(roots, m, A, A.shape[1])
-            own_jacobians(H_pose, m, roots, correlated, J)
-            for k in range(m - 1):
-                if weights[f, where[k]] < 1.0:
-                    scale(rows, 3 * k, 3 * k + 3, math.sqrt(weights[f, where[k]]))
-            clear(N, 1)
-            clear(B, 3)
-            add_normals(rows, 0, n - 3, N, B)
-            given_others(rows, n, N, B, H, S)
-            add_carried(where, H, P, T, S)
+            newest_innovation(f, N, A, JR, BR, H, S)
             newest[f] = weight_of(S, rules[BOUND], rules[HUBER_THRESHOLD])
-            scale(rows, n - 3, n, math.sqrt(newest[f]))
-            add_normals(rows, n - 3, n, N, B)
-            step(stepped, f, nearest_m, N)
-            add_products_of_poses(where, rows, n, told)
-            eliminated_rows(N, B, where, E, 3 * f)
-    mirror(told[0])
-    return stepped, newest, in_front, told[0], told[1], E
+            add_newest(f, newest[f], (A, J), JR, BR, (N, D, d))
+            step(stepped, f, depths[f], N, f)
+            eliminate(f, N, BR, e)
+    mirror(D)
+    return stepped, newest, in_front, e, blocks_times_root(D, R)
 
 
-COMPILED = what_was_compiled(told_by_tracks, "what tracks in view tell was")
+COMPILED = what_was_compiled(follow, "what tracks in view tell was")

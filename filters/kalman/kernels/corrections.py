@@ -1,0 +1,122 @@
+"""The test of a correction compiled: ``toolkit.models.corrections`` of two beliefs of the same layout.
+
+Source of the eigenvalues: Golub & Van Loan, "Matrix Computations" (4th ed.), 8.3 (tridiagonal QR).
+"""
+
+import math
+
+import numpy as np
+from numba import types
+
+from filters.kalman.kernels.algebra import inverses, products, reflect_both_sides
+from filters.kalman.kernels.compiling import MATRIX, ROW, STACK, Arrays, compiled, kept, what_was_compiled
+from filters.kalman.kernels.rigid_motions import logarithm
+from toolkit.geometry import Array, IntArray
+
+# Pose (1, 4, 4), velocity m/s and bias (9,), and covariance (d, d), before and after; where velocity, accel bias and
+# gyro bias stand in the error (3,), -1 what it has not; the least share that is told.
+_STATE = types.Tuple((STACK, ROW, MATRIX))
+SIGNATURE = (_STATE, _STATE, types.int64[::1], types.float64)
+# Two or three are what an eigenvalue takes.
+_MOST_STEPS = 30
+
+
+@compiled
+def error_between(before: Arrays, after: Arrays, places: IntArray, error: Array) -> None:
+    """Put the error (d,) that moves one state to the other in ``error``."""
+    pose, vector, _ = before
+    logarithm(products(inverses(pose), after[0]), error)
+    for block in range(3):
+        for i in range(3):
+            if places[block] >= 0:
+                moved = 0.0
+                for k in range(3):
+                    turn = pose[0, k, i] if block == 0 else 1.0 if k == i else 0.0
+                    moved += turn * (after[1][3 * block + k] - vector[3 * block + k])
+                error[places[block] + i] = moved
+
+
+@compiled
+def tridiagonalise(A: Array, y: Array, diagonal: Array, beside: Array) -> None:
+    """Put the elements (n,) of ``Q A Q^T`` on and beside its diagonal in two vectors, and Q y in the place of y (n,).
+
+    Q is a product of reflections, each of which leaves one element of a column below the diagonal.
+    """
+    n, V = A.shape[0], np.empty((1, A.shape[0]))
+    for k in range(n - 2):
+        below, alpha, dot = 0.0, A[k + 1, k], 0.0
+        for i in range(k + 2, n):
+            below += A[i, k] * A[i, k]
+        if below > 0.0:
+            beta = -math.copysign(math.sqrt(alpha * alpha + below), alpha)
+            tau = (beta - alpha) / beta
+            for i in range(n):
+                V[0, i] = 0.0 if i <= k else 1.0 if i == k + 1 else A[i, k] / (alpha - beta)
+                dot += V[0, i] * y[i]
+            reflect_both_sides(A, V, 0, tau, n)
+            for i in range(n):
+                y[i] -= tau * dot * V[0, i]
+    for i in range(n):
+        diagonal[i], beside[i] = A[i, i], A[i + 1, i] if i < n - 1 else 0.0
+
+
+@compiled
+def chase(diagonal: Array, beside: Array, y: Array, first: int, last: int) -> None:
+    """Take one implicit QL step, shifted as Wilkinson did, on what stands from ``first`` to ``last``; turn y too."""
+    g = (diagonal[first + 1] - diagonal[first]) / (2.0 * beside[first])
+    g = diagonal[last] - diagonal[first] + beside[first] / (g + math.copysign(math.sqrt(g * g + 1.0), g))
+    s, c, shift = 1.0, 1.0, 0.0
+    for i in range(last - 1, first - 1, -1):
+        f, b = s * beside[i], c * beside[i]
+        r = math.sqrt(f * f + g * g)
+        s, c = (f / r, g / r) if r > 0.0 else (0.0, 1.0)
+        beside[i + 1] = r
+        g = diagonal[i + 1] - shift
+        r = (diagonal[i] - g) * s + 2.0 * c * b
+        shift = s * r
+        diagonal[i + 1] = g + shift
+        g = c * r - b
+        y[i], y[i + 1] = c * y[i] - s * y[i + 1], s * y[i] + c * y[i + 1]
+    diagonal[first] -= shift
+    beside[first], beside[last] = g, 0.0
+
+
+@compiled
+def diagonalise(A: Array, y: Array, eigenvalues: Array) -> None:
+    """Put the eigenvalues (n,) of a symmetric A (n, n), which is lost, in place, and y (n,) in the axes of each."""
+    n, beside = A.shape[0], np.empty(A.shape[0])
+    tridiagonalise(A, y, eigenvalues, beside)
+    for first in range(n):
+        for _ in range(_MOST_STEPS):
+            last = first
+            while last < n - 1 and abs(beside[last]) > 1e-16 * (abs(eigenvalues[last]) + abs(eigenvalues[last + 1])):
+                last += 1
+            if last > first:
+                chase(eigenvalues, beside, y, first, last)
+
+
+@kept(SIGNATURE)
+def test_correction(before: Arrays, after: Arrays, places: IntArray, least: float) -> Arrays:
+    """Return squared length and degrees of freedom of a correction; see :data:`SIGNATURE`.
+
+    The covariance taken away, its entries in units of the sigmas before, becomes diagonal, and the error is turned with
+    its axes.
+    """
+    P, Q, d = before[2], after[2], before[2].shape[0]
+    error, taken, shares = np.empty(d), np.empty((d, d)), np.empty(d)
+    error_between(before, after, places, error)
+    for i in range(d):
+        error[i] = error[i] / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
+        for j in range(d):
+            known = P[i, i] > 0.0 and P[j, j] > 0.0
+            taken[i, j] = (P[i, j] - Q[i, j]) / math.sqrt(P[i, i] * P[j, j]) if known else 0.0
+    diagonalise(taken, error, shares)
+    nis, dof = 0.0, 0
+    for i in range(d):
+        if shares[i] > max(least, -shares.min()):
+            nis += error[i] * error[i] / shares[i]
+            dof += 1
+    return nis, dof
+
+
+COMPILED = what_was_compiled(test_correction, "the test of corrections was")
