@@ -52,7 +52,7 @@ for rung in rungs:
 # honest estimator it is 1 on average; chance lets the mean over several seeds scatter within a known band.
 
 # %%
-SEEDS, FRAMES = 4, 25
+SEEDS, FRAMES = 3, 20
 # A window of half a second, so that poses leave it within these frames.
 over = compare("flight", "ladder", seeds=SEEDS, max_frames=FRAMES, settings={"window": {"lag_s": 0.5}})
 over.table("ATE none", "NEES rot", "NEES pos", "NEES pose")
