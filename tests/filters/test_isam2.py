@@ -402,8 +402,7 @@ def test_its_final_answer_is_the_optimum_of_the_whole_problem(scenario):
     The solve stops at a relative decrease of 1e-5, of an error that is half of some 10^4 squared sigmas: what a state
     may still move by is a hundredth of a sigma.
     """
-    camera = replace(scenario.camera, max_tracks=40)
-    sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0, camera=camera), 1)
+    sequence = simulate(replace(scenario, duration_s=2.0 if scenario is FLIGHT else 4.0), 1)
     estimator, estimates = isam2_of(sequence), []
     for packet in sequence.packets():
         estimates.append(estimator.step(packet))
