@@ -23,7 +23,6 @@
 import gtsam
 import matplotlib.pyplot as plt
 import numpy as np
-from recordings import real_or
 
 import toolkit
 from toolkit.datasets import load_sequence
@@ -49,18 +48,16 @@ rig, noise, prior = sequence.rig, sequence.noise, sequence.prior
 motion = packets[1].motion
 print(f"{len(packets)} packets; the motion into the second:")
 print(f"  for {motion.dt_s[0]:.2f} s at {motion.v_mps[0].round(2)} m/s, turning at {motion.w_radps[0].round(3)} rad/s")
-print(
-    f"the frame shows {len(packets[1].frame.track_ids)} points; the first at (uL, uR, v) = {packets[1].frame.uvs_px[0]}"
-)
+seen = packets[1].frame
+print(f"the frame shows {len(seen.track_ids)} points; the first at (uL, uR, v) = {seen.uvs_px[0]}")
 
 # %% [markdown]
 # The toolkit estimates once, so that there is something to compare with. No gate and no robust loss
 # (`outliers: none`): the report has neither.
 
 # %%
-oracle = toolkit.compare(
-    sequence, ["dead-reckoning", "mapping", "seed-ekf", "ekf", "batch"], settings={"outliers": {"policy": "none"}}
-)
+names = ["dead-reckoning", "mapping", "seed-ekf", "ekf", "batch"]
+oracle = toolkit.compare(sequence, names, settings={"outliers": {"policy": "none"}})
 
 
 def largest_m(poses: np.ndarray, estimator: str) -> float:
@@ -172,14 +169,8 @@ assert difference_m < 1e-9
 def project(q: np.ndarray) -> np.ndarray:
     """Return (uL, uR, v) (N, 3) px of points (N, 3) in the left camera."""
     x, y, z = q.T
-    return np.stack(
-        [
-            rig.fx_px * x / z + rig.cx_px,
-            rig.fx_px * (x - rig.baseline_m) / z + rig.cx_px,
-            rig.fy_px * y / z + rig.cy_px,
-        ],
-        axis=1,
-    )
+    left, right, row = rig.fx_px * x / z, rig.fx_px * (x - rig.baseline_m) / z, rig.fy_px * y / z
+    return np.stack([left + rig.cx_px, right + rig.cx_px, row + rig.cy_px], axis=1)
 
 
 def triangulate(uvs: np.ndarray) -> np.ndarray:
@@ -321,9 +312,7 @@ def correct_pose(T: np.ndarray, cov: np.ndarray, points: np.ndarray, uvs: np.nda
     return T @ exp_se3(corrected @ vector), corrected
 
 
-def correct_pose_stacked(
-    T: np.ndarray, cov: np.ndarray, points: np.ndarray, uvs: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def by_stacking(T: np.ndarray, cov: np.ndarray, points: np.ndarray, uvs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same as the report writes it: the gain of all measurements at once."""
     seen = [d_pose(point, T) for point in points]
     H, residual = np.concatenate([H for _, H in seen]), (uvs - np.array([expected for expected, _ in seen])).ravel()
@@ -334,7 +323,7 @@ def correct_pose_stacked(
 tracks = [track for track in packets[0].frame.track_ids.tolist() if track in everything]
 rows = np.isin(packets[0].frame.track_ids, tracks)
 given = prior.T_world_imu, prior.cov[:6, :6], np.array([everything[t] for t in tracks]), packets[0].frame.uvs_px[rows]
-(T_small, cov_small), (T_large, cov_large) = correct_pose(*given), correct_pose_stacked(*given)
+(T_small, cov_small), (T_large, cov_large) = correct_pose(*given), by_stacking(*given)
 print(f"{len(tracks)} landmarks: a matrix of 6 x 6 instead of {3 * len(tracks)} x {3 * len(tracks)}")
 assert np.allclose(T_small, T_large, atol=1e-9)
 assert np.allclose(cov_small, cov_large, rtol=1e-6, atol=1e-12)
@@ -404,15 +393,5 @@ print(f"at the end your filter states {1e3 * sigma_m:.1f} mm and is off by {1e3 
 # landmark's uncertainty into the innovation and put up a gate (`ekf`), keep pose and landmarks in one state
 # (`ekf-slam`), and in the end look at all of it again (`batch`).
 #
-# ## On the course's own recording
-#
-# The same on Dataset 03, if you have it. What its data hide is the subject of
-# [notebook 2](02_the_seed_report.ipynb).
-
-# %%
-source = real_or("ucsd/03.npz", instead="drive")
-course = toolkit.compare(source, ["dead-reckoning", "seed-ekf", "ekf"], max_frames=200)
-course.table("reproj held-out")
-
-# %% [markdown]
-# Next: [your own estimator](04_your_own_estimator.ipynb), from these pieces.
+# The same filters on the course's own recording, and what its data hide, are the subject of
+# [notebook 2](02_the_seed_report.ipynb). Next: [your own estimator](04_your_own_estimator.ipynb), from these pieces.

@@ -10,10 +10,3 @@ def real(name: str) -> Path | None:
     """Return a real recording below the folder VISLAM_DATA (from the repository: ../shared/data), or None."""
     path = (PROJECT / os.environ.get("VISLAM_DATA", "../shared/data") / name).resolve()
     return path if path.exists() else None
-
-
-def real_or(name: str, instead: str) -> str:
-    """Return a real recording as a source of the toolkit, or what runs instead of it, and say which."""
-    path = real(name)
-    print(f"{name}: the real recording" if path else f"{name} is not here: the built-in {instead} runs instead")
-    return str(path) if path else instead

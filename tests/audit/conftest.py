@@ -14,14 +14,15 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
-# Most faults show in half of it.
-DURATION_S, HALF_S = 30.0, 15.0
+# Most faults show in a hundred and fifty frames.
+LENGTH_S = {"drive": 15.0, "drive-imu": 15.0, "flight": 7.5}
 
 
 @cache
-def clean(scenario: str = "drive", seed: int = 0, duration_s: float = DURATION_S) -> Sequence:
+def clean(scenario: str = "drive", seed: int = 0, duration_s: float | None = None) -> Sequence:
     """Return a simulated recording."""
-    return simulate(replace(SCENARIOS[scenario], duration_s=duration_s), seed)
+    length_s = LENGTH_S[scenario] if duration_s is None else duration_s
+    return simulate(replace(SCENARIOS[scenario], duration_s=length_s), seed)
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,10 @@ def time_order(sequence: Sequence) -> Plant:
 
 
 def time_gap(sequence: Sequence) -> Plant:
-    """Leave a hole of two seconds in the motion samples, ten seconds after the start."""
+    """Leave a hole of two seconds in the motion samples, a third of the way after the start."""
     t_s = (sequence.motion.t_ns - sequence.frames_t_ns[0]) / NS_PER_S
-    return Plant("time-gap", with_samples(sequence, (t_s <= 10.0) | (t_s >= 12.0)), 1)
+    begins_s = sequence.duration_s / 3.0
+    return Plant("time-gap", with_samples(sequence, (t_s <= begins_s) | (t_s >= begins_s + 2.0)), 1)
 
 
 def outside_motion(sequence: Sequence) -> Plant:
@@ -116,11 +118,11 @@ def stale_frames(sequence: Sequence) -> Plant:
 
 
 def returning_tracks(sequence: Sequence) -> Plant:
-    """Hide the tracks seen in frames 30 to 33 from frames 31 and 32."""
+    """Hide the tracks seen in frames 30 to 33 from frame 31, and every other one of them from frame 32 as well."""
     o = sequence.observations
     present = [set(o.track_id[o.frame == k].tolist()) for k in (30, 31, 32, 33)]
     hidden = np.array(sorted(set.intersection(*present)))
-    rows = ~(np.isin(o.track_id, hidden) & np.isin(o.frame, (31, 32)))
+    rows = ~(np.isin(o.track_id, hidden) & (o.frame == 31) | np.isin(o.track_id, hidden[::2]) & (o.frame == 32))
     return Plant("returning-tracks", with_observations(sequence, rows), hidden.size)
 
 
@@ -184,12 +186,12 @@ def plant(request: pytest.FixtureRequest) -> Plant:
     """Return each fault planted in each kind of recording that can have it."""
     scenario, fault = request.param
     # A lag of the twists shows only where there are turns enough.
-    return PLANTS[fault](clean(scenario, duration_s=DURATION_S if fault == "twist-lag" else HALF_S))
+    return PLANTS[fault](clean(scenario, duration_s=30.0 if fault == "twist-lag" else None))
 
 
 @pytest.fixture
 def clean_recording() -> Callable[..., Sequence]:
-    """Return the maker of clean recordings: scenario, seed."""
+    """Return the maker of clean recordings: scenario, seed, length."""
     return clean
 
 

@@ -17,7 +17,7 @@ from toolkit.sequence import Sequence, check_runnable
 def test_a_clean_recording_raises_no_finding_and_is_left_as_it_is(
     clean_recording: Callable[..., Sequence], scenario: str, seed: int
 ) -> None:
-    sequence = clean_recording(scenario, seed)
+    sequence = clean_recording(scenario, seed, 30.0)
     outcome = audit(sequence)
     assert outcome.findings == ()
     assert outcome.sequence is sequence

@@ -28,7 +28,8 @@ def test_they_are_counted_and_left_as_they_are(third: Sequence) -> None:
 def test_what_is_a_fault_is_found_beside_them(
     clean_recording: Callable[..., Sequence], planted: Callable[[str, Sequence], Sequence], fault: str
 ) -> None:
-    found = audit(faults.missing_right(planted(fault, clean_recording()), 0.2, 0)).findings
+    recording = clean_recording("drive", 0, 30.0 if fault == "twist-lag" else None)
+    found = audit(faults.missing_right(planted(fault, recording), 0.2, 0)).findings
     assert [(f.fault, f.repaired) for f in found if f.fault != "left-only"] == [(fault, True)]
 
 

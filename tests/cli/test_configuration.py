@@ -178,7 +178,7 @@ def test_a_run_over_seeds_is_repeated_from_its_manifest(vislam: Vislam) -> None:
 
 def test_without_words_the_default_sequences_and_estimators_are_compared(vislam: Vislam) -> None:
     assert set(SEQUENCES) <= set(built_in_names())
-    assert vislam("compare", "--max-frames", "3", "--workers", "1", "--out", "run") == 0
+    assert vislam("compare", "--max-frames", "3", "--workers", "1", "--figures", "none", "--out", "run") == 0
     assert {path.name for path in Path("run").iterdir()} == set(SEQUENCES)
     for sequence in SEQUENCES:
         assert manifest(f"run/{sequence}")["estimators"] == list(defaults())

@@ -74,7 +74,7 @@ def exact_run(name: str, build: Build, scenario: str) -> Run:
     return run_on(name, build, exact_recording(scenario))
 
 
-@every_scenario
+@both_kinds
 def test_it_is_causal_and_deterministic(build: Build, scenario: str) -> None:
     """Withholding later packets leaves earlier answers bit-identical, and the same packets give the same to the end."""
     assert promises.other_when_repeated(build, watched(build, scenario)) == ""

@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,17 @@ from toolkit.experiment.units import Outcome, Unit, run_unit
 from toolkit.experiment.workers import Lost, results_of
 from toolkit.progress import SILENT
 
-dask = pytest.importorskip("dask", reason="needs the extra cluster")
-distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+# Asked for by name: to import it takes a twentieth of what all tests take to be found.
+pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs the extra cluster")
 Units = Callable[..., list[Unit]]
 
 
 @pytest.fixture(scope="module")
 def local() -> Iterator[Any]:
     """Two worker processes and their scheduler."""
+    import dask
+    import distributed
+
     # How long a worker that is gone is waited for; 30 s otherwise.
     impatient = {"distributed.comm.timeouts.connect": "1s", "distributed.scheduler.allowed-failures": 1}
     with (

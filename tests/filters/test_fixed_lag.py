@@ -95,7 +95,10 @@ def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_ch
     np.testing.assert_allclose(position_of(window, 5), exact.atPoint3(X(5)), atol=1e-3)
 
 
-SCENARIOS = [replace(DRIVE, duration_s=4.0), replace(DRIVE_IMU, duration_s=4.0), replace(FLIGHT, duration_s=2.0)]
+SCENARIOS = [
+    replace(s, duration_s=duration_s, camera=replace(s.camera, max_tracks=40))
+    for s, duration_s in ((DRIVE, 4.0), (DRIVE_IMU, 4.0), (FLIGHT, 2.0))
+]
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)

@@ -81,8 +81,9 @@ def test_an_imu_that_is_shaken_is_found_and_does_less_harm_unless_it_is_to_be_be
     assert tells(run)
     as_stated = run_estimator(name, shaken, settings=Settings(noise=Noise(match_imu=False)))
     assert not tells(as_stated)
-    found, believed = (score_run(each, "causal", shaken).values for each in (run, as_stated))
-    for metric in ("nees_pose_mean", "ate_se3_m", "heldout_reproj_median_px"):
+    metrics = ("nees_pose_mean", "ate_se3_m", "heldout_reproj_median_px")
+    found, believed = (score_run(each, "causal", shaken, only=metrics).values for each in (run, as_stated))
+    for metric in metrics:
         assert found[metric] < believed[metric]
 
 

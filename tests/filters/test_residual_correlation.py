@@ -130,8 +130,9 @@ def test_tracks_that_walk_are_found_and_claimed_to_tell_less(name, walking, run_
     run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
     assert tells(run)
     assert not tells(full)
-    found, believed = (score_run(each, "final", walking).values for each in (run, full))
-    for metric in ("nees_pose_mean", "ate_none_m", "ate_se3_m"):
+    metrics = ("nees_pose_mean", "ate_none_m", "ate_se3_m")
+    found, believed = (score_run(each, "final", walking, only=metrics).values for each in (run, full))
+    for metric in metrics:
         assert found[metric] < 0.9 * believed[metric]
 
 

@@ -9,6 +9,7 @@ import pytest
 from toolkit import runner
 from toolkit.estimate import Run
 from toolkit.estimator import find
+from toolkit.sequence import Sequence
 from toolkit.settings import Outliers, Settings, Window
 from toolkit.simulation import DRIVE, simulate
 
@@ -16,11 +17,17 @@ WINDOWED = {"msckf", "msckf-fej", "msckf-slam", "fixed-lag", "smart"}
 
 
 @cache
-def answer(name: str, part: Window | Outliers = Window()) -> Run:  # noqa: B008 - frozen
-    """Run an estimator over two seconds in which one sighting in a hundred is of another point."""
-    settings = Settings(window=part) if isinstance(part, Window) else Settings(outliers=part)
+def recording() -> Sequence:
+    """Return two seconds in which one sighting in a hundred is of another point."""
     camera = replace(DRIVE.camera, outlier_rate=0.01, max_tracks=40)
-    sequence = simulate(replace(DRIVE, duration_s=2.0, camera=camera), 6)
+    return simulate(replace(DRIVE, duration_s=2.0, camera=camera), 6)
+
+
+@cache
+def answer(name: str, part: Window | Outliers = Window()) -> Run:  # noqa: B008 - frozen
+    """Run an estimator over the recording, once for each choice."""
+    settings = Settings(window=part) if isinstance(part, Window) else Settings(outliers=part)
+    sequence = recording()
     assert sequence.prior is not None
     run = runner.run(name, find(name).load(), sequence, sequence.prior, settings=settings)
     assert run.final is not None, run.log

@@ -173,7 +173,7 @@ def test_a_blackout_longer_than_the_window_does_not_end_it(run_estimator):
 
 def test_the_window_bounds_what_is_kept_of_the_past(run_estimator):
     """The final answer is each state as it left the window: a longer window corrects it longer."""
-    sequence = simulate(replace(DRIVE, duration_s=6.0), 2)
+    sequence = simulate(replace(DRIVE, duration_s=6.0, camera=replace(DRIVE.camera, max_tracks=40)), 2)
 
     def error_m(lag_s):
         run = runner.run("smart", lambda setup: Smart(setup, lag_s), sequence, sequence.prior, SILENT)

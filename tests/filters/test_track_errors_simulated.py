@@ -14,7 +14,7 @@ from toolkit.track_noise import TrackNoise
 
 # Four times the noise of real tracks: told white, with half a pixel for every sighting, it shows in a few seconds.
 NOISE = TrackNoise(np.array([0.12, 0.24, 0.12]), np.full(3, 0.5), np.array([0.0, 2.8, 0.0]))
-SCENARIO = replace(FLIGHT, duration_s=3.0, camera=replace(FLIGHT.camera, max_tracks=30))
+SCENARIO = replace(FLIGHT, duration_s=3.0, camera=replace(FLIGHT.camera, rate_hz=10.0, max_tracks=30))
 # Windowed filters told white noise would find for themselves that it is not.
 SETTINGS = Settings(noise=Noise(match_tracks=False), outliers=POLICIES["none"])
 

@@ -12,6 +12,8 @@ from types import ModuleType
 
 import nbformat
 import pytest
+from jupyter_client.manager import KernelManager
+from nbclient import NotebookClient
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = ROOT / "notebooks"
@@ -90,6 +92,21 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not [target for target in linked if not (NOTEBOOKS / target).exists()]
 
 
+@pytest.fixture(scope="module")
+def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
+    """Start a kernel in which notebooks run one after the other, on one processor, without real recordings.
+
+    To start one and to import the packages takes three seconds. What is kept was executed in a kernel for each.
+    """
+    manager = KernelManager()
+    # Tests run side by side: what starts threads or processes of its own would only fight for the cores.
+    variables = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "VISLAM_DATA": str(tmp_path_factory.mktemp("no"))}
+    with _one_processor():
+        manager.start_kernel(cwd=str(NOTEBOOKS), env={**os.environ, **variables})
+    yield manager
+    manager.shutdown_kernel(now=True)
+
+
 @contextmanager
 def _one_processor() -> Iterator[None]:
     """Let what is started meanwhile use one processor, another one for each worker that runs tests."""
@@ -106,14 +123,9 @@ def _one_processor() -> Iterator[None]:
 
 
 @each
-def test_it_runs_where_no_real_recording_is(
-    source: Path, execution: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("VISLAM_DATA", str(tmp_path))
-    # Tests run side by side: what starts threads or processes of its own would only fight for the cores.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        monkeypatch.setenv(name, os.environ.get(name, "1"))
-    with _one_processor():
-        executed = execution.execute(source)  # raises where a cell fails
+def test_it_runs_where_no_real_recording_is(source: Path, execution: ModuleType, kernel: KernelManager) -> None:
+    forget = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("%reset -f")])
+    NotebookClient(forget, km=kernel).execute()
+    executed = execution.execute(source, kernel)  # raises where a cell fails
     said = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
     assert "the real" not in said
