@@ -11,16 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, ResidualCorrelation
+from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, SOUND, ResidualCorrelation
 from filters.smoothing.smart_factors import Sightings
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
-
-# What chance explains less often, by the stated noise, is an outlier and says nothing of the others.
-_SOUND = 0.999
 
 
 class Discounted(NamedTuple):
@@ -116,6 +113,6 @@ def successive(tracks: IntArray, frames: IntArray, whitened: Array) -> tuple[Arr
     """
     order = np.lexsort((frames, tracks))
     before, after = order[:-1], order[1:]
-    sound = np.square(whitened).sum(axis=1) < chi2_bound(3, _SOUND)
+    sound = np.square(whitened).sum(axis=1) < chi2_bound(3, SOUND)
     pairs = (tracks[before] == tracks[after]) & (frames[after] == frames[before] + 1) & sound[before] & sound[after]
     return whitened[before[pairs]], whitened[after[pairs]]

@@ -7,17 +7,19 @@ import pytest
 
 from filters.kalman.gate import FrameGate
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.residual_correlation import ResidualCorrelation, residuals_left
+from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCorrelation, residuals_left
 from filters.kalman.triangulation import triangulate
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
 from toolkit.models import stereo
+from toolkit.sequence import StereoFrame
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_REALISTIC, simulate
 from toolkit.track_noise import TrackNoise
 
 WINDOW, TRACKS = 30, 60
 SMOOTHERS = ("fixed-lag", "smart", "isam2", "batch")
+ALWAYS = np.ones((WINDOW, TRACKS), dtype=bool)
 FULL = Settings(noise=Noise(match_tracks=False))
 
 
@@ -53,6 +55,18 @@ def tracks_of(rig, correlation, seed):
 def learnt(rig, correlation, seed=0):
     found = ResidualCorrelation(rig)
     found.learn(*tracks_of(rig, correlation, seed))
+    return found
+
+
+def learnt_by_frame(rig, correlation, seed=0, seen=ALWAYS, off_px=0.0):
+    """Return what landmarks that stand where they are tell, by the tracks seen in each frame, off by (F, 1) px."""
+    (track_ids, uvs_px, _, ages), points, poses = tracks_of(rig, correlation, seed)
+    uvs_px, backwards = uvs_px + np.reshape(off_px, (-1, 1, 1)), np.arange(TRACKS)[::-1]
+    found = LandmarkCorrelation(rig)
+    for k in range(WINDOW):
+        rows = backwards[seen[k, backwards]]
+        frame = StereoFrame(k, track_ids[rows], uvs_px[rows, k], ages[rows, k])
+        found.learn_frame(frame, track_ids, points, poses[k])
     return found
 
 
@@ -97,6 +111,30 @@ def test_what_is_left_of_residuals_is_what_the_best_points_leave(drive):
     # The points are a few hundredths of their depth off, and what is left of second order is below a tenth of a sigma.
     np.testing.assert_allclose(left, residuals_left(sightings, best, poses, drive.rig), atol=0.1)
     assert np.abs(left).max() > 2.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_landmarks_of_the_state_with_white_errors_count_in_full(drive, seed):
+    assert learnt_by_frame(drive.rig, 0.0, seed).share == 1.0
+
+
+def test_landmarks_of_the_state_count_for_as_much_as_the_mean_of_their_errors_is_worth(drive):
+    correlation = 0.6
+    found = learnt_by_frame(drive.rig, correlation)
+    assert found.share == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.15)
+    assert "landmarks of the state came to count for" in found.told[0]
+
+
+def test_residuals_of_landmarks_are_paired_in_successive_frames(drive):
+    every_other = np.add.outer(np.arange(WINDOW), np.arange(TRACKS)) % 2 == 0
+    assert learnt_by_frame(drive.rig, 0.9, seen=every_other).correlation == 0.0
+
+
+def test_outliers_among_landmarks_say_nothing_of_the_others(drive):
+    sound = np.arange(TRACKS) % 3 > 0
+    planted = learnt_by_frame(drive.rig, 0.6, off_px=np.where(sound, 0.0, 20.0))
+    alone = learnt_by_frame(drive.rig, 0.6, seen=np.tile(sound, (WINDOW, 1)))
+    assert planted.share == alone.share < 1.0
 
 
 def test_a_share_scales_what_is_accepted_and_not_what_is_tested():
