@@ -64,7 +64,8 @@ def _discounted_marginal(
     sizes = {key: values.extract([key]).dim() for key in factor.keys()}  # noqa: SIM118 - not a mapping
     blocks = dict(zip(sizes, np.split(jacobian, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
     keys = sorted(sizes, key=lambda key: kind_of(key) != "l")
-    rows = np.linalg.qr(np.column_stack([*(blocks[key] for key in keys), residual]), mode="r")[: sum(sizes.values())]
+    stacked = np.column_stack([*(blocks[key] for key in keys), residual])
+    rows = np.linalg.qr(stacked).R[: sum(sizes.values())]
     rows[: sum(sizes[key] for key in keys if kind_of(key) == "l")] *= np.sqrt(share)
     *columns, residual = np.split(rows, np.cumsum([sizes[key] for key in keys]), axis=1)
     return gtsam.LinearContainerFactor(linear_factor(list(zip(keys, columns, strict=True)), residual[:, 0]), values)
