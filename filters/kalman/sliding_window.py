@@ -7,11 +7,11 @@ than the window reaches, as a state does in the smoothers. With ``landmarks`` th
 the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for
 vision-aided inertial navigation").
 
-Where residuals along tracks turn out correlated under white noise, tracks count for less
-(:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track correct
-with their whole covariance, and a landmark in the state has the error of its track beside it. What is approximated: a
-track that lives on after it was used starts anew at its age, and the error it has come to by then is taken for drawn
-anew.
+Where residuals along tracks turn out correlated under white noise, tracks count for less, and landmarks in the state by
+their own (:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track
+correct with their whole covariance, and a landmark in the state has the error of its track beside it. What is
+approximated: a track that lives on after it was used starts anew at its age, and the error it has come to by then is
+taken for drawn anew.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.motion_noise import MatchedNoise, test_of_corrections
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
-from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCorrelation
 from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
 from filters.kalman.tracks_in_view import TracksInView, steps
@@ -70,6 +70,7 @@ class SlidingWindowFilter:
         self._noise = MatchedNoise.of(setup, test_of_corrections(setup.compilation))
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
         self._learn = learning(setup.compilation)
+        self._landmark_correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:
@@ -78,8 +79,7 @@ class SlidingWindowFilter:
         predicted = self._joint.core
         self._joint.clone(packet.index)
         self._clone_t_ns = np.append(self._clone_t_ns, packet.frame.t_ns)
-        share = self._correlation.share
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, share)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct_by_landmarks(packet.frame, gate)
         self._tracks.add_frame(_without(packet.frame, self._joint))
@@ -88,7 +88,7 @@ class SlidingWindowFilter:
         self._correct_by_bridge(packet)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._forget_clones(leaving)
-        now = self._in_view.corrected(self._joint, self._tracks.unused(), share)
+        now = self._in_view.corrected(self._joint, self._tracks.unused(), self._correlation.share)
         if self.bridge is not None:
             self.bridge.learn(now.T_world_imu)
         return now.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
@@ -100,14 +100,17 @@ class SlidingWindowFilter:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the run."""
-        return self._noise.told + self._correlation.told
+        return self._noise.told + self._correlation.told + self._landmark_correlation.told
 
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
+        gate.share = self._landmark_correlation.share
         if isinstance(self._joint, TrackErrorBelief):
             track_error_states.correct(self._joint, frame, self._at, self._rig, gate)
             joint_landmarks.forget(self._joint, track_error_states.implausible_errors(self._joint, gate), self._memory)
         else:
             joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+        joint = self._joint
+        self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
@@ -115,7 +118,7 @@ class SlidingWindowFilter:
         All at once, unless there is room for landmarks: what a landmark is linearised at for life is triangulated
         after the window has been corrected by the others.
         """
-        used = self._tracks.ended()
+        gate.share, used = self._correlation.share, self._tracks.ended()
         if not self._room:
             used = used | self._tracks.seen_by(leaving)
         self._correct_by(self._tracks.take(used), gate)

@@ -7,17 +7,19 @@ import pytest
 
 from filters.kalman.gate import FrameGate
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.residual_correlation import ResidualCorrelation, residuals_left
+from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCorrelation, residuals_left
 from filters.kalman.triangulation import triangulate
 from toolkit.geometry import se3_exp
 from toolkit.metrics import score_run
 from toolkit.models import stereo
+from toolkit.sequence import StereoFrame
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_REALISTIC, simulate
 from toolkit.track_noise import TrackNoise
 
 WINDOW, TRACKS = 30, 60
 SMOOTHERS = ("fixed-lag", "smart", "isam2", "batch")
+ALWAYS = np.ones((WINDOW, TRACKS), dtype=bool)
 FULL = Settings(noise=Noise(match_tracks=False))
 
 
@@ -53,6 +55,18 @@ def tracks_of(rig, correlation, seed):
 def learnt(rig, correlation, seed=0):
     found = ResidualCorrelation(rig)
     found.learn(*tracks_of(rig, correlation, seed))
+    return found
+
+
+def learnt_by_frame(rig, correlation, seed=0, seen=ALWAYS, off_px=0.0):
+    """Return what landmarks that stand where they are tell, by the tracks seen in each frame, off by (F, 1) px."""
+    (track_ids, uvs_px, _, ages), points, poses = tracks_of(rig, correlation, seed)
+    uvs_px, backwards = uvs_px + np.reshape(off_px, (-1, 1, 1)), np.arange(TRACKS)[::-1]
+    found = LandmarkCorrelation(rig)
+    for k in range(WINDOW):
+        rows = backwards[seen[k, backwards]]
+        frame = StereoFrame(k, track_ids[rows], uvs_px[rows, k], ages[rows, k])
+        found.learn_frame(frame, track_ids, points, poses[k])
     return found
 
 
@@ -99,6 +113,36 @@ def test_what_is_left_of_residuals_is_what_the_best_points_leave(drive):
     assert np.abs(left).max() > 2.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_landmarks_of_the_state_with_white_errors_count_in_full(drive, seed):
+    assert learnt_by_frame(drive.rig, 0.0, seed).share == 1.0
+
+
+def test_landmarks_of_the_state_count_for_as_much_as_the_mean_of_their_errors_is_worth(drive):
+    correlation = 0.6
+    found = learnt_by_frame(drive.rig, correlation)
+    assert found.share == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.15)
+    assert "tracks of landmarks in the state came to count for" in found.told[0]
+
+
+def test_landmarks_whose_residuals_are_hardly_correlated_count_in_full(drive):
+    """A filter leaves residuals of white landmarks correlated by up to 0.07; tracks that walk by more than half."""
+    assert learnt_by_frame(drive.rig, 0.1).share == 1.0
+    assert learnt_by_frame(drive.rig, 0.25).share < 0.8
+
+
+def test_residuals_of_landmarks_are_paired_in_successive_frames(drive):
+    every_other = np.add.outer(np.arange(WINDOW), np.arange(TRACKS)) % 2 == 0
+    assert learnt_by_frame(drive.rig, 0.9, seen=every_other).correlation == 0.0
+
+
+def test_outliers_among_landmarks_say_nothing_of_the_others(drive):
+    sound = np.arange(TRACKS) % 3 > 0
+    planted = learnt_by_frame(drive.rig, 0.6, off_px=np.where(sound, 0.0, 20.0))
+    alone = learnt_by_frame(drive.rig, 0.6, seen=np.tile(sound, (WINDOW, 1)))
+    assert planted.share == alone.share < 1.0
+
+
 def test_a_share_scales_what_is_accepted_and_not_what_is_tested():
     nis, dof = np.array([1.0, 3.0, 40.0]), 3
     for huber in (None, 1.5):
@@ -109,7 +153,7 @@ def test_a_share_scales_what_is_accepted_and_not_what_is_tested():
         np.testing.assert_allclose(part.weights(nis, dof, passed[1]), 0.2 * whole.weights(nis, dof, passed[0]))
 
 
-@pytest.mark.parametrize("name", ["msckf", "msckf-fej", "msckf-slam", *SMOOTHERS])
+@pytest.mark.parametrize("name", ["ekf-slam", "msckf", "msckf-fej", "msckf-slam", *SMOOTHERS])
 def test_a_drive_whose_noise_is_as_stated_is_answered_as_without_to_the_bit(name, drive, run_estimator):
     with_it, without = run_estimator(name, drive), run_estimator(name, drive, settings=FULL)
     np.testing.assert_array_equal(with_it.final.T_world_imu, without.final.T_world_imu)
@@ -125,7 +169,7 @@ def test_a_smoother_is_the_nearer_to_honest_for_it(name, walking, run_estimator)
     assert found["nees_pose_mean"] < 0.8 * believed["nees_pose_mean"]
 
 
-@pytest.mark.parametrize("name", ["msckf-fej", "msckf-slam"])
+@pytest.mark.parametrize("name", ["ekf-slam", "msckf-fej", "msckf-slam"])
 def test_tracks_that_walk_are_found_and_claimed_to_tell_less(name, walking, run_estimator):
     run, full = run_estimator(name, walking), run_estimator(name, walking, settings=FULL)
     assert tells(run)
@@ -147,4 +191,4 @@ def test_where_noise_of_tracks_is_stated_they_count_as_it_says(walking, run_esti
 
 def tells(run):
     """Say whether the log of a run says that tracks do not count in full."""
-    return any("residuals along tracks are correlated" in line for line in run.log)
+    return any("are correlated" in line and "came to count for" in line for line in run.log)
