@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Finding, audit
+from toolkit.audit.accelerometer_axes import check as accelerometer_axes
 from toolkit.audit.fault import Evidence
 from toolkit.audit.saturated_samples import check as saturated
 from toolkit.audit.stuck_samples import check as stuck
@@ -78,7 +79,8 @@ def test_a_sensor_read_twice_as_often_as_it_measures_is_not_stuck(clean_recordin
 
 def test_wheels_that_stand_still_give_zeros_and_are_not_judged() -> None:
     halted = faults.standstill(simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3), 3.0, seed=1)
-    silent = _with_values(halted, np.where(np.abs(halted.motion.values) < 0.5, 0.0, halted.motion.values))
+    stands = np.abs(halted.motion.values[:, :1]) < 0.5
+    silent = _with_values(halted, np.where(stands, 0.0, halted.motion.values))
     assert stuck(Evidence(silent)) is None
     assert saturated(Evidence(silent)) is None
 
@@ -88,3 +90,45 @@ def test_an_accelerometer_of_zeros_ends_without_a_warning_of_numpy(clean_recordi
     sound = clean_recording("flight", 3, 8.0)
     found = _found(_with_values(sound, np.zeros_like(sound.motion.values)), "stuck-samples")
     assert found.blocking
+
+
+@pytest.mark.parametrize("column, name", [(2, "accelerometer z"), (4, "gyro y")])
+def test_one_axis_that_repeats_a_value_is_named(clean_recording: Clean, column: int, name: str) -> None:
+    sound = clean_recording("flight", 3, 8.0)
+    values = sound.motion.values.copy()
+    values[len(values) // 4 :, column] = values[len(values) // 4, column]
+    found = _found(_with_values(sound, values), "stuck-samples")
+    assert found.blocking
+    assert f"the {name} repeats one value for" in found.detail
+
+
+def test_a_gyro_sample_no_body_can_turn_by_is_dropped_alone(clean_recording: Clean) -> None:
+    sound = clean_recording("flight", 3, 8.0)
+    values = sound.motion.values.copy()
+    values[[100, 300, 500], [3, 4, 0]] = [300.0, -80.0, 900.0]
+    outcome = audit(_with_values(sound, values))
+    assert next(f for f in outcome.findings if f.fault == "implausible").count == 3
+    assert outcome.sequence.motion.t_ns.size == len(values) - 3
+
+
+ORDERS = [((0, 1, 2), (-1.0, -1.0, -1.0)), ((0, 1, 2), (1.0, 1.0, -1.0)), ((1, 0, 2), (1.0, 1.0, 1.0))]
+
+
+@pytest.mark.parametrize("order, signs", ORDERS, ids=["gravity's sign", "one sign", "exchanged"])
+@pytest.mark.parametrize("scenario", ["flight", "drive-imu"])
+def test_an_accelerometer_in_other_axes_than_the_gyro_is_named(
+    clean_recording: Clean, scenario: str, order: tuple[int, ...], signs: tuple[float, ...]
+) -> None:
+    sound = clean_recording(scenario, 3, 12.0)
+    values = sound.motion.values.copy()
+    values[:, :3] = values[:, list(order)] * signs
+    found = _found(_with_values(sound, values), "accelerometer-axes")
+    assert found.blocking
+    named = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
+    assert f"the accelerometer's x, y, z are the gyro's {named}" in found.detail
+
+
+@pytest.mark.parametrize("scenario", ["flight", "flight-realistic", "drive-imu"])
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_a_sound_accelerometer_is_not_accused(clean_recording: Clean, scenario: str, seed: int) -> None:
+    assert accelerometer_axes(Evidence(clean_recording(scenario, seed, 12.0))) is None

@@ -276,6 +276,7 @@ def many(u_left: float, v_left: float, u_right: float, v_right: float) -> np.nda
     "corners, message",
     [
         ((400.0, 200.0, 380.0, 212.0), "vL - vR is -1[12].. px .* rectify the images"),
+        ((400.0, 200.0, 380.0, 197.0), "vL - vR is 3.. px .* rectify the images"),
         ((200.0, 400.0, 200.0, 380.0), "u and v look exchanged: exchange them"),
     ],
 )
@@ -285,6 +286,37 @@ def test_rows_that_differ_are_refused(
     with pytest.raises(DataError, match=message):
         course_npz.load(written(tmp_path, course | {"features": many(*corners)}))
     course_npz.load(written(tmp_path, course | {"features": many(400.0, 200.0, 380.0, 200.0)}))
+
+
+@pytest.mark.parametrize(
+    "other, message",
+    [
+        ((400.0, 200.0, 380.0, 212.0), "in 38% of 40 sightings .* rectify the images"),
+        ((200.0, 400.0, 200.0, 380.0), "in 38% of 40 sightings .* u and v look exchanged"),
+    ],
+)
+def test_rows_that_differ_in_some_of_the_tracks_are_refused(
+    course: Course, tmp_path: Path, other: tuple[float, float, float, float], message: str
+) -> None:
+    struck = (np.arange(8) % 3 == 0)[:, None]
+    features = np.where(struck, many(*other), many(400.0, 200.0, 380.0, 200.0))
+    with pytest.raises(DataError, match=message):
+        course_npz.load(written(tmp_path, course | {"features": features}))
+
+
+def test_nan_stands_for_a_missing_sighting_where_nothing_else_does(course: Course, tmp_path: Path) -> None:
+    features = np.where(course["features"] == -1.0, np.nan, course["features"])
+    sound = course_npz.load(written(tmp_path, course)).observations
+    seen = course_npz.load(written(tmp_path, course | {"features": features})).observations
+    np.testing.assert_array_equal(seen.uv_px, sound.uv_px)
+    np.testing.assert_array_equal(seen.frame, sound.frame)
+
+
+def test_one_stamp_that_is_no_time_tells_no_unit(course: Course, tmp_path: Path) -> None:
+    stamps = course["time_stamps"].astype(float)
+    stamps[0, 2] = 1e300
+    with pytest.raises(DataError, match=r"time_stamps\[2\] is 1e\+300 s \(1 such stamps\)"):
+        course_npz.load(written(tmp_path, course | {"time_stamps": stamps}))
 
 
 def test_features_without_a_sighting_are_not_taken_for_a_file_that_has_none(course: Course, tmp_path: Path) -> None:

@@ -57,5 +57,13 @@ FAULT = Fault(
     "conflict",
     "vision and the measured motion disagree for seconds: moving objects or wrong samples",
     check,
-    after=("mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement", "gyro-bias"),
+    after=(
+        "mixed-axes",
+        "extrinsic-translation",
+        "twist-lag",
+        "time-offset",
+        "accelerometer-axes",
+        "disagreement",
+        "gyro-bias",
+    ),
 )

@@ -3,6 +3,8 @@
 The last word on the calibration: what no other fault explains, or what a repair has left, is said here.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
@@ -10,13 +12,16 @@ from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
-from toolkit.audit.units import SPEEDS
+from toolkit.audit.units import FORCES, RATES, SPEEDS
 
 # Ratios of the samples' speed, rate of rotation and specific force to what the camera and gravity say. Sound recordings
 # have speeds of 0.96 to 1.02; the noise of the camera's rotation lowers that of rotations, so only a larger one counts.
 MOST_RATIO, MOST_FORCE_RATIO, SIGMAS = 1.25, 1.5, 5.0
 # Vision's speed is good to 5 % in sound recordings: a unit's factor that is nearer than this is named.
 NEAR_UNIT = 0.08
+# Named and not converted: they are too near to the factors of other units, or of other faults.
+OTHER_SPEEDS, OTHER_FORCES = {"knots": 1.944}, {"ft/s^2": 3.281}
+OTHER_RATES = {"turns a minute": 30.0 / np.pi, "mrad/s": 1000.0}
 # Velocities of the faster half that point elsewhere have a wrong sign, or axes that nothing mended.
 MOST_ANGLE_DEG = 60.0
 
@@ -50,14 +55,21 @@ def _ratios(evidence: Evidence) -> list[str]:
     if angle_deg is not None and angle_deg > MOST_ANGLE_DEG:
         said.append(f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)")
     if speed is not None and _is_off(speed, 1.0 / MOST_RATIO, MOST_RATIO):
-        units = [unit for unit, factor in SPEEDS.items() if abs(speed.value / factor - 1.0) < NEAR_UNIT]
-        meant = f", as if in {' or '.join(units)}" if units else ""
+        meant = _units_meant(speed.value, SPEEDS | OTHER_SPEEDS)
         said.append(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}")
     if _is_off(rotation, 0.0, MOST_RATIO):
-        said.append(f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera")
+        meant = _units_meant(rotation.value, RATES | OTHER_RATES)
+        said.append(f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}")
     if force is not None and _is_off(force, 1.0 / MOST_FORCE_RATIO, MOST_FORCE_RATIO):
-        said.append(f"the accelerometer reads {force.value:.3g} times gravity (median)")
+        meant = _units_meant(force.value, FORCES | OTHER_FORCES)
+        said.append(f"the accelerometer reads {force.value:.3g} times gravity (median){meant}")
     return said
+
+
+def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:
+    """Name the units whose factor a ratio is nearly, if there are any."""
+    units = [unit for unit, factor in factors.items() if abs(ratio / factor - 1.0) < NEAR_UNIT]
+    return f", as if in {' or '.join(units)}" if units else ""
 
 
 def _median_angle_deg(evidence: Evidence) -> float | None:

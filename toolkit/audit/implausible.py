@@ -1,7 +1,7 @@
 """Single values no sensor gives: a flipped bit or a failed parse, of which one ruins a whole run.
 
 Odometry has a vehicle behind it: one sample that leaves both its neighbours, and comes back, faster than any vehicle
-can is none of its motion, however plausible the value is. An accelerometer that is knocked does just that.
+can is none of its motion, however plausible the value is. An accelerometer that is knocked does just that, by less.
 """
 
 from dataclasses import replace
@@ -19,6 +19,8 @@ from toolkit.sequence import Sequence
 MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
 # Beyond what any vehicle's velocity and rate of rotation change by (m/s^2, rad/s^2): ten times gravity, and as much.
 MOST_CHANGE = 100.0
+# A single sample of an accelerometer and a gyro that is off its neighbours by more is no knock (m/s^2, rad/s).
+MOST_STEP = np.repeat([500.0, 50.0], 3)
 # Noise may step further where samples come fast: single ones are beyond this many standard deviations of such steps.
 BEYOND_STEPS = 20.0
 # A unit makes all samples too large; single ones are beyond this many times the median.
@@ -61,14 +63,15 @@ def _implausible_samples(sequence: Sequence) -> BoolArray:
 
 
 def _leaps(sequence: Sequence) -> BoolArray:
-    """Say which twists (S,) leave their neighbours on both sides, the same way, faster than a vehicle can."""
+    """Say which samples (S,) leave their neighbours on both sides, the same way, faster than a vehicle can."""
     values, t_s = sequence.motion.values, sequence.motion.t_ns / NS_PER_S
     leaps = np.zeros(len(values), dtype=bool)
-    if sequence.motion_kind != "twist" or len(values) < 3:
+    if sequence.motion_kind == "none" or len(values) < 3:
         return leaps
     step, step_s = np.diff(values, axis=0), np.diff(t_s)[:, None]
     usual = MAD_TO_SIGMA * np.median(np.abs(step), axis=0)
-    far = np.abs(step) > np.maximum(MOST_CHANGE * step_s, BEYOND_STEPS * usual)
+    most = MOST_CHANGE * step_s if sequence.motion_kind == "twist" else MOST_STEP
+    far = np.abs(step) > np.maximum(most, BEYOND_STEPS * usual)
     leaps[1:-1] = (far[1:] & far[:-1] & (step[1:] * step[:-1] < 0.0)).any(axis=1)
     return leaps
 

@@ -26,7 +26,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     intervals, rig = evidence.intervals, evidence.sequence.rig
     if intervals is None:
         return evidence.blind
-    said, turn = list[str](), turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
+    said, checks, turn = list[str](), list[str](), turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
     least_rad = SYSTEMATIC_RAD[evidence.sequence.motion_kind] + turn.by_chance_rad
     if (np.abs(turn.rad) > least_rad).any():
         angle = float(np.linalg.norm(turn.rad))
@@ -34,18 +34,21 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
             f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
         )
+        checks.append("the extrinsic and the principal point")
     rotation = rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
         said.append(f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera")
+        checks.append("the scale of the gyro and the focal length")
     force = force_ratio(evidence.sequence)
     if force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO and _is_off(force):
         said.append(f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)")
+        checks.append("the scale and the bias of the accelerometer")
     if not said:
         return _undecided(float(least_rad.min()), intervals.v_mps is not None)
     return Symptom(
         count=len(said),
         detail="; ".join(said),
-        treatment="check the extrinsic, the principal point and the scale of the samples",
+        treatment=f"check {', '.join(checks)}",
         remedy=None,
         harmful=False,
         warns=True,
@@ -68,5 +71,13 @@ FAULT = Fault(
     "miscalibration",
     "a camera turned a little against its extrinsic, or a scale that is a little off",
     check,
-    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+    after=(
+        "units",
+        "mixed-axes",
+        "extrinsic-translation",
+        "twist-lag",
+        "time-offset",
+        "accelerometer-axes",
+        "disagreement",
+    ),
 )

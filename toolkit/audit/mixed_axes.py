@@ -63,11 +63,11 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     readings = _readings(given)  # the first is the given
     costs = _costs(evidence.intervals, np.stack([one.T_imu_cam for one in readings]))  # (R, M)
     first, second = _best_two(readings, costs)
-    better, alone = _sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
+    better, alone = sigmas(costs[0] - costs[first]), _of_rotations(evidence.intervals, given)
     at_odds = _of_rotations(evidence.intervals, readings[first].T_imu_cam) != _OWN
     if at_odds and (alone != _OWN or better > AGAINST_GIVEN):
         return _exchanged(alone)
-    if first == 0 and (certainty := _sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
+    if first == 0 and (certainty := sigmas(costs[second] - costs[0])) < AGAINST_SECOND:
         return Undecided(
             f"{readings[second].name} explains the motion as well as what is given ({certainty:.1f} sigma)"
         )
@@ -75,7 +75,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if better < AGAINST_GIVEN:
         return Undecided(f"{readings[first].name} explains the motion better than what is given, by {better:.1f} sigma")
-    certain = _sigmas(costs[second] - costs[first]) > AGAINST_SECOND
+    certain = sigmas(costs[second] - costs[first]) > AGAINST_SECOND
     taken, doubt = _settled(evidence, evidence.intervals, [readings[k] for k in _twins(readings, first)])
     remedy = replace(evidence.sequence, rig=replace(evidence.sequence.rig, T_imu_cam=taken.T_imu_cam))
     return Symptom(
@@ -87,11 +87,19 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _exchanged(alone: str) -> Symptom:
+    if alone == _OWN:
+        return Symptom(
+            count=1,
+            detail="the gyro turns as the camera does, and the velocities go elsewhere, which no turn makes of both",
+            treatment="the velocities' channels are exchanged or have the wrong sign: set them right",
+            remedy=None,
+        )
     return Symptom(
         count=1,
         detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
         treatment="channels of the samples are exchanged or have the wrong sign, and not all alike: set them right",
         remedy=None,
+        spoils_vision=True,
     )
 
 
@@ -103,13 +111,13 @@ def _readings(given: Array) -> tuple[Reading, ...]:
 
 
 def _of_body(given: Array, turn: Array) -> Reading:
-    axes = _axes_named(turn[:3, :3])
+    axes = axes_named(turn[:3, :3])
     cause = f"the motion samples' axes are the extrinsic's {axes}"
     return Reading(turn @ given, axes, cause, "the extrinsic is turned to the samples' axes", given[:3, 3])
 
 
 def _of_camera(given: Array, turn: Array) -> Reading:
-    axes = _axes_named(turn[:3, :3].T)
+    axes = axes_named(turn[:3, :3].T)
     cause, place_m = f"the camera's axes are the extrinsic's {axes}", given[:3, :3] @ turn[:3, :3] @ given[:3, :3].T
     done = "the camera is turned in its place"
     return Reading(given @ turn, f"the camera's {axes}", cause, done, place_m @ given[:3, 3])
@@ -164,11 +172,11 @@ def _placed(evidence: Evidence, intervals: Intervals, reading: Reading) -> tuple
 
 def _right_handed_axes() -> Array:
     """Return the rotations (24, 3, 3) that map axes to axes, the identity first."""
-    signed = _signed_axes()
+    signed = signed_axes()
     return np.asarray(signed[np.linalg.det(signed) > 0.0])
 
 
-def _signed_axes() -> Array:
+def signed_axes() -> Array:
     """Return the matrices (48, 3, 3) that exchange and negate axes, the identity first."""
     return np.stack(
         [
@@ -181,24 +189,24 @@ def _signed_axes() -> Array:
 
 def _of_rotations(intervals: Intervals, T_imu_cam: Array) -> str:
     """Name the axes of an extrinsic that the gyro's channels are: its own ones, but where others are beyond doubt."""
-    signed, w_imu = _signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
-    costs = _cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
+    signed, w_imu = signed_axes(), intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    costs = cauchy(intervals.w_radps - w_imu @ signed.swapaxes(1, 2), LEAST_SPREAD_W)
     best = int(np.argmin(costs.mean(axis=1)))
-    return _axes_named(signed[best]) if _sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
+    return axes_named(signed[best]) if sigmas(costs[0] - costs[best]) > AGAINST_SECOND else _OWN
 
 
 def _costs(intervals: Intervals, candidates: Array) -> Array:
     """Return how badly each extrinsic (C, 4, 4) explains each interval (C, M): a Cauchy log-likelihood."""
     R_cam_imu = np.swapaxes(candidates[:, :3, :3], 1, 2)
     w_imu = intervals.w_cam_radps @ R_cam_imu  # (C, M, 3)
-    costs = _cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)
+    costs = cauchy(intervals.w_radps - w_imu, LEAST_SPREAD_W)
     if intervals.v_mps is not None:
         v_imu = intervals.v_cam_mps @ R_cam_imu - np.cross(w_imu, candidates[:, None, :3, 3])
-        costs = costs + _cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
+        costs = costs + cauchy(intervals.v_mps - v_imu, LEAST_SPREAD_V)
     return costs
 
 
-def _cauchy(residuals: Array, least_spread: float) -> Array:
+def cauchy(residuals: Array, least_spread: float) -> Array:
     """Return log(1 + r^2) (C, M) of residuals (C, M, 3) about their medians, in spreads of the best candidate."""
     centred = residuals - np.median(residuals, axis=1, keepdims=True)
     spreads = np.stack([spread(r) for r in residuals])
@@ -207,13 +215,14 @@ def _cauchy(residuals: Array, least_spread: float) -> Array:
     return costs
 
 
-def _sigmas(difference: Array) -> float:
+def sigmas(difference: Array) -> float:
     """Return the mean of differences (M,) in standard errors of that mean."""
     error = float(np.std(difference)) / math.sqrt(difference.size)
     return float(np.mean(difference)) / max(error, 1e-12)
 
 
-def _axes_named(turn: Array) -> str:
+def axes_named(turn: Array) -> str:
+    """Return the axes (3, 3) that another three are, in words."""
     largest = np.argmax(np.abs(turn), axis=1)
     return ", ".join(("-" if turn[row, axis] < 0 else "") + "xyz"[axis] for row, axis in enumerate(largest))
 

@@ -4,6 +4,10 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.subsets import keep_frames
+from toolkit.resampling import NS_PER_S
+
+# Between fewer frames nothing moves.
+LEAST_FRAMES = 2
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -16,6 +20,17 @@ def check(evidence: Evidence) -> Symptom | None:
     count = int(np.sum(~covered))
     if count == 0:
         return None
+    if sequence.frame_count - count < LEAST_FRAMES:
+        frames_s, motion_s = (
+            f"{t.min() / NS_PER_S:.6g} to {t.max() / NS_PER_S:.6g} s" for t in (frames_t_ns, motion_t_ns)
+        )
+        return Symptom(
+            count=count,
+            detail=f"the frames are at {frames_s} and the motion samples at {motion_s}: {count} of "
+            f"{sequence.frame_count} frames lie outside",
+            treatment="no motion is left: stamp both by one clock, in one unit",
+            remedy=None,
+        )
     return Symptom(
         count=count,
         detail=f"{count} of {sequence.frame_count} frames lie outside the time of the motion samples",

@@ -54,10 +54,11 @@ def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array) -> BoolA
     repeats = np.bincount(pairs.interval[step_px == 0.0], minlength=intervals)
     frozen = (repeats >= LEAST_SHARE * survivors) & (survivors >= LEAST_TRACKS)
     moving = _typical_step_px(intervals, pairs, step_px) > MOVING_PX
-    # The nearest interval that is not frozen, on either side; past the ends there is none.
-    index = np.arange(intervals)
-    before = np.maximum.accumulate(np.where(frozen, -1, index))
-    after = np.minimum.accumulate(np.where(frozen, intervals, index)[::-1])[::-1]
+    # The nearest interval that is not frozen, on either side; past the ends there is none. Where hardly a track goes
+    # on, as where a long freeze ends, nothing shows either.
+    index, shows_nothing = np.arange(intervals), frozen | (survivors < LEAST_TRACKS)
+    before = np.maximum.accumulate(np.where(shows_nothing, -1, index))
+    after = np.minimum.accumulate(np.where(shows_nothing, intervals, index)[::-1])[::-1]
     moving_or_end = np.concatenate([moving, [False]])  # index -1 and index `intervals` both read False
     stale: BoolArray = frozen & moving_or_end[before] & moving_or_end[after]
     return stale

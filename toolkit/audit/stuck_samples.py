@@ -1,7 +1,8 @@
 """An accelerometer, a gyro or odometry that repeats one value: a driver that hangs, a sensor that is not connected.
 
-Real samples carry noise, and three axes of it are never equal again and again. Odometry may well repeat itself, for a
-wheel that stands still gives zeros and one that rolls straight ahead whole counts; it counts where it moves and turns.
+Real samples carry noise, and three axes of it are never equal again and again, nor one axis for a second. Odometry may
+well repeat itself, for a wheel that stands still gives zeros and one that rolls straight ahead whole counts; it counts
+where it moves and turns, and where it says nothing of either all along while the camera does.
 """
 
 import numpy as np
@@ -15,8 +16,10 @@ from toolkit.resampling import NS_PER_S
 LEAST_RUN, LEAST_S = 10, 0.1
 # Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
 MOST_REPEATED = 0.2
-# A camera that is slower may stand, and its speed be noise.
-STANDING_MPS = 0.1
+# One axis alone of a coarse sensor at rest may repeat itself for a while.
+LEAST_OF_AXIS_S = 1.0
+# A camera that is slower may stand, or drive straight ahead, and what it has be noise.
+STANDING_MPS, STRAIGHT_RADPS = 0.1, 0.01
 IMU_SENSORS = {"accelerometer": slice(0, 3), "gyro": slice(3, 6)}
 
 
@@ -28,13 +31,16 @@ def check(evidence: Evidence) -> Symptom | None:
     values, t_ns = sequence.motion.values, sequence.motion.t_ns
     step_s = float(np.median(np.diff(t_ns))) / NS_PER_S if t_ns.size > 1 else LEAST_S
     least = max(LEAST_RUN, round(LEAST_S / max(step_s, 1e-6)))
-    if sequence.motion_kind == "twist" and not values.any():
-        return _never_moves(evidence)
+    if sequence.motion_kind == "twist" and (never := _never_moves(evidence)) is not None:
+        return never
     if sequence.motion_kind == "twist":
         moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
         repeated = {"odometry": _in_long_runs(values, least) & moves_and_turns}
     else:
         repeated = {name: _in_long_runs(values[:, columns], least) for name, columns in IMU_SENSORS.items()}
+    stuck_axes = _stuck_axes(values, repeated, step_s) if sequence.motion_kind == "imu" else None
+    if stuck_axes is not None:
+        return stuck_axes
     stuck = np.logical_or.reduce(list(repeated.values()))
     if not stuck.any():
         return None
@@ -53,16 +59,51 @@ def check(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _never_moves(evidence: Evidence) -> Symptom | None:
-    """Tell of odometry that is zero all along while the camera moves."""
-    camera, count = evidence.camera_motion, evidence.sequence.motion.t_ns.size
-    speed_mps = np.linalg.norm(camera.v_mps[camera.known], axis=1)
-    if speed_mps.size < LEAST_RUN or np.median(speed_mps) < STANDING_MPS:
+def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Symptom | None:
+    """Tell of single axes of an IMU (S, 6) that repeat one value where not all of their sensor does."""
+    least, found = max(LEAST_RUN, round(LEAST_OF_AXIS_S / max(step_s, 1e-6))), list[tuple[str, BoolArray]]()
+    for name, columns in IMU_SENSORS.items():
+        for axis, column in zip("xyz", values[:, columns].T, strict=True):
+            repeats = _in_long_runs(column[:, None], least) & ~whole[name] & ~_at_an_end(column)
+            found += [(f"{name} {axis}", repeats)] if repeats.any() else []
+    if not found:
         return None
     return Symptom(
-        count=count,
-        detail=f"all {count} twists are zero while the camera moves at {np.median(speed_mps):.2g} m/s (median)",
-        treatment="odometry was not recorded: look at the driver and the cables",
+        count=int(np.logical_or.reduce([rows for _, rows in found]).sum()),
+        detail=", ".join(f"the {name} repeats one value for {rows.sum() * step_s:.3g} s" for name, rows in found),
+        treatment="what it should have read is not known: look at the driver and the cables (samples carry noise)",
+        remedy=None,
+    )
+
+
+def _at_an_end(column: Array) -> BoolArray:
+    """Say which values (S,) are at an end of a range that is too small: the largest or smallest, again and again."""
+    at_end = np.zeros(column.size, dtype=bool)
+    for end in (column.min(initial=np.inf), column.max(initial=-np.inf)):
+        here = column == end
+        if np.sum(here[1:] & ~here[:-1]) + here[:1].sum() > 1:
+            at_end |= here
+    return at_end
+
+
+def _never_moves(evidence: Evidence) -> Symptom | None:
+    """Tell of odometry whose velocities, or rates of rotation, are zero all along while the camera's are not."""
+    camera, values = evidence.camera_motion, evidence.sequence.motion.values
+    if not len(values) or camera.known.sum() < LEAST_RUN:
+        return None
+    speed_mps = float(np.median(np.linalg.norm(camera.v_mps[camera.known], axis=1)))
+    rate_radps = float(np.median(np.linalg.norm(camera.w_radps[camera.known], axis=1)))
+    said = []
+    if not values[:, :3].any() and speed_mps > STANDING_MPS:
+        said.append(f"all {len(values)} velocities are zero while the camera moves at {speed_mps:.2g} m/s (median)")
+    if not values[:, 3:].any() and rate_radps > STRAIGHT_RADPS:
+        said.append(f"all {len(values)} rates of rotation are zero while the camera turns at {rate_radps:.2g} rad/s")
+    if not said:
+        return None
+    return Symptom(
+        count=len(values),
+        detail=", and ".join(said),
+        treatment="they were not recorded: look at the driver and the cables",
         remedy=None,
         spoils_vision=True,
     )

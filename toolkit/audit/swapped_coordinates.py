@@ -13,7 +13,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.agreement import agreement
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import Sequence, is_left_only
 
@@ -58,14 +58,16 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
     """Tell of sightings without any disparity: missing ones written as zeros, or one image in the place of both."""
     observations = sequence.observations
     uv_px = observations.uv_px
-    zero, same = np.asarray((uv_px == 0.0).all(axis=1)), uv_px[:, 0] == uv_px[:, 1]
+    filler, missing = _filler(uv_px)
+    same = uv_px[:, 0] == uv_px[:, 1]
     of_all = f"of {len(observations)} sightings"
-    if zero.sum() > 0.5 * suspect.sum():
+    if missing.sum() > 0.5 * suspect.sum():
+        count = int(missing.sum())
         return Symptom(
-            count=int(zero.sum()),
-            detail=f"{int(zero.sum())} {of_all} are 0 in every coordinate: missing ones, written as zeros",
+            count=count,
+            detail=f"{count} {of_all} are {filler:g} in every coordinate: missing ones, written as {filler:g}",
             treatment="dropped; a course file has -1 for them, a table no row",
-            remedy=replace(sequence, observations=observations.select(~zero)),
+            remedy=replace(sequence, observations=observations.select(~missing)),
             harmful=False,
         )
     if same.sum() > 0.5 * suspect.sum():
@@ -79,6 +81,16 @@ def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:
     return None
 
 
+def _filler(uv_px: Array) -> tuple[float, BoolArray]:
+    """Return the value that most sightings (N, 3) with three equal coordinates have, and which of them (N,) do."""
+    alike = (uv_px == uv_px[:, :1]).all(axis=1)
+    if not alike.any():
+        return np.nan, alike
+    values, counts = np.unique(uv_px[alike, 0], return_counts=True)
+    filler = float(values[np.argmax(counts)])
+    return filler, np.asarray(alike & (uv_px[:, 0] == filler))
+
+
 def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
     """Return the recording with its coordinates in every other order, and with the tracks behind the camera turned."""
     uv_px = sequence.observations.uv_px
@@ -87,19 +99,22 @@ def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
     sequence = replace(sequence, observations=sequence.observations.select(~is_left_only(uv_px)))
     uv_px = sequence.observations.uv_px
     whole = [(_words(order), uv_px[:, list(order)]) for order in orders]
-    behind = _behind(sequence)
+    observations = sequence.observations
+    parts = {"whole tracks": _behind(uv_px, observations.track_id), "whole frames": _behind(uv_px, observations.frame)}
+    # The exchange is of the kind that leaves the fewest points behind the camera.
+    kind = min(parts, key=lambda kind: int(np.sum(parts[kind] != (disparity_px(uv_px) <= 0.0))))
+    behind = parts[kind]
     if behind.mean() < 1.0 - SUSPECT_SHARE:
         turned = np.where(behind[:, None], uv_px[:, [1, 0, 2]], uv_px)
-        whole.append((f"left and right are exchanged in {behind.mean():.0%} of them, whole tracks", turned))
+        whole.append((f"left and right are exchanged in {behind.mean():.0%} of them, {kind}", turned))
     return [(words, _with_pixels(sequence, pixels)) for words, pixels in whole]
 
 
-def _behind(sequence: Sequence) -> BoolArray:
-    """Say of each sighting (N,) whether most of its track has a disparity <= 0."""
-    observations = sequence.observations
-    _, track = np.unique(observations.track_id, return_inverse=True)
-    behind = np.bincount(track, weights=disparity_px(observations.uv_px) <= 0.0) / np.bincount(track)
-    return np.asarray(behind[track] > 0.5)
+def _behind(uv_px: Array, group: IntArray) -> BoolArray:
+    """Say of each sighting (N,) whether most of its group, a track or a frame, has a disparity <= 0."""
+    _, member = np.unique(group, return_inverse=True)
+    behind = np.bincount(member, weights=disparity_px(uv_px) <= 0.0) / np.bincount(member)
+    return np.asarray(behind[member] > 0.5)
 
 
 def _is_sound(sequence: Sequence) -> bool:

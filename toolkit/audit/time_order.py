@@ -29,6 +29,9 @@ def check(evidence: Evidence) -> Symptom | None:
     if frames + samples == 0:
         return None
     detail = f"{frames} frame stamp(s) and {samples} motion-sample stamp(s) are not after the ones before them"
+    if max(map(_share_equal, _streams(sequence))) > MOST_LATE:
+        why = "most are equal to the one before them, as stamps are that were rounded: write them with all their digits"
+        return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
     if max(map(_share_back, _streams(sequence))) > MOST_LATE:
         why = "time runs backwards or stands still; sorting would play the recording backwards: mend the stamps"
         return Symptom(count=frames + samples, detail=detail, treatment=why, remedy=None)
@@ -56,6 +59,11 @@ def _streams(sequence: Sequence) -> tuple[IntArray, IntArray]:
 def _share_back(t_ns: IntArray) -> float:
     """Return the share of the steps that lead back in time, or nowhere."""
     return float(np.mean(np.diff(t_ns) <= 0)) if t_ns.size > 1 else 0.0
+
+
+def _share_equal(t_ns: IntArray) -> float:
+    """Return the share of the stamps that repeat the one before them."""
+    return float(np.mean(np.diff(t_ns) == 0)) if t_ns.size > 1 else 0.0
 
 
 def _sorted(sequence: Sequence) -> Sequence:

@@ -1,9 +1,10 @@
-"""Lengths, speeds, rates of rotation and accelerations in another unit than SI.
+"""Times, lengths, speeds, rates of rotation and accelerations in another unit than SI.
 
 What two sources tell of the same motion has a ratio, whatever the axes: that of the speeds of samples and camera, of
 their rates of rotation, of the speeds of the truth and the samples, of the specific force and gravity. A ratio that
-is a unit's, and far from one, names the unit; one that is neither is not judged here. The baseline and the extrinsic
-are lengths that a rig cannot have in another unit.
+both speeds and rates have is that of the stamps, by which the camera's motion is divided. A ratio that is a unit's, and
+far from one, names the unit; one that is neither is not judged here. The baseline and the extrinsic are lengths
+that a rig cannot have in another unit.
 """
 
 from collections.abc import Callable
@@ -30,11 +31,14 @@ from toolkit.sequence import Sequence
 SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237, "cm/s": 100.0, "mm/s": 1000.0}
 RATES = {"deg/s": 180.0 / np.pi}
 LENGTHS = {"millimetres": 1000.0, "centimetres": 100.0}
-FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665}
+# Of mg and cm/s^2, 2 % apart, gravity tells neither.
+FORCES = {"g": 1.0 / 9.80665, "mg": 1000.0 / 9.80665, "cm/s^2": 100.0, "mm/s^2": 1000.0}
 # A unit is named where the ratio is within this factor of it, and this many standard errors from one.
 WITHIN_FACTOR, SIGMAS = 1.25, 5.0
 # Vision's speed is good to 5 % in sound recordings, which tells km/h from ft/s, a factor of 1.1 apart.
 WITHIN_FACTOR_OF_SPEED = 1.08
+# Speeds and rates of rotation that are both off by more than the first factor, and alike to the second: the stamps.
+LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
 IN_A_PART = " in a part of the recording and not in another"
 # Baselines of rigs on vehicles, in the hand or in the air (m), and the farthest that a camera stands from its IMU.
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
@@ -51,7 +55,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Count the quantities in another unit; convert them where the unit is certain."""
     found: list[_Wrong] = []
     now = evidence
-    for measure in (_baseline, _lever_arm, _speed, _rotation, _force, _truth):
+    stamps = _stamps(evidence)
+    measures = (_baseline, _lever_arm, _speed, _rotation, _force, _truth)
+    found += [] if stamps is None else [stamps]
+    for measure in measures if stamps is None else ():
         wrong = measure(now)
         if wrong is not None:
             found.append(wrong)
@@ -65,6 +72,25 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         treatment="converted to SI" if certain else "no one unit fits it all: mend the recording",
         remedy=now.sequence if certain else None,
         spoils_vision=True,
+    )
+
+
+def _stamps(evidence: Evidence) -> _Wrong | None:
+    """Tell of stamps in which time passes faster or slower than for the odometry, in translation and rotation alike."""
+    speed = speed_ratio(evidence.intervals)
+    if evidence.intervals is None or speed is None or not speed.value > 0.0:
+        return None
+    rotation = rotation_ratio(evidence.intervals)
+    known = all(ratio.error * SIGMAS < (LEAST_OF_STAMPS - 1.0) * ratio.value for ratio in (speed, rotation))
+    if not known or abs(np.log(speed.value / rotation.value)) > np.log(STAMPS_ALIKE):
+        return None
+    if min(abs(np.log(ratio.value)) for ratio in (speed, rotation)) < np.log(LEAST_OF_STAMPS):
+        return None
+    return _Wrong(
+        f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} and their rate of rotation {rotation.value:.3g} "
+        f"+- {rotation.error:.1g} times the camera's: in the stamps time passes {speed.value:.3g} times as fast as it "
+        "did, so that they are not in seconds",
+        None,
     )
 
 
@@ -179,7 +205,7 @@ def _truth(evidence: Evidence) -> _Wrong | None:
 
 FAULT = Fault(
     "units",
-    "lengths, speeds, rates of rotation or accelerations in another unit than SI",
+    "times, lengths, speeds, rates of rotation or accelerations in another unit than SI",
     check,
     after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics"),
 )

@@ -58,5 +58,13 @@ FAULT = Fault(
     "vision-scale",
     "steps of vision that are a few percent longer or shorter than the measured ones",
     check,
-    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+    after=(
+        "units",
+        "mixed-axes",
+        "extrinsic-translation",
+        "twist-lag",
+        "time-offset",
+        "accelerometer-axes",
+        "disagreement",
+    ),
 )

@@ -111,7 +111,7 @@ def _with_accelerations(sequence: Sequence, camera: CameraMotion, intervals: Int
     if kept.size < 3:
         return None
     w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
-    windows = max(1, round(frame_s[kept[-1]] / WINDOW_S))
+    windows = min(max(1, round(frame_s[kept[-1]] / WINDOW_S)), kept.size // 2)  # frames may be seconds apart
     edges = np.linspace(0, kept.size - 1, windows + 1).round().astype(int)
     equations = [_window(sequence, strides, kept, w_bias, range(*edge)) for edge in pairwise(edges.tolist())]
     response = np.concatenate([response for response, _, _ in equations])

@@ -18,12 +18,16 @@ from toolkit.sequence import Observations
 
 # How far R^T R of a calibration may be from the identity: four printed decimals leave 1e-4.
 _RIGID_TOLERANCE = 1e-3
-# A pair whose rows are this far apart (median, px) is not rectified: at most 0.4 px in the recordings at hand.
-_MOST_ROWS_APART_PX, _FEWEST_ROWS = 3.0, 30
+# A pair whose rows are this far apart (median, px) is not rectified: at most 0.3 px in the recordings at hand.
+_MOST_ROWS_APART_PX, _FEWEST_ROWS = 1.5, 30
+# Matches of two rows so far apart (px) are none; 4 % of them at most in the recordings at hand, with 3 px of noise.
+_NO_MATCH_PX, _MOST_NO_MATCH = 5.0, 0.1
 # Share of the focal length that a skew may be: less than a pixel at the edge of the image.
 _MOST_SKEW = 1e-3
 # No recording lies beyond the year 5000, nor has a sample only every half minute.
 _LATEST_S = 1e11
+# What int64 holds of nanoseconds: to the year 2262.
+_LATEST_NS_S = 9.2e9
 # Stamps are finer than this; single precision is not, from 10 000 s on.
 _COARSE_S = 9e-4
 _LONGEST_STEP_S = 30.0
@@ -132,6 +136,9 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     bad = np.flatnonzero(~np.isfinite(stamps_s))
     if bad.size:
         raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]} ({bad.size} such stamps); remove these samples")
+    bad = np.flatnonzero(np.abs(stamps_s) > _LATEST_NS_S)
+    if 0 < bad.size < 0.5 * stamps_s.size:
+        raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]:g} s ({bad.size} such stamps); mend them")
     coarse_s = float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
     if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s, coarse_s):
         raise DataError(
@@ -170,22 +177,32 @@ def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:
 
 
 def check_rows(path: Path, corners_px: Array) -> None:
-    """Raise DataError where the rows vL and vR of corners (N, 4) differ by a constant: the pair is not rectified.
+    """Raise DataError where the rows vL and vR of corners (N, 4) differ by a constant, or in many: not rectified.
 
     Or u and v are exchanged. A sequence has only the rows' mean, in which nothing shows it any more.
     """
     whole = corners_px[np.isfinite(corners_px).all(axis=1)]
     if len(whole) < _FEWEST_ROWS:
         return
-    columns_px, rows_px = np.median(whole[:, 0] - whole[:, 2]), np.median(whole[:, 1] - whole[:, 3])
-    if abs(rows_px) <= _MOST_ROWS_APART_PX:
-        return
-    exchanged = abs(columns_px) <= _MOST_ROWS_APART_PX
-    remedy = "u and v look exchanged: exchange them" if exchanged else "rectify the images, or mend the rows"
-    raise DataError(
-        f"{path}: vL - vR is {rows_px:.1f} px and uL - uR {columns_px:.1f} px (medians of {len(whole)} sightings), and "
-        f"the rows of a rectified pair are equal; {remedy}"
-    )
+    columns_px, rows_px = whole[:, 0] - whole[:, 2], whole[:, 1] - whole[:, 3]
+    if abs(np.median(rows_px)) > _MOST_ROWS_APART_PX:
+        raise DataError(
+            f"{path}: vL - vR is {np.median(rows_px):.1f} px and uL - uR {np.median(columns_px):.1f} px (medians of "
+            f"{len(whole)} sightings), and the rows of a rectified pair are equal; {_rows_mended(columns_px)}"
+        )
+    apart = np.abs(rows_px) > _NO_MATCH_PX
+    if apart.mean() > _MOST_NO_MATCH:
+        raise DataError(
+            f"{path}: vL and vR differ by more than {_NO_MATCH_PX:g} px in {apart.mean():.0%} of {len(whole)} "
+            f"sightings (by {np.median(np.abs(rows_px[apart])):.1f} px in the median of these), and the rows of a "
+            f"rectified pair are equal; {_rows_mended(columns_px[apart])}"
+        )
+
+
+def _rows_mended(columns_px: Array) -> str:
+    """Return what to do about rows that differ in sightings whose uL - uR (N,) px is given."""
+    exchanged = abs(np.median(columns_px)) <= _MOST_ROWS_APART_PX
+    return "u and v look exchanged: exchange them" if exchanged else "rectify the images, or mend the rows"
 
 
 def camera_matrix(path: Path, key: str, K: Array) -> Array:

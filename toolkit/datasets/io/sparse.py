@@ -44,8 +44,8 @@ def sparse_array(
 ) -> SparseArray:
     """Read an array of a shape (None = any) from a stream, in either memory order; keep what is not the filler.
 
-    NaN is not. Raises DataError, naming file and key, where it holds no real numbers, has another shape, or the stream
-    ends before it.
+    NaN is not, unless the array has no filler at all: then it stands for it. Raises DataError, naming file and key,
+    where it holds no real numbers, has another shape, or the stream ends before it.
     """
     path, key = named
     check_numeric(path, key, layout.dtype)
@@ -54,6 +54,8 @@ def sparse_array(
     size, position, value = _kept_entries(stream, layout.dtype, expected, filler)
     if size != expected:
         raise DataError(f"{path}: {key} ends after {size} of {expected} values; save it again")
+    if value.size == expected and np.isnan(value).any():
+        position, value = position[~np.isnan(value)], value[~np.isnan(value)]
     indices = np.unravel_index(position, layout.shape, order="F" if layout.fortran_order else "C")
     return SparseArray(layout.shape, indices, value)
 
