@@ -22,6 +22,7 @@ from toolkit.models.state import POSITION, ROTATION
 from toolkit.sequence import Sequence, Truth
 
 _MICROSECONDS = 6
+_HALF_WINDOW = 7
 NOT_ALIGNED = Alignment(np.eye(3), np.zeros(3))
 
 
@@ -98,6 +99,19 @@ def errors_to(reference: Truth, trajectory: Trajectory, alignment: Alignment, se
 def seconds(sequence: Sequence, t_ns: IntArray) -> tuple[float, ...]:
     """Return stamps (N,) as seconds from the first frame, to the microsecond."""
     return tuple(round(t, _MICROSECONDS) for t in sequence.elapsed_s(t_ns).tolist())
+
+
+def running_median(values: Array) -> Array:
+    """Return the median (N,) of the known ones of the fifteen values around each of (N,); NaN where none is known.
+
+    At the ends there are fewer.
+    """
+    padded = np.pad(values, _HALF_WINDOW, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _HALF_WINDOW + 1)
+    known = np.isfinite(windows).any(axis=1)
+    medians = np.full(values.size, np.nan)
+    medians[known] = np.nanmedian(windows[known], axis=1)
+    return medians
 
 
 def shown_output(run: Run) -> Output:

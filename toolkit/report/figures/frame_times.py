@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.ticker import NullFormatter
 
 from toolkit.experiment.comparison import Comparison
-from toolkit.geometry import Array
+from toolkit.report.curves import running_median
 from toolkit.report.figures.style import (
     Entry,
     NamedFigure,
@@ -19,7 +19,6 @@ from toolkit.report.figures.style import (
 )
 
 _MS = 1e3
-_SMOOTHED_FRAMES = 15
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -40,7 +39,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
             told += f", end {timings.finish_s:.1f} s"
         line = line_of_estimator(comparison, run.estimator, "final")
         (median,) = axes.plot(
-            _running_median(step_ms), color=colour, linestyle=line, linewidth=width_of(comparison, run.estimator)
+            running_median(step_ms), color=colour, linestyle=line, linewidth=width_of(comparison, run.estimator)
         )
         entries.append(Entry(told, (median,)))
     axes.set_yscale("log")
@@ -57,12 +56,3 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         "estimator that answers only at the end does its work there; that time is in the legend, too."
     )
     yield NamedFigure("frame_times", caption, figure)
-
-
-def _running_median(values: Array) -> Array:
-    """Return the median (N,) of the values (N,) around each, mirrored at the ends so that none counts for many."""
-    half = _SMOOTHED_FRAMES // 2
-    padded = np.pad(values, half, mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-    medians: Array = np.median(windows, axis=1)
-    return medians

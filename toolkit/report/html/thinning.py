@@ -6,6 +6,7 @@ import numpy as np
 
 from toolkit.documents import number, numbers
 from toolkit.geometry import Array, IntArray
+from toolkit.report import curves
 
 MOST_POSES = 1500
 MOST_SAMPLES = 1200
@@ -13,7 +14,6 @@ MOST_OF_COMPONENTS = 400
 MOST_LANDMARKS = 5000
 _MILLIMETRES = 3
 _LARGE_M = 1e7
-_HALF_WINDOW = 7
 
 
 def evenly(count: int, most: int) -> IntArray:
@@ -41,23 +41,18 @@ def with_peaks(values: Array, most: int) -> IntArray:
 
 def thinned(series: Mapping[str, Sequence[float | None]], leading: str) -> dict[str, list[float | None]]:
     """Return the lists of a series, all thinned alike, so that the peaks of the ``leading`` one stay."""
-    values = np.array([np.nan if value is None else value for value in series[leading]], dtype=float)
+    values = _as_array(series[leading])
     kept = with_peaks(values, MOST_SAMPLES).tolist()
     return {name: [column[i] for i in kept] for name, column in series.items() if len(column) == values.size}
 
 
 def running_median(values: Sequence[float | None]) -> list[float | None]:
     """Return the median of the known values around each; None where there are none."""
-    padded = np.pad(
-        np.array([np.nan if value is None else value for value in values], dtype=float),
-        _HALF_WINDOW,
-        constant_values=np.nan,
-    )
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _HALF_WINDOW + 1)
-    known = np.isfinite(windows).any(axis=1)
-    medians = np.full(len(values), np.nan)
-    medians[known] = np.nanmedian(windows[known], axis=1)
-    return list(numbers(medians))
+    return list(numbers(curves.running_median(_as_array(values))))
+
+
+def _as_array(values: Sequence[float | None]) -> Array:
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
 def coordinates(points: Array) -> dict[str, list[float | None]]:
