@@ -18,8 +18,8 @@ from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
-RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth, IMU matched; no loss"
-RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
+RUNG, CHANGE = 30, "+ cross-covariances, first estimates, inverse depth, by share, IMU matched; no loss"
+RULES = {"tracks": "a landmark in its state has no state for the error of its track", "match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:

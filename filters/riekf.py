@@ -21,7 +21,7 @@ from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("barrau2015ekf", "barrau2017invariant")
-RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose"
+RUNG, CHANGE = 40, "+ right-invariant error, latest Jacobians, anchors that move with the pose; no share"
 RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
 
 
