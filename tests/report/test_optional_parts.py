@@ -29,9 +29,9 @@ def test_who_has_no_such_part_is_found_by_what_estimators_say_of_themselves():
 
 def test_where_the_audit_found_correlated_tracks_those_who_take_them_for_white_are_named():
     white, realistic = (prepare(Recording(name, max_frames=40)) for name in ("drive", "drive-realistic"))
-    entries = find_all(["dead-reckoning", "ekf", "ekf-slam", "msckf", "smart"])
+    entries = find_all(["dead-reckoning", "ekf", "ekf-slam", "riekf", "msckf", "smart"])
     assert "match_tracks" not in lacking(entries, DEFAULTS.noise, decisive_parts(white))
-    assert lacking(entries, DEFAULTS.noise, decisive_parts(realistic))["match_tracks"] == ("ekf", "ekf-slam")
+    assert lacking(entries, DEFAULTS.noise, decisive_parts(realistic))["match_tracks"] == ("ekf", "riekf")
 
 
 def test_gaps_are_bridged_between_measured_twists_only():
