@@ -1,7 +1,7 @@
 """Which variables of an incremental tree stay linearised where they are, since no recent frame has factors on them."""
 
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Set
 
 import gtsam
 
@@ -21,11 +21,13 @@ class FrozenVariables:
         self._last_view: dict[int, int] = {}
         self.count = 0
         self._frozen: set[int] = set()
+        self._used: set[int] = set()
         self.keys = gtsam.KeyList()
 
-    def others(self, keys: Iterable[int]) -> list[int]:
-        """Return those of some variables that are not frozen."""
-        return [key for key in keys if key not in self._frozen]
+    @property
+    def others(self) -> Set[int]:
+        """Return the variables that recent frames have factors on, but for those that were frozen before."""
+        return self._used
 
     def unused_for(self, frames: int) -> list[int]:
         """Return the listed keys that none of the last so many frames has factors on, or in view."""
@@ -49,10 +51,12 @@ class FrozenVariables:
         frame = set(keys)
         self._recent.append(frame)
         self._last_frame |= dict.fromkeys(frame, self.count)
+        self._used |= frame - self._frozen
         if len(self._recent) > self._frames:
             oldest = self.count - self._frames
             for key in sorted(self._recent.popleft()):
                 if self._last_frame[key] == oldest and key not in self._frozen:
                     self.keys.push_back(key)
                     self._frozen.add(key)
+                    self._used.remove(key)
         self.count += 1

@@ -203,10 +203,10 @@ class Isam2Tree:
     def _moved(self) -> set[int]:
         """Return what is linearised anew in this frame: of recent states all, or none, so that they agree."""
         fixed = {*self.isam.getFixedVariables(), *(self._chained.settled if self._chained is not None else ())}
-        told = [*(key for keys in self._recent for key in keys), *self._to_relinearise]
-        may_move = [key for key in self._frozen.others(told) if key not in fixed and self.has(key)]
+        may_move = [key for key in self._frozen.others - fixed if self.has(key)]
+        landmarks = self._to_relinearise.intersection(may_move)
         states = [key for key in may_move if kind_of(key) != "l"]
-        return set(may_move).difference(() if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else states)
+        return landmarks.union(states if any_moved_beyond(self._at_most, self.isam.getDelta(), states) else ())
 
     def _linearisations(
         self, factors: gtsam.NonlinearFactorGraph, new: gtsam.Values
@@ -231,8 +231,10 @@ class Isam2Tree:
 
     def _held(self) -> gtsam.KeyList:
         """Return what GTSAM is not to linearise anew: all but what is told by key."""
-        others = self._landmarks.union(*self._recent) - self._to_relinearise
-        return key_list([*self._frozen.keys, *others, LAST])
+        held = gtsam.KeyList(self._frozen.keys)
+        for key in (*(self._frozen.others - self._to_relinearise), LAST):
+            held.push_back(key)
+        return held
 
     def _unchain(self, landmarks: list[int]) -> None:
         if self._chained is not None:

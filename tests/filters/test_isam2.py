@@ -24,7 +24,7 @@ from toolkit.estimator import Setup
 from toolkit.geometry import se3_inverse, se3_log, transform
 from toolkit.measured_motion import TwistMotion, TwistNoise
 from toolkit.models import stereo, twist
-from toolkit.models.factors import B, L, V, X, kind_of
+from toolkit.models.factors import SCALE, B, L, V, X, kind_of
 from toolkit.models.motion import motion_model
 from toolkit.models.twist import twist_factor
 from toolkit.sequence import Sequence
@@ -215,6 +215,12 @@ def test_seconds_of_an_accurate_imu_alone_are_solved_by_cholesky(run_estimator):
     assert (run.status, run.log) == ("ok", ())
 
 
+@pytest.mark.parametrize("index", [0, 7, 2**56 - 1])
+def test_a_key_tells_its_kind_as_a_symbol_of_gtsam_does(index):
+    for kind, key in {"x": X(index), "v": V(index), "b": B(index), "l": L(index), "s": SCALE}.items():
+        assert kind_of(key) == kind == chr(gtsam.Symbol(key).chr())
+
+
 def test_what_none_of_the_last_frames_had_factors_on_is_frozen():
     frozen = FrozenVariables(frames=2)
     for keys in ([X(0), L(0), L(1)], [X(1), L(1)], [X(2)]):
@@ -223,7 +229,9 @@ def test_what_none_of_the_last_frames_had_factors_on_is_frozen():
     for keys in ([X(3), L(2)], [X(4)], [X(5)]):
         frozen.add_frame(keys)
     assert list(frozen.keys) == [L(0), X(0), L(1), X(1), X(2), L(2), X(3)]
-    assert frozen.others([X(3), X(4), L(2), X(5)]) == [X(4), X(5)]
+    assert frozen.others == {X(4), X(5)}
+    frozen.add_frame([X(6), L(0)])
+    assert frozen.others == {X(5), X(6)}, "what is seen again stays frozen"
 
 
 def test_a_frozen_state_is_linearised_where_it_was_until_the_end(monkeypatch):

@@ -15,13 +15,15 @@ from toolkit.sequence import StereoFrame, StereoRig
 X, V, B, L = (gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.V, gtsam.symbol_shorthand.B, gtsam.symbol_shorthand.L)
 # The scale of all disparities, a vector (1,).
 SCALE: int = gtsam.symbol("s", 0)
+# A key is a character above an index of so many bits (gtsam/inference/Symbol.h); a Symbol takes several times as long.
+_INDEX_BITS = 56
 # GTSAM's Python has linear factors on so many variables; on more it has conditionals, which are such factors too.
 _MOST_TERMS = 3
 
 
 def kind_of(key: int) -> str:
     """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
-    return chr(gtsam.Symbol(key).chr())
+    return chr(key >> _INDEX_BITS)
 
 
 def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:
