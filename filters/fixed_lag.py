@@ -55,7 +55,7 @@ class FixedLag:
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
         if self._builder.is_outdated:
-            self._note(packet, self._tree.rebuild(self._builder.brought_up_to_date))
+            self._note(packet, self._tree.rebuild(self._builder.window_brought_up_to_date))
         extension, t_ns = self._builder.extend(packet), packet.frame.t_ns
         while self._first_in_window < packet.index and self._states[self._first_in_window].t_ns < t_ns - self._lag_ns:
             self._complete(self._first_in_window)

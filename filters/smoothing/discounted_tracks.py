@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import gtsam
 import numpy as np
 
 from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, SOUND, ResidualCorrelation
@@ -16,6 +17,7 @@ from filters.smoothing.smart_factors import Sightings
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
+from toolkit.models.factors import kind_of, linear_factor
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -36,6 +38,37 @@ def discounted(rig: StereoRig, huber: float | None, share: float) -> Discounted:
         return Discounted(rig, huber)
     threshold = None if huber is None else huber * float(np.sqrt(share))
     return Discounted(replace(rig, cov_uv_px2=rig.cov_uv_px2 / share), threshold)
+
+
+def discounted_past(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, share: float
+) -> gtsam.NonlinearFactorGraph:
+    """Return the graph of a window whose landmarks owe what has left it a share in (0, 1] of its information.
+
+    The marginals of what has left are densities of states times those of landmarks given these states. The second come
+    of sightings alone: their information is what is multiplied. What is known of states stays, for motion tells most of
+    it or part. ``values`` are of all variables of the graph.
+    """
+    made = gtsam.NonlinearFactorGraph()
+    for factor in (graph.at(i) for i in range(graph.size())):
+        is_linear = isinstance(factor, gtsam.LinearContainerFactor)
+        made.add(_discounted_marginal(factor, values, share) if is_linear else factor)
+    return made
+
+
+def _discounted_marginal(
+    factor: gtsam.NonlinearFactor, values: gtsam.Values, share: float
+) -> gtsam.LinearContainerFactor:
+    """Eliminate the landmarks first: their rows are the conditional density, and all below concern states alone."""
+    jacobian, residual = factor.linearize(values).jacobian()
+    sizes = {key: values.extract([key]).dim() for key in factor.keys()}  # noqa: SIM118 - not a mapping
+    blocks = dict(zip(sizes, np.split(jacobian, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
+    keys = sorted(sizes, key=lambda key: kind_of(key) != "l")
+    stacked = np.column_stack([*(blocks[key] for key in keys), residual])
+    rows = np.linalg.qr(stacked).R[: sum(sizes.values())]
+    rows[: sum(sizes[key] for key in keys if kind_of(key) == "l")] *= np.sqrt(share)
+    *columns, residual = np.split(rows, np.cumsum([sizes[key] for key in keys]), axis=1)
+    return gtsam.LinearContainerFactor(linear_factor(list(zip(keys, columns, strict=True)), residual[:, 0]), values)
 
 
 class DiscountedTracks:

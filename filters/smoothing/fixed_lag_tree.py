@@ -42,6 +42,9 @@ MOST_RECOVERIES = 20
 # sightings nothing, but for what a marginal holds.
 RELINEARISE_BEYOND, BESIDE_CHAINED = 0.01, 0.0
 
+# Makes another graph of one and of the values of all its variables.
+Remake = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.NonlinearFactorGraph]
+
 
 class FixedLagTree:
     """Takes in factors and values with their stamps; what is older than the lag is marginalised."""
@@ -80,12 +83,10 @@ class FixedLagTree:
             back = self.rebuild()
         return Recovery(added.log + back.log, added.dropped | back.dropped)
 
-    def rebuild(
-        self, remade: Callable[[gtsam.NonlinearFactorGraph], gtsam.NonlinearFactorGraph] | None = None
-    ) -> Recovery:
+    def rebuild(self, remade: Remake | None = None) -> Recovery:
         """Build the tree anew; its estimates, now and later, are the same but for rounding, and for factors remade."""
         factors, values = self._emptied()
-        return self._solved(factors if remade is None else remade(factors), values)
+        return self._solved(factors if remade is None else remade(factors, values), values)
 
     def drop(self, track_ids: Collection[int]) -> Recovery:
         """Take landmarks out with their sightings in the window; the others keep what older sightings added."""

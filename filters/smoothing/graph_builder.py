@@ -12,7 +12,7 @@ import numpy as np
 
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.alignment import aligned
-from filters.smoothing.discounted_tracks import DiscountedTracks, seen_often
+from filters.smoothing.discounted_tracks import DiscountedTracks, discounted_past, seen_often
 from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
 from filters.smoothing.refused_tracks import RefusedTracks
 from toolkit.estimate import Estimate
@@ -109,6 +109,19 @@ class GraphBuilder:
         factors = self._factors()
         self._share_in_graph, self._count_alike = self._share, True
         return factors.remade(graph)
+
+    def window_brought_up_to_date(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> gtsam.NonlinearFactorGraph:
+        """Return the graph of a window so, with values of all its variables.
+
+        Where sightings count for less than they did, what has left the window does so too: landmarks that their past
+        makes sure would stand against new ones, and the poses between them.
+        """
+        before = self._share_in_graph
+        graph = self.brought_up_to_date(graph)
+        fallen = self._share_in_graph / before
+        return discounted_past(graph, values, fallen) if fallen < 1.0 else graph
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the motion and the tracks that were taken in."""

@@ -4,10 +4,19 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.smoothing.discounted_tracks import discounted, seen_often, successive, successive_residuals
+from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.smoothing.discounted_tracks import (
+    discounted,
+    discounted_past,
+    seen_often,
+    successive,
+    successive_residuals,
+)
+from filters.smoothing.graph_builder import GraphBuilder
+from toolkit.estimator import Setup
 from toolkit.geometry import se3_exp
 from toolkit.models import stereo
-from toolkit.models.factors import L, StereoFactors, X, huber_loss
+from toolkit.models.factors import L, StereoFactors, X, huber_loss, linear_factor
 from toolkit.sequence import StereoFrame
 from toolkit.simulation import DRIVE, simulate
 
@@ -69,6 +78,58 @@ def test_factors_made_anew_cost_what_new_ones_do_and_others_stay_as_they_were(ri
     for i in range(expected.size()):
         assert made.at(i).error(values) == pytest.approx(expected.at(i).error(values), rel=1e-12)
     assert made.at(4).error(values) == prior.error(values)
+
+
+@pytest.fixture
+def past():
+    """Return a marginal on two poses and three landmarks, about where they are, and these values."""
+    rng, values = np.random.default_rng(3), gtsam.Values()
+    for k in range(2):
+        values.insert(X(k), gtsam.Pose3(se3_exp(rng.normal(size=6))))
+    for i in range(3):
+        values.insert(L(i), rng.normal(size=3))
+    sizes = {L(0): 3, X(0): 6, L(1): 3, X(1): 6, L(2): 3}
+    factor = linear_factor([(key, rng.normal(size=(21, size))) for key, size in sizes.items()], rng.normal(size=21))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.LinearContainerFactor(factor, values))
+    return graph, values
+
+
+def information(graph, values):
+    """Return the information of landmarks (9, 9) of a graph, with poses (9, 12), of poses (12, 12), and the step."""
+    order = gtsam.Ordering()
+    for key in (*map(L, range(3)), *map(X, range(2))):
+        order.push_back(key)
+    whole, told = graph.linearize(values).hessian(order)
+    return whole[:9, :9], whole[:9, 9:], whole[9:, 9:], np.linalg.solve(whole, told)
+
+
+def test_what_left_a_window_tells_the_share_of_landmarks_given_states_and_all_of_states(past):
+    graph, values = past
+    landmarks, across, states, step = information(graph, values)
+    made = discounted_past(graph, values, SHARE)
+    less, across_then, states_then, step_then = information(made, values)
+    np.testing.assert_allclose(less, SHARE * landmarks, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(across_then, SHARE * across, rtol=1e-9, atol=1e-9)
+    of_states = states - across.T @ np.linalg.solve(landmarks, across)
+    np.testing.assert_allclose(
+        states_then - across_then.T @ np.linalg.solve(less, across_then), of_states, rtol=1e-7, atol=1e-7
+    )
+    np.testing.assert_allclose(step_then, step, rtol=1e-6, atol=1e-8)
+
+
+def test_what_left_a_window_counts_for_less_once_sightings_do_and_never_for_more(past, monkeypatch):
+    graph, values = past
+    sequence = simulate(DRIVE, 0)
+    builder = GraphBuilder(
+        Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
+    )
+    landmarks, *_ = information(graph, values)
+    for share, kept in ((0.5, 0.5), (0.1, 0.1), (0.3, 0.1)):
+        monkeypatch.setattr(ResidualCorrelation, "share", property(lambda self, share=share: share))
+        assert builder.is_outdated
+        graph = builder.window_brought_up_to_date(graph, values)
+        np.testing.assert_allclose(information(graph, values)[0], kept * landmarks, rtol=1e-9, atol=1e-9)
 
 
 def test_pairs_are_of_one_track_in_successive_frames_and_of_no_outlier():
