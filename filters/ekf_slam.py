@@ -3,6 +3,9 @@
 The gauge: in world coordinates a joint EKF evaluates the Jacobians of one landmark at ever new estimates, which
 together reduce the variance of its heading, though nothing measures it. Here every Jacobian is taken at first
 estimates, with which global position and heading stay exactly unobservable (Huang, Mourikis & Roumeliotis 2010).
+
+Where residuals of landmarks turn out correlated under white noise, their sightings count for less
+(:mod:`filters.kalman.residual_correlation`).
 """
 
 from functools import partial
@@ -11,6 +14,7 @@ from filters.kalman.inverse_depth import InverseDepthBelief
 from filters.kalman.joint_ekf import JointEkf
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.online_output import OnlineOutput
+from filters.kalman.residual_correlation import LandmarkCorrelation
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
@@ -21,4 +25,5 @@ RULES = {"tracks": "a landmark in its state has no state for the error of its tr
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam)
-    return OnlineOutput(JointEkf(setup, AtFirstEstimates(), belief))
+    correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
+    return OnlineOutput(JointEkf(setup, AtFirstEstimates(), belief, correlation=correlation))

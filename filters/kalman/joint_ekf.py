@@ -16,6 +16,7 @@ from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.online_output import LandmarkMemory
+from filters.kalman.residual_correlation import LandmarkCorrelation
 from filters.kalman.triangulation import triangulate
 from toolkit.arrays import is_among
 from toolkit.estimate import Estimate, Landmarks
@@ -37,7 +38,8 @@ class Correct(Protocol):
 class JointEkf:
     """Propagate, correct pose and landmarks together, forget the landmarks lost, start those new.
 
-    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is found.
+    ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is found, and
+    ``correlation`` what landmarks count for, in full if there is none.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class JointEkf:
         linearisation: Linearisation,
         belief: Callable[[Belief], JointBelief] = JointBelief,
         correct: Correct = joint_landmarks.correct,
+        correlation: LandmarkCorrelation | None = None,
     ) -> None:
         self._rig, self._at, self._correct = setup.rig, linearisation, correct
         self._outliers = setup.settings.outliers
@@ -53,6 +56,7 @@ class JointEkf:
         self._joint = belief(self._motion.initial_belief(setup.prior))
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup)
+        self._correlation = correlation or LandmarkCorrelation(setup.rig, matches=False)
 
     @property
     def joint(self) -> JointBelief:
@@ -64,10 +68,12 @@ class JointEkf:
         propagate(self._joint, self._motion, self._at, self._noise.applied(packet).motion)
         predicted = self._joint.core
         self._joint.clone(packet.index)
-        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
+        gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._correlation.share)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
+        joint = self._joint
+        self._correlation.learn_frame(packet.frame, joint.landmark_ids, joint.points, joint.clones[-1])
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
         return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
@@ -79,7 +85,7 @@ class JointEkf:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the run."""
-        return self._noise.told
+        return self._noise.told + self._correlation.told
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""

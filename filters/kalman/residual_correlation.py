@@ -94,7 +94,7 @@ class LandmarkCorrelation(ResidualCorrelation):
     what the mean of k leaves of the kth is independent of what that of k + 1 leaves of the next.
     """
 
-    _of = "landmarks of the state"
+    _of = "tracks of landmarks in the state"
 
     def __init__(self, rig: StereoRig, matches: bool = True) -> None:
         super().__init__(rig, matches)

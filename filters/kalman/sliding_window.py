@@ -7,11 +7,11 @@ than the window reaches, as a state does in the smoothers. With ``landmarks`` th
 the state, up to that many, for as long as they are seen (Li & Mourikis 2013, "Optimization-based estimator design for
 vision-aided inertial navigation").
 
-Where residuals along tracks turn out correlated under white noise, tracks count for less
-(:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track correct
-with their whole covariance, and a landmark in the state has the error of its track beside it. What is approximated: a
-track that lives on after it was used starts anew at its age, and the error it has come to by then is taken for drawn
-anew.
+Where residuals along tracks turn out correlated under white noise, tracks count for less, and landmarks in the state by
+their own (:mod:`filters.kalman.residual_correlation`). Where the rig states noise of tracks, the sightings of a track
+correct with their whole covariance, and a landmark in the state has the error of its track beside it. What is
+approximated: a track that lives on after it was used starts anew at its age, and the error it has come to by then is
+taken for drawn anew.
 """
 
 import numpy as np
