@@ -30,12 +30,15 @@ _MOST_CORRELATED = 0.98
 _MOST_TOLD = 0.95
 # What chance explains less often, by the stated noise, is an outlier and says nothing of the others.
 SOUND = 0.999
+# Gates, robust weights and linearisation leave residuals of white landmarks correlated, however many there are: by up
+# to 0.07 where there are thousands, on drive, flight and exports of OpenVINS. Tracks that walk are beyond 0.5.
+_LEAST_OF_LANDMARKS = 0.15
 
 
 class ResidualCorrelation:
     """Measures over a run the correlation of a track's residuals from one sighting to the next, if it ``matches``."""
 
-    _of = "tracks"
+    _of, _least = "tracks", 0.0
 
     def __init__(self, rig: StereoRig, matches: bool = True) -> None:
         # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
@@ -44,11 +47,12 @@ class ResidualCorrelation:
 
     @property
     def correlation(self) -> float:
-        """Return the correlation so far, 0 unless it is positive beyond chance."""
+        """Return the correlation so far, 0 unless it is beyond what chance, or the filter, makes of white residuals."""
         if not self._pairs:
             return 0.0
         found = self._products / max(self._squares, np.finfo(float).tiny)
-        return float(min(found, _MOST_CORRELATED)) if found > _STANDARD_ERRORS / np.sqrt(self._pairs) else 0.0
+        chance = max(self._least, _STANDARD_ERRORS / np.sqrt(self._pairs))
+        return float(min(found, _MOST_CORRELATED)) if found > chance else 0.0
 
     @property
     def share(self) -> float:
@@ -90,11 +94,11 @@ class LandmarkCorrelation(ResidualCorrelation):
 
     Such a landmark collects sightings for as long as it is seen, not for a window, and what its track has come to be
     off by stays in it: its residuals are correlated for longer than those of tracks that correct once, and it counts
-    for less. White ones are not correlated at all: a landmark's estimate is then a mean of its sightings so far, and
-    what the mean of k leaves of the kth is independent of what that of k + 1 leaves of the next.
+    for less. White ones are hardly correlated: what an optimal filter leaves of a sighting is its innovation times a
+    gain, and innovations are white.
     """
 
-    _of = "tracks of landmarks in the state"
+    _of, _least = "tracks of landmarks in the state", _LEAST_OF_LANDMARKS
 
     def __init__(self, rig: StereoRig, matches: bool = True) -> None:
         super().__init__(rig, matches)

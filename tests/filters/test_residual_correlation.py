@@ -125,6 +125,12 @@ def test_landmarks_of_the_state_count_for_as_much_as_the_mean_of_their_errors_is
     assert "tracks of landmarks in the state came to count for" in found.told[0]
 
 
+def test_landmarks_whose_residuals_are_hardly_correlated_count_in_full(drive):
+    """A filter leaves residuals of white landmarks correlated by up to 0.07; tracks that walk by more than half."""
+    assert learnt_by_frame(drive.rig, 0.1).share == 1.0
+    assert learnt_by_frame(drive.rig, 0.25).share < 0.8
+
+
 def test_residuals_of_landmarks_are_paired_in_successive_frames(drive):
     every_other = np.add.outer(np.arange(WINDOW), np.arange(TRACKS)) % 2 == 0
     assert learnt_by_frame(drive.rig, 0.9, seen=every_other).correlation == 0.0
