@@ -93,6 +93,23 @@ def test_a_truth_by_another_clock_is_told_with_its_offset(scenario: str, late_s:
     assert float(told[1]) == pytest.approx(-1e3 * late_s, abs=4.0 * float(told[2]) + 2.0)
 
 
+@pytest.mark.parametrize("recording", ["drive", "flight"])
+def test_a_truth_that_leaps_or_is_not_finite_is_told(recording: str, request: pytest.FixtureRequest) -> None:
+    sequence = request.getfixturevalue(recording)
+    truth = truth_of(sequence)
+    for rows, added, told in (
+        (slice(len(truth.t_ns) // 2, None), 30.0, "leaps 1 time(s), the farthest by 30 m"),
+        (slice(20, 21), 1e150, "leaps 2 time(s), the farthest by 1e+150 m"),
+        (slice(20, 23), np.nan, "3 of"),
+    ):
+        T_world_imu = truth.T_world_imu.copy()
+        T_world_imu[rows, 2, 3] += added
+        symptom = with_truth(sequence, replace(truth, T_world_imu=T_world_imu))
+        assert isinstance(symptom, Symptom)
+        assert symptom.warns
+        assert told in symptom.detail
+
+
 def test_a_truth_that_stands_still_is_not_judged(drive: Sequence) -> None:
     truth = truth_of(drive)
     still = np.repeat(truth.T_world_imu[:1], truth.t_ns.size, axis=0)

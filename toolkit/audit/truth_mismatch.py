@@ -36,6 +36,8 @@ MOST_SCALED_OFF = 0.25
 LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
 # A vehicle that fills the view turns vision alone, but not for a third of the time.
 LEAST_TURNING = 1.0 / 3.0
+# From one true pose to the next: so far (m) and so many times the usual speed (m/s) is no motion.
+LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
 # An offset of the truth's clock beyond so many standard errors and so much (s) counts.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
@@ -49,7 +51,26 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
-    return _by_another_clock(evidence, truth) or _compared_with(evidence, truth)
+    return _broken(truth) or _by_another_clock(evidence, truth) or _compared_with(evidence, truth)
+
+
+def _broken(truth: Truth) -> Symptom | None:
+    """Tell of poses that are not finite, or between which nothing can have moved: a reset, a flipped bit."""
+    finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
+    if not finite.all():
+        return _told(f"{int((~finite).sum())} of {finite.size} true poses are not finite", "leave them out of the file")
+    step_s = np.maximum(np.diff(truth.t_ns), 1) / NS_PER_S
+    step_m = np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1)
+    usual_mps = float(np.quantile(step_m / step_s, 0.9))
+    leaps = (step_m > LEAST_LEAP_M) & (step_m / step_s > max(LEAP * usual_mps, LEAST_LEAP_MPS))
+    if not leaps.any():
+        return None
+    row = int(np.argmax(np.where(leaps, step_m, 0.0)))
+    at_s = (truth.t_ns[row] - truth.t_ns[0]) / NS_PER_S
+    return _told(
+        f"the truth leaps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
+        "cut it there, or leave the pose out: every position error holds the leap",
+    )
 
 
 def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | None:
