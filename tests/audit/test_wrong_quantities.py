@@ -176,3 +176,11 @@ def test_a_camera_that_freezes_for_longer_than_tracks_last_is_named(scenario: st
     finding = found(frozen)["stale-frames"]
     assert finding.blocking
     assert finding.count == repeats
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2.0])
+def test_a_focal_length_of_the_rows_unlike_that_of_the_columns_is_named(factor: float) -> None:
+    flight = simulate(replace(SCENARIOS["flight"], duration_s=6.0), 4)
+    finding = found(replace(flight, rig=replace(flight.rig, fy_px=factor * flight.rig.fy_px)))["intrinsics"]
+    assert finding.blocking
+    assert "beside fx_px" in finding.detail
