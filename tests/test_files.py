@@ -91,3 +91,33 @@ def test_a_signal_waits_until_something_is_in_its_place() -> None:
         signal.raise_signal(signal.SIGINT)
         done = True
     assert done
+
+
+@pytest.mark.parametrize(
+    ("theirs", "ours", "told"),
+    [
+        ("what I must not forget", "<!doctype html>", True),
+        ("what I must not forget", "0.0 1 2 3", True),
+        ('{"focal": 500}', "<!doctype html>", True),
+        ("0.1 1 2 3", "# t x y z\n0.0 1 2 3", False),
+        ("<!doctype html><p>earlier", "<!doctype html>", False),
+        ("", "<!doctype html>", False),
+    ],
+)
+def test_a_file_is_replaced_by_a_later_version_of_itself_alone(
+    tmp_path: Path, theirs: str, ours: str, told: bool
+) -> None:
+    target = tmp_path / "file"
+    target.write_text(theirs)
+
+    def write() -> None:
+        with replaced_file(target) as partial:
+            partial.write_text(ours)
+
+    if told:
+        with pytest.raises(OutputError, match="a file of another kind, which would be lost"):
+            write()
+    else:
+        write()
+    assert target.read_text() == (theirs if told else ours)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -24,6 +24,9 @@ Owner = Callable[[Path], Collection[str]]
 # What asks a program to end; one that comes while something is put in its place waits until that is done.
 _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
+# What a table of numbers may begin with: a comment, a sign, a digit.
+_OF_TABLES = tuple(c.encode() for c in "#+-.0123456789")
+
 
 def check_replaceable(target: Path, owner: Owner) -> None:
     """Raise OutputError unless ``target`` can be created, or is a directory that holds nothing but files of ours."""
@@ -144,8 +147,8 @@ def replaced_directory(target: Path, owner: Owner) -> Iterator[Path]:
 def replaced_file(target: Path) -> Iterator[Path]:
     """Give a file to write to; on success it takes ``target``'s place, on any failure it is removed.
 
-    Of a link the file it points to is replaced. Raises OutputError where the place is taken by a directory, a device
-    or a pipe, or cannot be written.
+    Of a link the file it points to is replaced. Raises OutputError where the place is taken by a directory, a device,
+    a pipe or a file of another kind than is written, or cannot be written.
     """
     place = Path(os.path.realpath(target))
     partial = _beside(place, "partial")
@@ -154,6 +157,7 @@ def replaced_file(target: Path) -> Iterator[Path]:
         with _parents_of(place):
             try:
                 yield partial
+                _check_kind(target, place, partial)
                 partial.replace(place)
             finally:
                 with suppress(OSError):
@@ -183,6 +187,22 @@ def check_file(target: Path) -> None:
         raise OutputError(f"{target} is a directory; name a file in it")
     if target.exists() and not target.is_file():
         raise OutputError(f"{target} is a device or a pipe, and files are written whole; name a regular file")
+
+
+def _check_kind(target: Path, place: Path, written: Path) -> None:
+    """Raise OutputError where a file stands at a place that what was written is no later version of."""
+    there = _kind(place) if place.exists() else ""
+    if there and there != _kind(written):
+        raise OutputError(f"{target} is a file of another kind, which would be lost; name another file")
+
+
+def _kind(path: Path) -> str:
+    """Tell pages, JSON, archives, tables of numbers and other files apart by how they begin; empty ones are none."""
+    with path.open("rb") as file:
+        beginning = file.read(64).lstrip()
+    kinds = {b"<": "page", b"{": "JSON", b"PK": "archive", **dict.fromkeys(_OF_TABLES, "table")}
+    known = (kind for begins, kind in kinds.items() if beginning.startswith(begins))
+    return next(known, "other" if beginning else "")
 
 
 class LineFile:

@@ -1,5 +1,6 @@
 """A truth of another motion or scale, and an IMU's noise that its samples refute: told where planted, nowhere else."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -75,6 +76,38 @@ def test_a_truth_of_another_flight_is_told(flight: Sequence) -> None:
     found = with_truth(flight, Truth(stamps, poses))
     assert isinstance(found, Symptom)
     assert "the truth's motion is not the camera's" in found.detail
+
+
+@pytest.mark.parametrize("late_s", [0.05, -0.2, 0.5])
+@pytest.mark.parametrize("scenario", ["flight", "drive", "drive-imu"])
+def test_a_truth_by_another_clock_is_told_with_its_offset(scenario: str, late_s: float) -> None:
+    sequence = simulate(replace(SCENARIOS[scenario], duration_s=12.0), 5)
+    truth = truth_of(sequence)
+    late = replace(truth, t_ns=truth.t_ns + round(late_s * NS_PER_S))
+    symptom = with_truth(sequence, late)
+    assert isinstance(symptom, Symptom)
+    assert symptom.warns
+    told = re.search(r"the truth's stamps are shifted by (\S+) \+- (\S+) ms", symptom.detail)
+    assert told is not None
+    # Printed in whole milliseconds, with an error of less than one as 0.
+    assert float(told[1]) == pytest.approx(-1e3 * late_s, abs=4.0 * float(told[2]) + 2.0)
+
+
+@pytest.mark.parametrize("recording", ["drive", "flight"])
+def test_a_truth_that_leaps_or_is_not_finite_is_told(recording: str, request: pytest.FixtureRequest) -> None:
+    sequence = request.getfixturevalue(recording)
+    truth = truth_of(sequence)
+    for rows, added, told in (
+        (slice(len(truth.t_ns) // 2, None), 30.0, "leaps 1 time(s), the farthest by 30 m"),
+        (slice(20, 21), 1e150, "leaps 2 time(s), the farthest by 1e+150 m"),
+        (slice(20, 23), np.nan, "3 of"),
+    ):
+        T_world_imu = truth.T_world_imu.copy()
+        T_world_imu[rows, 2, 3] += added
+        symptom = with_truth(sequence, replace(truth, T_world_imu=T_world_imu))
+        assert isinstance(symptom, Symptom)
+        assert symptom.warns
+        assert told in symptom.detail
 
 
 def test_a_truth_that_stands_still_is_not_judged(drive: Sequence) -> None:

@@ -160,3 +160,27 @@ def test_frames_by_another_clock_altogether_are_not_cut_off_to_nothing() -> None
     finding = found(replace(drive(), frames_t_ns=drive().frames_t_ns // 1000))["outside-motion"]
     assert finding.blocking
     assert "stamp both by one clock" in finding.detail
+
+
+@pytest.mark.parametrize("begin, end", [(0.0, 0.3), (0.2, 0.8), (0.6, 1.0)], ids=["beginning", "middle", "end"])
+@pytest.mark.parametrize("scenario", ["drive", "flight"])
+def test_a_camera_that_freezes_for_longer_than_tracks_last_is_named(scenario: str, begin: float, end: float) -> None:
+    sequence = simulate(replace(SCENARIOS[scenario], duration_s=8.0), 4)
+    first, last = (int(share * (sequence.frame_count - 1)) for share in (begin, end))
+    seen = sequence.observations
+    here, rest = np.flatnonzero(seen.frame == first), np.flatnonzero((seen.frame <= first) | (seen.frame > last))
+    repeats = last - first
+    rows = np.concatenate([rest, np.tile(here, repeats)])
+    frame = np.concatenate([seen.frame[rest], np.repeat(np.arange(first + 1, last + 1), here.size)])
+    frozen = replace(sequence, observations=Observations.sorted(frame, seen.track_id[rows], seen.uv_px[rows]))
+    finding = found(frozen)["stale-frames"]
+    assert finding.blocking
+    assert finding.count == repeats
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2.0])
+def test_a_focal_length_of_the_rows_unlike_that_of_the_columns_is_named(factor: float) -> None:
+    flight = simulate(replace(SCENARIOS["flight"], duration_s=6.0), 4)
+    finding = found(replace(flight, rig=replace(flight.rig, fy_px=factor * flight.rig.fy_px)))["intrinsics"]
+    assert finding.blocking
+    assert "beside fx_px" in finding.detail

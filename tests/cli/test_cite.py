@@ -75,7 +75,7 @@ def test_what_is_unknown_is_told_in_one_line(tmp_path, monkeypatch, capsys, text
     monkeypatch.chdir(tmp_path)
     if text is not None:
         Path("mine.py").write_text(text)
-    assert main(["cite", "mscf" if text is None else "mine.py"]) == 1
+    assert main(["cite", "mscf" if text is None else "mine.py"]) == 5
     said = capsys.readouterr().err
     assert told in said
     assert said.count("\n") == 1

@@ -131,3 +131,17 @@ def test_a_recording_without_noise_is_named(vislam: Vislam, one_line: OneLine) -
     assert vislam("compare", "exact", "--estimators", "dead-reckoning", "--out", "run") == 3
     assert "noise.gyro_noise_density is 0, expected a positive number" in one_line()
     assert not Path("run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [(("report",), 3), (("diff", "run"), 3), (("export", "--format", "tum", "--out", "e.tum"), 3), (("cite",), 5)],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_a_name_too_long_for_the_system_is_no_run_directory(
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], status: int
+) -> None:
+    Path("run").mkdir()
+    (Path("run") / "metrics.json").write_text("{}")
+    assert vislam(words[0], "n" * 300, *words[1:]) == status
+    assert "is not a directory; give a run directory" in (told := one_line()) or "or name a run directory" in told

@@ -20,7 +20,7 @@ MOST_PX, MOST_MPS, MOST_MPS2, MOST_RADPS = 1e5, 1e3, 1e4, 1e3
 # Beyond what any vehicle's velocity and rate of rotation change by (m/s^2, rad/s^2): ten times gravity, and as much.
 MOST_CHANGE = 100.0
 # A single sample of an accelerometer and a gyro that is off its neighbours by more is no knock (m/s^2, rad/s).
-MOST_STEP = np.repeat([500.0, 50.0], 3)
+MOST_STEP = np.repeat([500.0, 10.0], 3)
 # Noise may step further where samples come fast: single ones are beyond this many standard deviations of such steps.
 BEYOND_STEPS = 20.0
 # A unit makes all samples too large; single ones are beyond this many times the median.

@@ -26,6 +26,8 @@ USUAL = 1.5
 # Share by which other intrinsics must lower the tracks' residual: 0.15 and more where the point is off by half a view.
 LEAST_GAIN = 0.05
 TRIED_FRAMES = 300
+# Pixels are square but for a rescaled image's.
+MOST_STRETCHED = 1.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -83,6 +85,9 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
         usual_px = width_px / USUAL
         words = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
         found.append(({"fx_px": usual_px, "fy_px": usual_px}, words))
+    elif not 1.0 / MOST_STRETCHED < rig.fy_px / rig.fx_px < MOST_STRETCHED:
+        words = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are not square by far"
+        found.append(({"fy_px": rig.fx_px}, words))
     return found
 
 

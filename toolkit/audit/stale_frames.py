@@ -2,7 +2,7 @@
 
 From such a frame on each track follows a different scene point: its steps before and after agree with the
 motion, the step into the stale frame is zero. A standing camera repeats pixels too, and that is no fault: the
-image must have been moving just before and just after.
+image must have been moving just before and just after or, at the ends of a recording, the samples must say so.
 """
 
 from dataclasses import replace
@@ -10,9 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.parts.intervals import interval_means, is_comparable
 from toolkit.audit.parts.tracks import by_track, split
 from toolkit.geometry import Array, BoolArray
 from toolkit.models.camera_motion import Neighbours, neighbours
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 
 # Share of a frame's surviving tracks that must repeat. Measured: in the recordings at hand it is 1 in a stale
@@ -23,6 +25,8 @@ LEAST_TRACKS = 4
 # Upper quartile of the pixel steps above which the camera moves (far points hardly move). Measured: at least 0.96 px
 # beside a stale frame, at most 0.05 px with the vehicle parked.
 MOVING_PX = 0.5
+# By the samples it moves where they turn the image by more from frame to frame, which no gyro's bias does, or drive.
+TURNING_PX, DRIVING_MPS = 2.0, 1.0
 
 
 def check(evidence: Evidence) -> Symptom | None:
@@ -31,7 +35,7 @@ def check(evidence: Evidence) -> Symptom | None:
     pairs = neighbours(sequence.observations)
     moved_px = np.abs(sequence.observations.uv_px[pairs.after] - sequence.observations.uv_px[pairs.before])
     step_px = np.where(np.isnan(moved_px[:, 1]), moved_px[:, [0, 2]].max(axis=1), moved_px.max(axis=1))
-    stale = _stale_intervals(max(sequence.frame_count - 1, 0), pairs, step_px)
+    stale = _stale_intervals(max(sequence.frame_count - 1, 0), pairs, step_px, _moving_by_samples(sequence))
     count = int(stale.sum())
     if count == 0:
         return None
@@ -48,8 +52,20 @@ def check(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array) -> BoolArray:
-    """Say of each interval whether its tracks stand still between moving ones."""
+def _moving_by_samples(sequence: Sequence) -> BoolArray:
+    """Say of each interval (K - 1,) whether the samples turn the image by pixels, or move the vehicle fast."""
+    if sequence.motion_kind == "none" or not is_comparable(sequence):
+        return np.zeros(max(sequence.frame_count - 1, 0), dtype=bool)
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
+    step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
+    turning = sequence.rig.fx_px * np.linalg.norm(mean[:, 3:], axis=1) * step_s > TURNING_PX
+    return np.asarray(
+        turning | ((sequence.motion_kind == "twist") & (np.linalg.norm(mean[:, :3], axis=1) > DRIVING_MPS))
+    )
+
+
+def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array, moving_by_samples: BoolArray) -> BoolArray:
+    """Say of each interval whether its tracks stand still between moving ones, or at an end while the samples move."""
     survivors = np.bincount(pairs.interval, minlength=intervals)
     repeats = np.bincount(pairs.interval[step_px == 0.0], minlength=intervals)
     frozen = (repeats >= LEAST_SHARE * survivors) & (survivors >= LEAST_TRACKS)
@@ -59,8 +75,10 @@ def _stale_intervals(intervals: int, pairs: Neighbours, step_px: Array) -> BoolA
     index, shows_nothing = np.arange(intervals), frozen | (survivors < LEAST_TRACKS)
     before = np.maximum.accumulate(np.where(shows_nothing, -1, index))
     after = np.minimum.accumulate(np.where(shows_nothing, intervals, index)[::-1])[::-1]
-    moving_or_end = np.concatenate([moving, [False]])  # index -1 and index `intervals` both read False
-    stale: BoolArray = frozen & moving_or_end[before] & moving_or_end[after]
+    stays = np.concatenate([moving, [False]])  # index -1 and index `intervals` both read False
+    moves_before = np.where(before < 0, moving_by_samples, stays[before])
+    moves_after = np.where(after == intervals, moving_by_samples, stays[after])
+    stale: BoolArray = frozen & moves_before & moves_after
     return stale
 
 

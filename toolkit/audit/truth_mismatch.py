@@ -2,9 +2,11 @@
 
 Over windows of time the camera's own displacement and turn, chained from frame to frame, are held against those of the
 truth. Vision's steps are too long or too short where the baseline or the focal length is wrong, or the truth is in
-another unit; they go elsewhere where the truth is another recording's, runs backwards or is in other axes.
+another unit; they go elsewhere where the truth is another recording's, runs backwards or is in other axes. Where it is
+of this motion, the camera turns as it does, but for an offset of its clock.
 """
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,8 +14,9 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.alignment import chained
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable, moved_by
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, is_comparable, moved_by
 from toolkit.audit.parts.robust import chance_sigmas, median_error
+from toolkit.audit.time_offset import camera_offset
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
@@ -33,6 +36,10 @@ MOST_SCALED_OFF = 0.25
 LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
 # A vehicle that fills the view turns vision alone, but not for a third of the time.
 LEAST_TURNING = 1.0 / 3.0
+# From one true pose to the next: so far (m) and so many times the usual speed (m/s) is no motion.
+LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
+# An offset of the truth's clock beyond so many standard errors and so much (s) counts.
+OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
 
@@ -44,6 +51,29 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
+    return _broken(truth) or _by_another_clock(evidence, truth) or _compared_with(evidence, truth)
+
+
+def _broken(truth: Truth) -> Symptom | None:
+    """Tell of poses that are not finite, or between which nothing can have moved: a reset, a flipped bit."""
+    finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
+    if not finite.all():
+        return _told(f"{int((~finite).sum())} of {finite.size} true poses are not finite", "leave them out of the file")
+    step_s = np.maximum(np.diff(truth.t_ns), 1) / NS_PER_S
+    step_m = np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1)
+    usual_mps = float(np.quantile(step_m / step_s, 0.9))
+    leaps = (step_m > LEAST_LEAP_M) & (step_m / step_s > max(LEAP * usual_mps, LEAST_LEAP_MPS))
+    if not leaps.any():
+        return None
+    row = int(np.argmax(np.where(leaps, step_m, 0.0)))
+    at_s = (truth.t_ns[row] - truth.t_ns[0]) / NS_PER_S
+    return _told(
+        f"the truth leaps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
+        "cut it there, or leave the pose out: every position error holds the leap",
+    )
+
+
+def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | None:
     both = _windows(evidence, truth)
     moved, turned = _moving(both.displaced_m, LEAST_MOVED_M), _moving(both.turned_rad, LEAST_TURNED_RAD)
     if moved.sum() < LEAST_WINDOWS:
@@ -67,6 +97,30 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
         return None
     return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's", _WHERE)
+
+
+def _by_another_clock(evidence: Evidence, truth: Truth) -> Symptom | None:
+    """Tell of a truth that turns as the camera does at other times: its rates take the place of the gyro's."""
+    sequence, camera = evidence.sequence, evidence.camera_motion
+    step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
+    in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
+    if sequence.motion_kind == "none" or not in_order:
+        return None
+    R_world_imu = truth.T_world_imu[:, :3, :3]
+    w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+    middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
+    turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
+    as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
+    rows = np.flatnonzero(camera.known)
+    seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
+    found = camera_offset(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
+    if found is None or abs(found.value) < max(LEAST_OFFSET_S, OFFSET_SIGMAS * found.error):
+        return None
+    return _told(
+        f"the camera turns as the truth does when the truth's stamps are shifted by {-1e3 * found.value:.0f} +- "
+        f"{1e3 * found.error:.0f} ms",
+        "stamp both by one clock: every position error holds the way that is gone in that time",
+    )
 
 
 def _told(detail: str, treatment: str) -> Symptom:

@@ -4,6 +4,7 @@ An entry of ``CITES`` is a key of references.bib beside this file, or BibTeX its
 file. Nothing is imported to read it.
 """
 
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from toolkit import datasets
 from toolkit.discovery import FoundModule, shown_name
-from toolkit.errors import VislamError, no_such
+from toolkit.errors import EstimatorError, no_such
 from toolkit.estimator import discover
 from toolkit.report.records import read_manifest
 from toolkit.report.run_directory import MANIFEST
@@ -38,7 +39,7 @@ class Cited:
 def citations(names: Iterable[str]) -> tuple[Cited, ...]:
     """Return what to cite for estimators, formats, files of estimators and run directories; for all without names.
 
-    Raises VislamError for a name nobody knows or a key that references.bib does not have, DataError for a directory
+    Raises EstimatorError for a name nobody knows or a key that references.bib does not have, DataError for a directory
     that is no run's.
     """
     known = _known()
@@ -73,8 +74,8 @@ def _meant(name: str, known: Mapping[str, FoundModule]) -> list[tuple[str, Found
     path = Path(name)
     if path.suffix == ".py" and path.is_file():
         return [(shown_name(path.stem), FoundModule(path.stem, path))]
-    if not path.is_dir():
-        raise VislamError(f"{no_such('estimator or format', name, known)}, or name a run directory")
+    if not name or not os.path.isdir(name):  # noqa: PTH112 - a name that is too long is no directory either
+        raise EstimatorError(f"{no_such('estimator or format', name, known)}, or name a run directory")
     manifest = read_manifest(path / MANIFEST)
     inside = (*manifest.estimators, manifest.sequence.format)
     return [(one, known[one]) for one in inside if one in known]
@@ -90,7 +91,7 @@ def _entries(module: FoundModule) -> dict[str, str]:
         elif text in references():
             found[text] = references()[text]
         else:
-            raise VislamError(f"{module.path}: {no_such('reference', text, references())}; or give BibTeX, @...")
+            raise EstimatorError(f"{module.path}: {no_such('reference', text, references())}; or give BibTeX, @...")
     return found
 
 
