@@ -29,8 +29,8 @@ from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 CITES = ("dellaert2017factor", "gtsam")
-RUNG, CHANGE = 120, "+ the future; all relinearised to convergence, outliers cut after a schedule"
-RULES = {"window": "it keeps every state", "disparity_scale": True, "bridge_gaps": True}
+RUNG, CHANGE = 120, "+ all relinearised to convergence, in the end: Huber, Cauchy, cut; IMU as stated"
+RULES = {"window": "it keeps every state", "disparity_scale": True, "bridge_gaps": True, "match_tracks": True}
 DEFAULT = True
 
 

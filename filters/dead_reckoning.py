@@ -8,6 +8,7 @@ from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
 RUNG, CHANGE = 0, "the measured motion alone"
+RULES = {"match_tracks": True}
 DEFAULT = True
 
 

@@ -14,7 +14,7 @@ from toolkit.models.motion import motion_model
 from toolkit.sequence import Packet
 
 CITES = ("kang_vislam",)
-RUNG, CHANGE = 20, "+ gate and loss, landmark noise in the innovation, biases; the pose before the map"
+RUNG, CHANGE = 20, "+ gate and loss, biases; pose before map, each with the other's uncertainty as noise"
 RULES = {"tracks": "each landmark is a Gaussian of its own, without a state for the error of its track"}
 DEFAULT = True
 

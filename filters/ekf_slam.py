@@ -14,7 +14,7 @@ from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
 
 CITES = ("smith1990estimating", "huang2010observability")
-RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, landmarks along inverse depth"
+RUNG, CHANGE = 30, "+ cross-covariances, first-estimate Jacobians, inverse depth, IMU matched; no loss"
 RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
 
 

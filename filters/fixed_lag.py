@@ -28,8 +28,8 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 90, "+ relinearisation, every sighting kept at once, every landmark a variable"
-RULES = {"bridge_gaps": True}
+RUNG, CHANGE = 90, "+ relinearisation; each sighting kept at once, all landmarks; fourfold gate and loss"
+RULES = {"bridge_gaps": True, "match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:

@@ -31,8 +31,8 @@ from toolkit.models.motion import state_cov
 from toolkit.sequence import Packet
 
 CITES = ("kaess2012isam2", "gtsam")
-RUNG, CHANGE = 110, "+ every state and landmark kept as variables; one step a frame, old ones frozen"
-RULES = {"window": "it keeps every state", "bridge_gaps": True}
+RUNG, CHANGE = 110, "+ every state and landmark a variable, bridge; one step a frame, old ones frozen"
+RULES = {"window": "it keeps every state", "bridge_gaps": True, "match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:

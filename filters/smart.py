@@ -32,7 +32,8 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("carlone2014eliminating", "forster2017manifold", "gtsam")
-RUNG, CHANGE = 100, "+ landmarks eliminated at every iteration, of several; none outlives the window"
+RUNG, CHANGE = 100, "+ landmarks eliminated at each of several iterations, gone with window; no bridge"
+RULES = {"match_tracks": True}
 
 
 def build(setup: Setup) -> Estimator:

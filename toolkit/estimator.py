@@ -28,8 +28,15 @@ ENTRY_POINT_GROUP = "toolkit.estimators"
 # Among the names of estimators to compare, this word stands for all that have a rung.
 LADDER = "ladder"
 # Settings that are meant for all estimators, and whether one obeys them whose module says nothing of them: the outlier
-# policy, the window, the stated noise of tracks, and two parts of the noise model that few estimators have.
-RULES = {"outliers": True, "window": True, "tracks": True, "disparity_scale": False, "bridge_gaps": False}
+# policy, the window, the stated noise of tracks, and parts of the noise model that not all estimators have.
+RULES = {
+    "outliers": True,
+    "window": True,
+    "tracks": True,
+    "disparity_scale": False,
+    "bridge_gaps": False,
+    "match_tracks": False,
+}
 
 
 @dataclass(frozen=True, eq=False)

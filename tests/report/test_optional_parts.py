@@ -5,7 +5,8 @@ from dataclasses import replace
 import msgspec
 
 from toolkit.estimator import find_all
-from toolkit.experiment.pipeline import lacking, to_bridge
+from toolkit.experiment.pipeline import decisive_parts, lacking, to_bridge
+from toolkit.experiment.recording import Recording, prepare
 from toolkit.report.messages import note_lines, rules_line
 from toolkit.settings import DEFAULTS, Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate
@@ -17,10 +18,19 @@ SCALE_ALONE = Noise(disparity_scale=0.02, bridge_gaps=False)
 
 def test_who_has_no_such_part_is_found_by_what_estimators_say_of_themselves():
     entries = find_all(["ekf", "fixed-lag", "batch", "msckf-slam"])
-    without_bridge = {"bridge_gaps": ("ekf",)}
-    assert lacking(entries, DEFAULTS.noise, True) == without_bridge
-    assert lacking(entries, BOTH, True) == {"disparity_scale": ("ekf", "fixed-lag", "msckf-slam")} | without_bridge
-    assert lacking(entries, DEFAULTS.noise, False) == lacking(entries, Noise(bridge_gaps=False), True) == {}
+    everything = frozenset({"disparity_scale", "bridge_gaps", "match_tracks"})
+    without = {"bridge_gaps": ("ekf",), "match_tracks": ("ekf",)}
+    assert lacking(entries, DEFAULTS.noise, everything) == without
+    assert lacking(entries, BOTH, everything) == {"disparity_scale": ("ekf", "fixed-lag", "msckf-slam")} | without
+    assert lacking(entries, DEFAULTS.noise, frozenset()) == {}
+    assert lacking(entries, Noise(bridge_gaps=False, match_tracks=False), everything) == {}
+
+
+def test_where_the_audit_found_correlated_tracks_those_who_take_them_for_white_are_named():
+    white, realistic = (prepare(Recording(name, max_frames=40)) for name in ("drive", "drive-realistic"))
+    entries = find_all(["dead-reckoning", "ekf", "ekf-slam", "msckf", "smart"])
+    assert "match_tracks" not in lacking(entries, DEFAULTS.noise, decisive_parts(white))
+    assert lacking(entries, DEFAULTS.noise, decisive_parts(realistic))["match_tracks"] == ("ekf", "ekf-slam")
 
 
 def test_gaps_are_bridged_between_measured_twists_only():

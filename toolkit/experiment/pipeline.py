@@ -282,7 +282,7 @@ def _comparison(
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
         white={} if sequence.rig.track_noise is None else _told_white(entries),
-        lacking=lacking(entries, plan.settings.noise, to_bridge(sequence)),
+        lacking=lacking(entries, plan.settings.noise, decisive_parts(case.prepared)),
         settings=plan.settings,
         workers=workers,
         undecided=case.prepared.undecided,
@@ -295,14 +295,24 @@ def _told_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
 
-def lacking(entries: Mapping[str, EstimatorEntry], noise: Noise, to_bridge: bool) -> dict[str, tuple[str, ...]]:
-    """Return, for each optional part of the noise model that is asked for, the estimators that do without.
-
-    ``to_bridge`` says whether there is a gap that could be bridged.
-    """
-    asked = {"disparity_scale": noise.disparity_scale is not None, "bridge_gaps": noise.bridge_gaps and to_bridge}
+def lacking(
+    entries: Mapping[str, EstimatorEntry], noise: Noise, decisive: frozenset[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return, for each optional part of the noise model that is asked for and decisive, the estimators without it."""
+    asked = {
+        "disparity_scale": noise.disparity_scale is not None,
+        "bridge_gaps": noise.bridge_gaps,
+        "match_tracks": noise.match_tracks,
+    }
     parts = {part: tuple(name for name, entry in entries.items() if not entry.obeys(part)) for part in asked}
-    return {part: names for part, names in parts.items() if asked[part] and names}
+    return {part: names for part, names in parts.items() if asked[part] and part in decisive and names}
+
+
+def decisive_parts(prepared: Prepared) -> frozenset[str]:
+    """Return the optional parts of the noise model without which answers on a recording may be others."""
+    correlated = any(finding.fault == "correlated-tracks" for finding in prepared.findings)
+    known = {"disparity_scale": True, "bridge_gaps": to_bridge(prepared.sequence), "match_tracks": correlated}
+    return frozenset(part for part, decides in known.items() if decides)
 
 
 def to_bridge(sequence: Recorded) -> bool:

@@ -148,7 +148,11 @@ def outcome(finding: Finding) -> str:
     return "warning" if finding.warning else "for information"
 
 
-_PARTS = {"disparity_scale": "a scale of the disparities", "bridge_gaps": "a bridge where no track leads on"}
+_PARTS = {
+    "disparity_scale": "a scale of the disparities",
+    "bridge_gaps": "a bridge where no track leads on",
+    "match_tracks": "a smaller weight for tracks whose errors are correlated",
+}
 
 
 def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
