@@ -4,13 +4,16 @@ A scenario is a fault of toolkit.simulation.faults in a stretch of a simulated r
 away. The recording is audited and run as a user would; then the truth is put back for the error: the RMS of the
 position after an alignment, of the causal answer where there is one. A run is bad where its error is above three times
 that of the same estimator on the sound recording, or where it has none. A run says so where it is not ok, is marked
-overconfident or contradicted, where a note says that its gate refused much or that it explains withheld tracks worse
-than dead reckoning, or where the audit found something in its recording, repaired or not; faults that could not be
-judged do not count. In a sound recording all of that is a false alarm, and so is the mark timid.
+overconfident or contradicted, where a note says that its gate refused much, that it explains withheld tracks worse
+than dead reckoning, that it parts from the measured motion or rests on a motion that others dispute, or where the audit
+found something in its recording, repaired or not; faults that could not be judged do not count. In a sound recording
+all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
 thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`,
-`fourth` and `fifth` are draws of others yet, with one recording drawn for every fault.
+`fourth`, `fifth` and `sixth` are draws of others yet, with one recording drawn for every fault; in `sixth` the faults
+meet other estimators. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all
+together and two by two, as they meet faults, and what any of these comparisons says is a false alarm.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
@@ -23,7 +26,7 @@ import json
 import pickle
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Sized
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -33,9 +36,10 @@ import numpy as np
 
 from toolkit.errors import VislamError
 from toolkit.estimate import Output, Run, Status
-from toolkit.experiment.comparison import consistency_of
+from toolkit.experiment.comparison import Row, consistency_of
+from toolkit.experiment.disagreement import Dispute
 from toolkit.experiment.recording import Prepared, Recording, prepare
-from toolkit.experiment.units import Unit, outcome_of, run_estimator
+from toolkit.experiment.units import OUTPUTS, Outcome, Unit, outcome_of, run_estimator
 from toolkit.metrics import Evaluation, ate, score_run
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
@@ -84,11 +88,13 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth")
-DRAWN = ("fresh", "again", "third", "fourth", "fifth")
+HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth", "sixth")
+DRAWN = HALVES[2:]
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
-# The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns.
+# The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns, the
+# cheap ones after so many of them.
+PASSED_OVER = {"sixth": 4}
 CHEAP = ("dead-reckoning", "ekf", "ekf-slam", "mapping", "msckf", "msckf-fej", "msckf-slam", "riekf", "seed-ekf")
 DEAR = ("batch", "fixed-lag", "smart", "isam2", "batch", "fixed-lag", "smart", "iekf")
 SOUND = ""
@@ -122,7 +128,7 @@ def scenarios(half: str) -> list[Scenario]:
         for j, recording in enumerate(LENGTH_S):
             if (j == drawn[i]) if half in DRAWN else (i + j) % 2 == HALVES.index(half):
                 count = len(faulty)
-                cheap = (CHEAP[(2 * count + k) % len(CHEAP)] for k in range(2))
+                cheap = _neighbours(2 * count + PASSED_OVER.get(half, 0))
                 dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 else ()
                 seed = first_seed + (count // len(LENGTH_S)) % FAULTY_STRETCHES
                 faulty.append(Scenario(recording, seed, fault, (*cheap, *dear)))
@@ -133,6 +139,17 @@ def scenarios(half: str) -> list[Scenario]:
             dear = sorted({name for one in here for name in one.estimators} - set(CHEAP))
             sound.append(Scenario(recording, first_seed + k, SOUND, (*CHEAP, *dear)))
     return sound + faulty
+
+
+def _neighbours(first: int) -> tuple[str, str]:
+    """Return two of the cheap estimators, which take turns."""
+    return CHEAP[first % len(CHEAP)], CHEAP[(first + 1) % len(CHEAP)]
+
+
+def comparisons(scenario: Scenario) -> list[tuple[str, ...]]:
+    """Return the estimators that are compared with each other; in a sound stretch every two that meet faults, too."""
+    two_by_two = [_neighbours(first) for first in range(len(CHEAP))] if scenario.fault == SOUND else []
+    return [scenario.estimators, *two_by_two]
 
 
 @dataclass(frozen=True)
@@ -151,11 +168,12 @@ class Ended:
     log: Sequence[str] = ()
     refuses: bool = False
     harms: bool = False
+    disputes: bool = False
 
     @property
     def is_told(self) -> bool:
-        """Say whether its status, its mark, a note on its gate or withheld tracks, or the audit tells of a fault."""
-        by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms
+        """Say whether its status, its mark, a note, or the audit tells of a fault."""
+        by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms or self.disputes
         return bool(self.found) or self.status != "ok" or by_mark or by_notes
 
     @property
@@ -208,6 +226,8 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
     if recorded is None:
         return
     prepared = _unless_refused(partial(prepare, Recording(replace(recorded, truth=None))))
+    rows = dict[str, list[Row]]()
+    lines = dict[str, Ended]()
     for name in scenario.estimators:
         run = prepared
         if isinstance(prepared, Prepared):
@@ -215,9 +235,20 @@ def ended(half: str, scenario: Scenario, keep: Path | None) -> Iterator[Ended]:
             run = _unless_refused(partial(_run, name, prepared, kept))
         one = Ended(half, scenario.recording, scenario.seed, scenario.fault, name)
         if isinstance(run, str):
-            yield replace(one, status="refused", log=(run,))
+            lines[name] = replace(one, status="refused", log=(run,))
         elif isinstance(run, Run) and isinstance(prepared, Prepared):
-            yield _scored(one, run, prepared, replace(prepared.sequence, truth=recorded.truth))
+            outcome = outcome_of(run, prepared.sequence, 0)
+            rows[name] = [row for row in (Row(output, (outcome,)) for output in OUTPUTS) if not row.repeats_causal]
+            lines[name] = _scored(one, run, outcome, prepared, replace(prepared.sequence, truth=recorded.truth))
+    disputing = {name for names in comparisons(scenario) for name in _who_disputes(rows, names)}
+    for name, line in lines.items():
+        yield replace(line, disputes=name in disputing)
+
+
+def _who_disputes(rows: Mapping[str, Sequence[Row]], names: Sequence[str]) -> set[str]:
+    """Return of the estimators of a comparison who parts from the measured motion, or rests on one in doubt."""
+    dispute = Dispute.of(row for name in names for row in rows.get(name, ()))
+    return {one.row.estimator for one in dispute.parted} | set(dispute.alone if dispute.doubts_motion else ())
 
 
 def _unless_refused(make: Callable[[], Result]) -> Result | str:
@@ -241,8 +272,8 @@ def _run(name: str, prepared: Prepared, kept: Path | None) -> Run:
     return run
 
 
-def _scored(one: Ended, run: Run, prepared: Prepared, with_truth: Recorded) -> Ended:
-    scored = list(outcome_of(run, prepared.sequence, 0).outputs.values())
+def _scored(one: Ended, run: Run, outcome: Outcome, prepared: Prepared, with_truth: Recorded) -> Ended:
+    scored = list(outcome.outputs.values())
     verdicts = [found.verdict for found in map(consistency_of, ([output] for output in scored)) if found is not None]
     return replace(
         one,
@@ -279,10 +310,11 @@ def run_half(half: str, file: Path, keep: Path | None) -> None:
     done = {(one.recording, one.seed, one.fault, one.estimator) for one in lines}
     for scenario in scenarios(half):
         where = (scenario.recording, scenario.seed, scenario.fault)
-        missing = tuple(name for name in scenario.estimators if (*where, name) not in done)
-        for one in ended(half, replace(scenario, estimators=missing), keep) if missing else ():
-            with file.open("a") as out:
-                out.write(json.dumps(asdict(one)) + "\n")
+        missing = [name for name in scenario.estimators if (*where, name) not in done]
+        for one in ended(half, scenario, keep) if missing else ():
+            if one.estimator in missing:
+                with file.open("a") as out:
+                    out.write(json.dumps(asdict(one)) + "\n")
         print(scenario.name, flush=True)
 
 
@@ -303,7 +335,7 @@ def print_table(lines: list[Ended]) -> bool:
     warned = [one for one in harmless if one.is_told]
     print(f"{len(harmless)} runs that a fault cost less: {len(warned)} tell of it ({_percent(warned, harmless)})")
     by = Counter(_first_to_tell(one) for one in told)
-    print(f"the bad say so by the audit, else by the status, else by the mark, else by the gate: {dict(by)}")
+    print(f"what says so first of audit, status, mark, gate and comparison: {dict(by)}")
     for key in ("estimator", "fault"):
         for name in sorted({getattr(one, key) for one in bad}):
             of_name = [one for one in bad if getattr(one, key) == name]
@@ -321,7 +353,9 @@ def _first_to_tell(run: Ended) -> str:
         return "audit"
     if run.status != "ok":
         return "status"
-    return "mark" if run.mark in TELLING_MARKS else "gate"
+    if run.mark in TELLING_MARKS:
+        return "mark"
+    return "gate" if run.refuses or run.harms else "comparison"
 
 
 def _percent(part: Sized, whole: Sized) -> str:

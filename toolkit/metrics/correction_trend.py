@@ -27,6 +27,7 @@ CAUSAL_ONLY = "corrections from frame to frame belong to the causal output"
 TREND, LIMIT = "correction_trend", "correction_trend_limit"
 # What all tracks of some frames share adds up within it; longer ones lose what biases absorb.
 _STRETCH_S = 1.0
+NOTHING_CORRECTED = f"nothing was corrected over {_STRETCH_S:g} s"
 # A consistent estimator is beyond half of the limit less than once in a million runs. The other half is for filters
 # that linearise at estimates they have since corrected, and so count some information twice: chosen with 36 sound
 # simulated runs of each of three filters in view, one of which it leaves beyond the limit (docs/metrics.md).
@@ -57,7 +58,7 @@ def score(evaluation: Evaluation) -> Scores:
     """
     tests = [test for test in _tests(evaluation) if test.dof]
     if not tests:
-        raise Unavailable(f"nothing was corrected over {_STRETCH_S:g} s")
+        raise Unavailable(NOTHING_CORRECTED)
     nis, dof = np.sum(tests, axis=0)
     return Scores({TREND: float(nis / dof), LIMIT: _BY_LINEARISATION * float(chdtri(dof, _BY_CHANCE) / dof)})
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.experiment.disagreement import FARTHEST, Dispute, Parted
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
@@ -167,6 +168,7 @@ def note_lines(comparison: Comparison, columns: Columns = None) -> Iterator[str]
     yield from _marks(comparison)
     yield from _refusals(comparison)
     yield from _harm_by_vision(comparison)
+    yield from dispute_lines(Dispute.of(comparison.lines))
     yield from truth_lines(comparison)
     yield from missing_lines(comparison, columns)
 
@@ -260,6 +262,27 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
             yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {under}"
         elif harmed:
             yield f"{_of(row)} {harmed[0][1]}"
+
+
+def dispute_lines(dispute: Dispute) -> Iterator[str]:
+    """Yield a line for those who part from the measured motion, and one for who rests on a motion that is disputed."""
+    if dispute.parted:
+        told = "; ".join(f"{_of(one.row)} by {_parted_in_words(one)}" for one in dispute.parted)
+        yield (
+            "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
+            f"which squared is at most {_figure(FARTHEST)} times what they state: {told}"
+        )
+    if dispute.doubts_motion:
+        names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.by_vision)}"
+        yield (
+            f"{', '.join(dispute.alone)}: nothing but the measured motion and the start, which {count} that use vision "
+            f"dispute ({names})"
+        )
+
+
+def _parted_in_words(one: Parted) -> str:
+    apart = f"{_figure(one.distance_m)} m and {_figure(one.angle_deg)} deg"
+    return f"{apart} at {one.t_s:.0f} s, {_figure(one.squared)} times"
 
 
 def _remark_on(key: str, scored: Scored | None) -> str:

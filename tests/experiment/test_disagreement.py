@@ -1,0 +1,104 @@
+"""Estimators of one comparison that disagree about the measured motion are told, and who rests on it with them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.estimate import Landmarks, Run, Trajectory
+from toolkit.experiment.comparison import Row
+from toolkit.experiment.disagreement import FARTHEST, Dispute, Parted, farthest
+from toolkit.experiment.recording import Prepared, Recording, prepare
+from toolkit.experiment.units import Outcome, Scored, Unit, outcome_of, run_estimator
+from toolkit.geometry import Array, se3_exp
+from toolkit.metrics import Scores
+from toolkit.metrics.correction_trend import LIMIT, NOTHING_CORRECTED, TREND
+from toolkit.progress import SILENT
+from toolkit.report.messages import dispute_lines
+from toolkit.sequence import Sequence
+from toolkit.settings import Settings
+from toolkit.simulation import DRIVE, faults, simulate
+
+NAMES = ("dead-reckoning", "seed-ekf", "ekf-slam", "msckf")
+STAMPS_NS = np.arange(40) * 100_000_000
+SIGMA = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+
+
+def row(name: str, poses: Array | None = None, cov: Array | None = None, trend: float | None = None) -> Row:
+    """Return a row that rests on the motion where it has no trend, else one whose trend has a limit of 4."""
+    values, notes = {TREND: trend, LIMIT: None if trend is None else 4.0}, {TREND: NOTHING_CORRECTED}
+    scored = Scored(Scores(values, notes if trend is None else {}), np.empty(0), np.empty(0))
+    said = None if poses is None else Trajectory(STAMPS_NS[: len(poses)], poses, cov=cov)
+    run = Run(name, "ok", said, said, Landmarks.none(), None)
+    return Row("causal", (Outcome(0, name, "ok", {"causal": scored}, final_is_causal=True, run=run),))
+
+
+def drawn(seed: int, sigma: Array = SIGMA) -> Array:
+    """Return poses (40, 4, 4) whose errors have standard deviations (6,)."""
+    return se3_exp(sigma * np.random.default_rng(seed).standard_normal((40, 6)))
+
+
+def apart(mine: Array, other: Array, cov: Array) -> Parted:
+    found = farthest(row("other", other, cov, trend=1.0), Trajectory(STAMPS_NS, mine, cov=cov))
+    assert found is not None
+    return found
+
+
+def test_poses_drawn_from_what_is_stated_never_part_and_a_shift_of_ten_sigmas_does() -> None:
+    cov = np.tile(np.diag(SIGMA**2), (40, 1, 1))
+    squared = [apart(drawn(seed), drawn(1000 + seed), cov).squared for seed in range(200)]
+    assert 1.5 < np.median(squared) < max(squared) < FARTHEST
+    shifted = drawn(3)
+    shifted[25, :3, 3] += np.array([0.0, 2.0, 0.0])
+    told = apart(drawn(4), shifted, cov)
+    assert (told.t_s, told.squared > FARTHEST) == (2.5, True)
+    assert told.distance_m == pytest.approx(2.0, abs=4.0 * SIGMA[5])
+
+
+def test_where_the_pose_is_known_for_certain_rounding_parts_nobody() -> None:
+    same = drawn(0)
+    assert apart(same, same @ se3_exp(np.full(6, 1e-9)), np.zeros((40, 6, 6))).squared < 1e-3
+
+
+def test_without_a_covariance_or_over_seeds_nobody_parts() -> None:
+    poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
+    far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
+    motion = row("dead-reckoning", poses, cov)
+    assert Dispute.of([motion, row("a", far, cov, 1.0)]).parted
+    assert not Dispute.of([motion, row("a", far, None, 1.0)]).parted
+    outcome = motion.outcomes[0]
+    assert not Dispute.of([Row("causal", (outcome, replace(outcome, seed=1))), row("a", far, cov, 1.0)]).parted
+
+
+@pytest.mark.parametrize(
+    ("trends", "doubted"), [((5.0,), True), ((5.0, 1.0), True), ((5.0, 1.0, 1.0), False), ((1.0,), False), ((), False)]
+)
+def test_the_motion_is_in_doubt_where_half_of_those_that_use_vision_dispute_it(
+    trends: tuple[float, ...], doubted: bool
+) -> None:
+    rows = [row(f"filter-{i}", trend=trend) for i, trend in enumerate(trends)]
+    dispute = Dispute.of([row("dead-reckoning"), *rows])
+    assert (dispute.alone, dispute.doubts_motion) == (("dead-reckoning",), doubted)
+    assert not Dispute.of(rows).doubts_motion
+    assert len(list(dispute_lines(dispute))) == doubted
+
+
+def rows_of(sequence: Sequence) -> list[Row]:
+    prepared = prepare(Recording(replace(sequence, truth=None)))
+    return [_row_of(name, prepared) for name in NAMES]
+
+
+def _row_of(name: str, prepared: Prepared) -> Row:
+    run = run_estimator(Unit(prepared, 0, name, Settings(arithmetic="numpy")), prepared, SILENT)
+    return Row("causal", (outcome_of(run, prepared.sequence, 0),))
+
+
+def test_an_odometer_that_slips_is_told_of_dead_reckoning_too_and_a_sound_one_of_nobody() -> None:
+    sound = simulate(replace(DRIVE, duration_s=8.0), 5)
+    assert not any(True for _ in dispute_lines(Dispute.of(rows_of(sound))))
+    slipping = Dispute.of(rows_of(faults.disturbed_motion(sound, 0.8, 5)))
+    assert (slipping.alone, slipping.doubts_motion) == (("dead-reckoning",), True)
+    assert "seed-ekf" in slipping.disputing
+    parting, resting = dispute_lines(slipping)
+    assert "vision and the measured motion alone disagree" in parting
+    assert resting.startswith("dead-reckoning: nothing but the measured motion and the start, which ")

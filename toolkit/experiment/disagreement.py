@@ -1,0 +1,113 @@
+"""Where the estimators of one comparison disagree about the measured motion: what no single run of them can tell.
+
+An estimator that uses no vision has no innovations: nothing in its run shows an odometer that slips or a start that is
+wrong. Those that correct the same motion by vision dispute it in two ways. Their answer parts from it by more than the
+covariances of both allow; for that the covariance of the difference is taken for the sum, and it is no more unless the
+errors are correlated negatively, while two estimators of the same motion from the same start share theirs. Or their
+corrections lean one way (:mod:`toolkit.metrics.correction_trend`). Where half of those that use vision dispute the
+motion, those that rest on it are in doubt; where fewer do, these are. That two estimates differ tells that one is
+inconsistent, not which (Hausman 1978, "Specification tests in econometrics").
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.special import chdtri
+
+from toolkit.estimate import Trajectory
+from toolkit.experiment.comparison import Row
+from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.metrics.correction_trend import NOTHING_CORRECTED, TREND
+from toolkit.models.state import POSE, POSITION, ROTATION
+from toolkit.resampling import NS_PER_S
+
+# Over its degrees of freedom, the squared distance of two consistent estimates of a pose is larger once in a million.
+FARTHEST = float(chdtri(6, 1e-6)) / 6.0
+# Rounding of poses that are known exactly, as the first one may be: m and rad.
+_ROUNDING = 1e-6
+
+
+class Parted(NamedTuple):
+    """Where a row is farthest from the measured motion alone: when (s), by how much, and squared by the covariances.
+
+    ``squared`` is divided by its 6 degrees of freedom: 1 on average where both are consistent and independent.
+    """
+
+    row: Row
+    t_s: float
+    distance_m: float
+    angle_deg: float
+    squared: float
+
+
+@dataclass(frozen=True, eq=False)
+class Dispute:
+    """Estimators that rest on the measured motion ``alone``, those ``by_vision``, and who of these disputes the motion.
+
+    That is who has a row that ``parted`` from it, or corrections ``leaning`` one way.
+    """
+
+    alone: tuple[str, ...]
+    by_vision: tuple[str, ...]
+    parted: tuple[Parted, ...]
+    leaning: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> Self:
+        """Hold the rows of a comparison against each other; over seeds, where no runs are kept, nobody parts."""
+        rows = [row for row in rows if row.answered]
+        resting = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
+        others = [row for row in rows if row.estimator not in (one.estimator for one in resting)]
+        motion = _trajectory(resting[0]) if resting else None
+        apart = [] if motion is None else [farthest(row, motion) for row in others]
+        return cls(
+            _names(resting),
+            _names(others),
+            tuple(one for one in apart if one is not None and one.squared > FARTHEST),
+            _names(row for row in others if row.mark == "contradicted"),
+        )
+
+    @property
+    def disputing(self) -> tuple[str, ...]:
+        """Return who disputes the measured motion."""
+        parted = {one.row.estimator for one in self.parted}
+        return tuple(name for name in self.by_vision if name in parted or name in self.leaning)
+
+    @property
+    def doubts_motion(self) -> bool:
+        """Say whether at least half of those that use vision dispute the motion, and others rest on it."""
+        return bool(self.alone and self.disputing and 2 * len(self.disputing) >= len(self.by_vision))
+
+
+def farthest(row: Row, motion: Trajectory) -> Parted | None:
+    """Return where a row is farthest from a trajectory by the covariances of both, or None where these are lacking."""
+    other = _trajectory(row)
+    if other is None or other.cov is None or motion.cov is None:
+        return None
+    _, mine, its = np.intersect1d(motion.t_ns, other.t_ns, assume_unique=True, return_indices=True)
+    cov = motion.cov[mine][:, POSE, POSE] + other.cov[its][:, POSE, POSE] + _ROUNDING**2 * np.eye(6)
+    apart = se3_log(se3_inverse(motion.T_world_imu[mine]) @ other.T_world_imu[its])
+    known = np.isfinite(cov).all(axis=(1, 2)) & np.isfinite(apart).all(axis=1)
+    if not known.any():
+        return None
+    squared = _squared(apart[known], cov[known])
+    k = int(np.argmax(squared))
+    t_s = (motion.t_ns[mine][known][k] - motion.t_ns[0]) / NS_PER_S
+    distance_m, angle = np.linalg.norm(apart[known][k, POSITION]), np.linalg.norm(apart[known][k, ROTATION])
+    return Parted(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
+
+
+def _names(rows: Iterable[Row]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(row.estimator for row in rows))
+
+
+def _trajectory(row: Row) -> Trajectory | None:
+    run = row.outcomes[0].run
+    return None if run is None or len(row.outcomes) > 1 else run.trajectory(row.output)
+
+
+def _squared(apart: Array, cov: Array) -> Array:
+    """Return the squared Mahalanobis lengths (N,) of vectors (N, 6) by covariances (N, 6, 6)."""
+    return np.asarray((apart * np.linalg.solve(cov, apart[..., None])[..., 0]).sum(axis=1))
