@@ -65,7 +65,7 @@ class FixedLag:
         self._note(packet, recovery)
         self._read(packet)
         self._drop_landmarks(packet)
-        return self._states[-1]
+        return replace(self._states[-1], info=self._builder.info)
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""

@@ -100,7 +100,7 @@ class Isam2:
         values = self._tree.read(extension.state_keys)
         estimate = self._builder.motion.read(values, packet.index, packet.frame.t_ns)
         cov = state_cov(self._builder.motion, self._tree.isam, packet.index, estimate.T_world_imu[:3, :3])
-        return replace(estimate, cov=cov)
+        return replace(estimate, cov=cov, info=self._builder.info)
 
     def _drop_landmarks(self, seen: list[int], points: Array, estimate: Estimate, packet: Packet) -> None:
         """Drop what is not in front of the camera any more, where sightings have no gradient, and what is elsewhere."""

@@ -71,7 +71,7 @@ class Smart:
         self._tracked = replace(tracked, window=self._solution.window)
         self._read(packet)
         self._shorten(packet)
-        return self._states[-1]
+        return replace(self._states[-1], info=self._noise.info)
 
     def finish(self) -> Finished:
         """Return each state as it left the window, and every landmark as last known."""

@@ -183,6 +183,13 @@ def noise_scale_of(motion: TwistMotion | ImuMotion) -> Array:
     return np.ones((motion.dt_s.size, 2)) if motion.noise_scale is None else motion.noise_scale
 
 
+def with_noise_scaled(motion: Motion, variance: float) -> Motion:
+    """Return a motion whose samples' white noise has so many times its variance; where none is measured, as it is."""
+    if variance == 1.0 or isinstance(motion, UnmeasuredMotion):
+        return motion
+    return replace(motion, noise_scale=np.sqrt(variance) * noise_scale_of(motion))
+
+
 MotionKind = Literal["twist", "imu", "none"]
 _KINDS: tuple[tuple[type[MotionSamples], type[MotionNoise], MotionKind], ...] = (
     (TwistSamples, TwistNoise, "twist"),

@@ -70,7 +70,7 @@ class JointEkf:
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         self._start_new(packet.frame)
         self._joint.forget_clones(np.ones(1, dtype=bool))
-        return self._joint.core.estimate(packet.frame.t_ns, **gate.info())
+        return self._joint.core.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark there ever was, as last known."""

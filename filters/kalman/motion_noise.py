@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from toolkit.estimator import Setup
-from toolkit.measured_motion import ImuMotion, noise_scale_of
+from toolkit.measured_motion import with_noise_scaled
 from toolkit.models.corrections import CorrectionTest, correction_test
 from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
@@ -37,7 +37,7 @@ class MatchedNoise:
 
     def __init__(self, window_s: float, matches: bool = True) -> None:
         self._window_ns, self._matches = round(window_s * NS_PER_S), matches
-        self._scales = [1.0]
+        self._scales, self._applied = [1.0], 1.0
         self._tests: list[tuple[int, CorrectionTest]] = []
 
     @classmethod
@@ -52,6 +52,11 @@ class MatchedNoise:
         return self._scales[-1]
 
     @property
+    def info(self) -> dict[str, float]:
+        """Return that of the packet that it was last applied to, by the name an Estimate's info has."""
+        return {"motion_noise_scale": self._applied}
+
+    @property
     def told(self) -> tuple[str, ...]:
         """Return what a user should know, a line, where the stated noise did not hold."""
         most, usual = np.sqrt([max(self._scales), np.median(self._scales)])
@@ -64,10 +69,10 @@ class MatchedNoise:
 
     def applied(self, packet: Packet) -> Packet:
         """Return a packet whose motion has the noise that it is taken for now."""
-        if self.scale == 1.0 or not isinstance(packet.motion, ImuMotion):
+        self._applied = self.scale
+        if self.scale == 1.0 or packet.motion is None:
             return packet
-        scaled = np.sqrt(self.scale) * noise_scale_of(packet.motion)
-        return replace(packet, motion=replace(packet.motion, noise_scale=scaled))
+        return replace(packet, motion=with_noise_scaled(packet.motion, self.scale))
 
     def learn(self, t_ns: int, predicted: Belief, corrected: Belief) -> None:
         """Take in what a frame's tracks made of the state that was predicted for it."""

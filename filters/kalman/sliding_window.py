@@ -85,7 +85,7 @@ class SlidingWindowFilter:
         now = self._in_view.corrected(self._joint, self._tracks.unused(), share)
         if self.bridge is not None:
             self.bridge.learn(now.T_world_imu)
-        return now.estimate(packet.frame.t_ns, **gate.info())
+        return now.estimate(packet.frame.t_ns, **gate.info(), **self._noise.info)
 
     def landmarks(self) -> Landmarks:
         """Return every landmark that was ever triangulated, as last known."""

@@ -110,6 +110,11 @@ class GraphBuilder:
         self._share_in_graph, self._count_alike = self._share, True
         return factors.remade(graph)
 
+    @property
+    def info(self) -> dict[str, float]:
+        """Return how the newest state was predicted, by the names an Estimate's info has."""
+        return self._noise.info
+
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the motion and the tracks that were taken in."""
         return self._noise.told + self._tracks.told

@@ -5,7 +5,7 @@ track has so little of it that it passes its gate, and the innovations stay near
 state one way, frame after frame. The corrections of a consistent estimator are independent from frame to frame, and
 their sum over a stretch of time has the covariance that they took away (:mod:`toolkit.models.corrections`): its squared
 length is chi-square distributed. Corrections are the answers less what the measured motion predicts from the answers
-before; nothing else has to be reported.
+before, with the noise that the estimator took it for; where that is what is stated, nothing else has to be reported.
 """
 
 from collections.abc import Iterator
@@ -65,7 +65,7 @@ def score(evaluation: Evaluation) -> Scores:
 
 def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
     """Yield the test of the summed corrections of each whole stretch."""
-    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence))
+    steps = list(predicted_steps(evaluation.estimate, evaluation.sequence, _noise_scale(evaluation)))
     cov = _stated_cov(evaluation.estimate, steps)
     total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
     for step in steps:
@@ -76,6 +76,12 @@ def _tests(evaluation: Evaluation) -> Iterator[CorrectionTest]:
         if since_s > _STRETCH_S - 1e-6:
             yield total.test(np.sqrt(sigma2))
             total, since_s, sigma2 = None, 0.0, np.zeros(cov.shape[-1])
+
+
+def _noise_scale(evaluation: Evaluation) -> Array | None:
+    """Return how many times its stated variance the run took the noise of the motion up to each row (N,) for."""
+    scale = evaluation.run.info.get("motion_noise_scale")
+    return None if scale is None else np.nan_to_num(scale, nan=1.0)
 
 
 def _stated_cov(trajectory: Trajectory, steps: list[PredictedStep]) -> Array:

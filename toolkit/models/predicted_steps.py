@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.estimate import Trajectory
-from toolkit.measured_motion import Motion
+from toolkit.geometry import Array
+from toolkit.measured_motion import Motion, with_noise_scaled
 from toolkit.models.motion import belief_at, integrated, motion_model
 from toolkit.models.state import Belief, Layout, Prediction
 from toolkit.sequence import Sequence
@@ -31,10 +32,17 @@ def layout_of(sequence: Sequence) -> Layout:
     return motion_model(sequence.noise, sequence.gravity_world).layout
 
 
-def predicted_steps(trajectory: Trajectory, sequence: Sequence) -> Iterator[PredictedStep]:
-    """Yield the steps between neighbouring frames of which the trajectory has both. Its stamps must be frames'."""
+def predicted_steps(
+    trajectory: Trajectory, sequence: Sequence, noise_scale: Array | None = None
+) -> Iterator[PredictedStep]:
+    """Yield the steps between neighbouring frames of which the trajectory has both. Its stamps must be frames'.
+
+    ``noise_scale`` (N,) is how many times its stated variance the noise of the motion up to each row is taken for.
+    """
     model = motion_model(sequence.noise, sequence.gravity_world)
     intervals = list(_intervals(trajectory, sequence))
+    if noise_scale is not None:
+        intervals = [(start, end, with_noise_scaled(motion, noise_scale[end])) for start, end, motion in intervals]
     beliefs = [belief_at(trajectory, start, model) for start, *_ in intervals]
     increments = integrated(model, [motion for *_, motion in intervals], [belief.bias for belief in beliefs])
     for (start, end, motion), belief, increment in zip(intervals, beliefs, increments, strict=True):
