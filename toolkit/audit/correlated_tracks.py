@@ -42,7 +42,7 @@ def check(evidence: Evidence) -> Symptom | None:
         count=1,
         detail=(
             f"the errors of a track's sightings go together: from one step to the next their correlation is "
-            f"{value:+.2f} +- {error:.2f}, where it is -0.5 if each errs by itself; estimators told so are too sure"
+            f"{value:+.2f} +- {error:.2f}, where it is -0.5 if each errs by itself; to count them as white is too sure"
         ),
         treatment="'vislam card' shows how, noise.tracks=fitted tells them",
         remedy=None,
