@@ -65,9 +65,9 @@ def _noise(card: Card) -> str:
     return (
         f"errors of a track are correlated: {' and '.join(parts)}, beside white noise of "
         f"{_channels(card.noise.white_px)} (correlation from frame to frame {lags}; {card.gain:.1f} +- "
-        f"{card.gain_error:.1f} in log-likelihood a track better than white). Told white noise, an estimator takes "
-        "every further sighting of a track for new information, a smoother most of all: it is too sure of itself "
-        "and need not win; noise.tracks=fitted tells it"
+        f"{card.gain_error:.1f} in log-likelihood a track better than white). An estimator that counts them as white "
+        "takes every further sighting of a track for new information, a smoother most of all: it is too sure of itself "
+        "and need not win; noise.match_tracks has tracks count for less, noise.tracks=fitted tells it"
     )
 
 
