@@ -11,8 +11,8 @@ all of that is a false alarm, and so is the mark timid.
 
 The scenarios are dealt into two halves with other stretches and other pairs of fault and recording: `fit`, on which
 thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`,
-`fourth`, `fifth` and `sixth` are draws of others yet, with one recording drawn for every fault; in `sixth` the faults
-meet other estimators. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all
+`fourth`, `fifth`, `sixth` and `seventh` are draws of others yet, with one recording drawn for every fault. In `sixth`
+the faults meet other estimators, and in `seventh` those that have no innovations to be judged by, beside one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all
 together and two by two, as they meet faults, and what any of these comparisons says is a false alarm.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
@@ -88,13 +88,15 @@ FAULTS: dict[str, Callable[..., Recorded]] = {
     )
     for dose in doses
 }
-HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth", "sixth")
+HALVES = ("fit", "score", "fresh", "again", "third", "fourth", "fifth", "sixth", "seventh")
 DRAWN = HALVES[2:]
 # So many stretches of each recording a half has, and in so many of these faults are planted.
 STRETCHES, FAULTY_STRETCHES = 7, 5
 # The estimators that meet a fault: two of the cheap ones, and one of the dear every fourth time; all take turns, the
 # cheap ones after so many of them.
 PASSED_OVER = {"sixth": 4}
+# Or these three meet every fault.
+SAME_FOR_ALL = {"seventh": ("dead-reckoning", "seed-ekf", "ekf-slam")}
 CHEAP = ("dead-reckoning", "ekf", "ekf-slam", "mapping", "msckf", "msckf-fej", "msckf-slam", "riekf", "seed-ekf")
 DEAR = ("batch", "fixed-lag", "smart", "isam2", "batch", "fixed-lag", "smart", "iekf")
 SOUND = ""
@@ -128,8 +130,8 @@ def scenarios(half: str) -> list[Scenario]:
         for j, recording in enumerate(LENGTH_S):
             if (j == drawn[i]) if half in DRAWN else (i + j) % 2 == HALVES.index(half):
                 count = len(faulty)
-                cheap = _neighbours(2 * count + PASSED_OVER.get(half, 0))
-                dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 else ()
+                cheap = SAME_FOR_ALL.get(half) or _neighbours(2 * count + PASSED_OVER.get(half, 0))
+                dear = (DEAR[(count // 4) % len(DEAR)],) if count % 4 == 3 and half not in SAME_FOR_ALL else ()
                 seed = first_seed + (count // len(LENGTH_S)) % FAULTY_STRETCHES
                 faulty.append(Scenario(recording, seed, fault, (*cheap, *dear)))
     sound = []
@@ -137,7 +139,7 @@ def scenarios(half: str) -> list[Scenario]:
         for recording in LENGTH_S:
             here = [one for one in faulty if (one.recording, one.seed) == (recording, first_seed + k)]
             dear = sorted({name for one in here for name in one.estimators} - set(CHEAP))
-            sound.append(Scenario(recording, first_seed + k, SOUND, (*CHEAP, *dear)))
+            sound.append(Scenario(recording, first_seed + k, SOUND, (*SAME_FOR_ALL.get(half, CHEAP), *dear)))
     return sound + faulty
 
 
