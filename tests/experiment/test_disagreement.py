@@ -83,6 +83,20 @@ def test_the_motion_is_in_doubt_where_half_of_those_that_use_vision_dispute_it(
     assert len(list(dispute_lines(dispute))) == doubted
 
 
+def test_one_that_parts_and_whose_corrections_cannot_be_judged_is_no_witness_against_the_motion() -> None:
+    poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
+    far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
+    held = row("seed-ekf", far, cov)
+    scored = held.outcomes[0].outputs["causal"]
+    notes = replace(scored, scores=Scores(scored.scores.values, {TREND: "the estimator holds its biases"}))
+    held = Row("causal", (replace(held.outcomes[0], outputs={"causal": notes}),))
+    motion = row("dead-reckoning", poses, cov)
+    dispute = Dispute.of([motion, held])
+    assert [one.row.estimator for one in dispute.parted] == ["seed-ekf"]
+    assert not dispute.doubts_motion
+    assert Dispute.of([motion, held, row("a", far, cov, 1.0)]).doubts_motion
+
+
 def rows_of(sequence: Sequence) -> list[Row]:
     prepared = prepare(Recording(replace(sequence, truth=None)))
     return [_row_of(name, prepared) for name in NAMES]
@@ -98,7 +112,8 @@ def test_an_odometer_that_slips_is_told_of_dead_reckoning_too_and_a_sound_one_of
     assert not any(True for _ in dispute_lines(Dispute.of(rows_of(sound))))
     slipping = Dispute.of(rows_of(faults.disturbed_motion(sound, 0.8, 5)))
     assert (slipping.alone, slipping.doubts_motion) == (("dead-reckoning",), True)
-    assert "seed-ekf" in slipping.disputing
+    assert set(slipping.disputing) <= {"ekf-slam", "msckf"} == set(slipping.witnesses)
+    assert "seed-ekf" in {one.row.estimator for one in slipping.parted}
     parting, resting = dispute_lines(slipping)
     assert "vision and the measured motion alone disagree" in parting
     assert resting.startswith("dead-reckoning: nothing but the measured motion and the start, which ")

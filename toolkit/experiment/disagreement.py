@@ -4,9 +4,10 @@ An estimator that uses no vision has no innovations: nothing in its run shows an
 wrong. Those that correct the same motion by vision dispute it in two ways. Their answer parts from it by more than the
 covariances of both allow; for that the covariance of the difference is taken for the sum, and it is no more unless the
 errors are correlated negatively, while two estimators of the same motion from the same start share theirs. Or their
-corrections lean one way (:mod:`toolkit.metrics.correction_trend`). Where half of those that use vision dispute the
-motion, those that rest on it are in doubt; where fewer do, these are. That two estimates differ tells that one is
-inconsistent, not which (Hausman 1978, "Specification tests in econometrics").
+corrections lean one way (:mod:`toolkit.metrics.correction_trend`). That two estimates differ tells that one is
+inconsistent, not which (Hausman 1978, "Specification tests in econometrics"). Those whose corrections can be judged
+are witnesses: where half of them dispute the motion, those that rest on it are in doubt. One that holds its biases
+parts from a sound motion by what they are, and is none.
 """
 
 from collections.abc import Iterable
@@ -44,13 +45,13 @@ class Parted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Dispute:
-    """Estimators that rest on the measured motion ``alone``, those ``by_vision``, and who of these disputes the motion.
+    """Estimators that rest on the measured motion ``alone``, ``witnesses`` of it, and what disputes it.
 
-    That is who has a row that ``parted`` from it, or corrections ``leaning`` one way.
+    That are rows that ``parted`` from it, and estimators whose corrections are ``leaning`` one way.
     """
 
     alone: tuple[str, ...]
-    by_vision: tuple[str, ...]
+    witnesses: tuple[str, ...]
     parted: tuple[Parted, ...]
     leaning: tuple[str, ...]
 
@@ -64,21 +65,21 @@ class Dispute:
         apart = [] if motion is None else [farthest(row, motion) for row in others]
         return cls(
             _names(resting),
-            _names(others),
+            _names(row for row in others if row.value(TREND) is not None),
             tuple(one for one in apart if one is not None and one.squared > FARTHEST),
             _names(row for row in others if row.mark == "contradicted"),
         )
 
     @property
     def disputing(self) -> tuple[str, ...]:
-        """Return who disputes the measured motion."""
+        """Return the witnesses that dispute the measured motion."""
         parted = {one.row.estimator for one in self.parted}
-        return tuple(name for name in self.by_vision if name in parted or name in self.leaning)
+        return tuple(name for name in self.witnesses if name in parted or name in self.leaning)
 
     @property
     def doubts_motion(self) -> bool:
-        """Say whether at least half of those that use vision dispute the motion, and others rest on it."""
-        return bool(self.alone and self.disputing and 2 * len(self.disputing) >= len(self.by_vision))
+        """Say whether at least half of the witnesses dispute the motion, and others rest on it."""
+        return bool(self.alone and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
 
 
 def farthest(row: Row, motion: Trajectory) -> Parted | None:

@@ -273,10 +273,10 @@ def dispute_lines(dispute: Dispute) -> Iterator[str]:
             f"which squared is at most {_figure(FARTHEST)} times what they state: {told}"
         )
     if dispute.doubts_motion:
-        names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.by_vision)}"
+        names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.witnesses)}"
         yield (
-            f"{', '.join(dispute.alone)}: nothing but the measured motion and the start, which {count} that use vision "
-            f"dispute ({names})"
+            f"{', '.join(dispute.alone)}: nothing but the measured motion and the start, which {count} that correct "
+            f"it by vision dispute ({names})"
         )
 
 
