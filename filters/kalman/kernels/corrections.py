@@ -111,9 +111,11 @@ def test_correction(before: Arrays, after: Arrays, places: IntArray, least: floa
             known = P[i, i] > 0.0 and P[j, j] > 0.0
             taken[i, j] = (P[i, j] - Q[i, j]) / math.sqrt(P[i, i] * P[j, j]) if known else 0.0
     diagonalise(taken, error, shares)
+    for i in range(d):
+        least = max(least, -shares[i])
     nis, dof = 0.0, 0
     for i in range(d):
-        if shares[i] > max(least, -shares.min()):
+        if shares[i] > least:
             nis += error[i] * error[i] / shares[i]
             dof += 1
     return nis, dof
