@@ -40,7 +40,7 @@ Test = Callable[[Belief, Belief], CorrectionTest]
 
 def test_of_corrections(compilation: Compilation) -> Test:
     """Return what is to test corrections: compiled where that is asked for and possible, else the definition."""
-    compiled = compilation.module("filters.kalman.compiled_corrections")
+    compiled = compilation.module("filters.kalman.compiled_correction_test")
     return correction_test if compiled is None else cast(Test, compiled.correction_test)
 
 

@@ -57,13 +57,5 @@ FAULT = Fault(
     "conflict",
     "vision and the measured motion disagree for seconds: moving objects or wrong samples",
     check,
-    after=(
-        "mixed-axes",
-        "extrinsic-translation",
-        "twist-lag",
-        "time-offset",
-        "accelerometer-axes",
-        "disagreement",
-        "gyro-bias",
-    ),
+    after=("accelerometer-axes", "disagreement", "gyro-bias"),
 )

@@ -128,7 +128,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of fault. ``after`` names the faults that must have been checked (and repaired) before it."""
+    """One kind of fault. ``after`` names those checked (and repaired) before it, but for what comes before these."""
 
     name: str
     summary: str

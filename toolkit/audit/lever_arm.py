@@ -43,13 +43,5 @@ FAULT = Fault(
     "lever-arm",
     "a camera that stands elsewhere than the extrinsic says, as its turns show",
     check,
-    after=(
-        "units",
-        "mixed-axes",
-        "extrinsic-translation",
-        "twist-lag",
-        "time-offset",
-        "accelerometer-axes",
-        "disagreement",
-    ),
+    after=("accelerometer-axes", "disagreement"),
 )

@@ -71,13 +71,5 @@ FAULT = Fault(
     "miscalibration",
     "a camera turned a little against its extrinsic, or a scale that is a little off",
     check,
-    after=(
-        "units",
-        "mixed-axes",
-        "extrinsic-translation",
-        "twist-lag",
-        "time-offset",
-        "accelerometer-axes",
-        "disagreement",
-    ),
+    after=("accelerometer-axes", "disagreement"),
 )

@@ -88,5 +88,5 @@ FAULT = Fault(
     "scale-change",
     "odometry whose scale beside the camera changes during the recording",
     check,
-    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+    after=("disagreement",),
 )

@@ -199,5 +199,5 @@ FAULT = Fault(
     "truth-mismatch",
     "a truth that moves otherwise than vision: of another motion or unit, or beside a wrong baseline or focal length",
     check,
-    after=("units", "mixed-axes", "extrinsic-translation", "twist-lag", "time-offset", "disagreement"),
+    after=("disagreement",),
 )

@@ -58,13 +58,5 @@ FAULT = Fault(
     "vision-scale",
     "steps of vision that are a few percent longer or shorter than the measured ones",
     check,
-    after=(
-        "units",
-        "mixed-axes",
-        "extrinsic-translation",
-        "twist-lag",
-        "time-offset",
-        "accelerometer-axes",
-        "disagreement",
-    ),
+    after=("accelerometer-axes", "disagreement"),
 )

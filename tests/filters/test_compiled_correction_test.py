@@ -15,9 +15,9 @@ from toolkit.models.twist import TWIST_LAYOUT
 @pytest.fixture(scope="module")
 def compiled():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    from filters.kalman import compiled_corrections
+    from filters.kalman import compiled_correction_test
 
-    return compiled_corrections.correction_test
+    return compiled_correction_test.correction_test
 
 
 def corrected(layout, seed, turn_rad):

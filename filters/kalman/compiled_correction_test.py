@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from filters.kalman.kernels import corrections as kernel
+from filters.kalman.kernels import correction_test as kernel
 from toolkit.geometry import Array, IntArray
 from toolkit.models.corrections import LEAST_TAKEN, CorrectionTest
 from toolkit.models.state import Belief, Layout
