@@ -123,14 +123,17 @@ def test_a_wall_that_comes_ever_nearer_is_not_taken_for_a_doubling(clean_recordi
 
 def test_a_parked_vehicle_that_repeats_its_pixels_is_not_stale(clean_recording: Make) -> None:
     clean = clean_recording()
-    o = clean.observations
+    o, m = clean.observations, clean.motion
     moving = o.frame >= 20
     parked = np.flatnonzero(o.frame == 20)
     frame = np.concatenate([np.repeat(np.arange(20), parked.size), o.frame[moving]])
     track_id = np.concatenate([np.tile(o.track_id[parked], 20), o.track_id[moving]])
     uv_px = np.concatenate([np.tile(o.uv_px[parked], (20, 1)), o.uv_px[moving]])
-    standing = replace(clean, observations=type(o).sorted(frame, track_id, uv_px))
+    at_rest = m.of(m.t_ns, np.where((m.t_ns <= clean.frames_t_ns[20])[:, None], 0.0, m.values))
+    standing = replace(clean, observations=type(o).sorted(frame, track_id, uv_px), motion=at_rest)
     assert "stale-frames" not in {f.fault for f in audit(standing).findings}
+    # Odometry that goes on tells of a camera that froze.
+    assert "stale-frames" in {f.fault for f in audit(replace(standing, motion=m)).findings}
 
 
 def test_no_track_is_absent_between_its_first_and_last_sighting(clean_recording: Make, planted: PlantIn) -> None:

@@ -72,7 +72,7 @@ def _leaps(sequence: Sequence) -> BoolArray:
     usual = MAD_TO_SIGMA * np.median(np.abs(step), axis=0)
     most = MOST_CHANGE * step_s if sequence.motion_kind == "twist" else MOST_STEP
     far = np.abs(step) > np.maximum(most, BEYOND_STEPS * usual)
-    leaps[1:-1] = (far[1:] & far[:-1] & (step[1:] * step[:-1] < 0.0)).any(axis=1)
+    leaps[1:-1] = (far[1:] & far[:-1] & (np.sign(step[1:]) * np.sign(step[:-1]) < 0.0)).any(axis=1)
     return leaps
 
 

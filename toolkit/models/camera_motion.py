@@ -118,10 +118,10 @@ def camera_motion(sequence: Sequence, start: Array | None = None) -> CameraMotio
     for stretch in _stretches(views.first):
         there = views.over(stretch)
         T_before_after[stretch], support[stretch] = _motion_over(there, T_before_after[stretch], sequence.rig)
-    known = (support > LEAST_SUPPORT) & np.isfinite(T_before_after).all(axis=(1, 2))
-    dt_s = np.diff(sequence.frames_t_ns)[known] / NS_PER_S
+    steps_s = np.diff(sequence.frames_t_ns) / NS_PER_S
+    known = (support > LEAST_SUPPORT) & np.isfinite(T_before_after).all(axis=(1, 2)) & (steps_s > 0.0)
     twist = np.zeros((intervals, 6))
-    twist[known] = se3_log(T_before_after[known]) / dt_s[:, None]
+    twist[known] = se3_log(T_before_after[known]) / steps_s[known, None]
     return CameraMotion(twist[:, :3], twist[:, 3:], known)
 
 
