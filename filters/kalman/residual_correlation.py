@@ -1,20 +1,22 @@
 """How much a sighting of a track counts for, by how alike the residuals of its successive sightings are.
 
 A tracker takes its error along from image to image, and a filter told white noise takes every sighting of such a track
-for new. Residuals that are correlated by rho from one sighting to the next carry, as a sum, as much as (1 - rho) /
-(1 + rho) times as many independent ones (Bayley & Hammersley 1946, "The 'effective' number of independent observations
-in an autocorrelated time series"): for long tracks whose errors are an autoregression of first order that is exact. So
-with a variance that is v times the stated one a sighting tells (1 - rho) / (1 + rho) / v of what it is stated to, and
-where that is less than all of it, every track corrects with that share of its information; what is an outlier stays a
-matter of the stated noise. Noise that was stated large enough for such tracks counts in full. White errors have
-residuals that are correlated negatively, by the landmark that was fitted to them, and count in full: a filter whose
-noise is as stated stays, to the bit, what it is without.
+for new. Residuals that are correlated by rho from one sighting to the next carry, as a sum, as much as (1 - rho) / (1 +
+rho) times as many independent ones (Bayley & Hammersley 1946, "The 'effective' number of independent observations in an
+autocorrelated time series"): for long tracks whose errors are an autoregression of first order that is exact. So with a
+variance that is v times the stated one a sighting tells (1 - rho) / (1 + rho) / v of what it is stated to, and where
+that is less than all of it, every track corrects with that share of its information; what is an outlier stays a matter
+of the stated noise. Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is
+smaller by as many as err as one (:mod:`filters.kalman.neighbour_correlation`). Noise that was stated large enough for
+such tracks counts in full. White errors have residuals that are correlated negatively, by the landmark that was fitted
+to them, and count in full: a filter whose noise is as stated stays, to the bit, what it is without.
 """
 
 import numpy as np
 
 from filters.kalman import multiview
 from filters.kalman.multiview import TrackSightings
+from filters.kalman.neighbour_correlation import NeighbourCorrelation
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound
@@ -44,6 +46,7 @@ class ResidualCorrelation:
         # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
         self._rig, self.matches = rig, matches and rig.track_noise is None
         self._products, self._squares, self._pairs = 0.0, 0.0, 0
+        self._neighbours = NeighbourCorrelation()
 
     @property
     def correlation(self) -> float:
@@ -56,18 +59,23 @@ class ResidualCorrelation:
 
     @property
     def share(self) -> float:
-        """Return the share of its information that a track counts for: all of it where residuals are not correlated."""
+        """Return the share of its information that a track counts for: all where residuals along it are not alike."""
         rho = self.correlation
-        return min(1.0, (1.0 - rho) / (1.0 + rho) * self._pairs / self._squares) if rho > 0.0 else 1.0
+        if rho == 0.0:
+            return 1.0
+        effective = (1.0 - rho) / (1.0 + rho) / self._neighbours.erring_as_one(rho)
+        return min(1.0, effective * self._pairs / self._squares)
 
     @property
     def told(self) -> tuple[str, ...]:
         """Return what a user should know, a line, where tracks do not count in full."""
         if self.share > _MOST_TOLD:
             return ()
+        together = self._neighbours.erring_as_one(self.correlation)
+        neighbours = f" and {together:.1f} neighbours err as one" if together > 1.0 else ""
         return (
-            f"residuals along {self._of} are correlated, {self.correlation:.2f} from frame to frame, and not white as "
-            f"stated: {self._of} came to count for {self.share:.2f} of their information",
+            f"residuals along {self._of} are correlated, {self.correlation:.2f} from frame to frame,{neighbours} and "
+            f"not white as stated: {self._of} came to count for {self.share:.2f} of their information",
         )
 
     def learn(self, sightings: TrackSightings, points: Array, poses: Array) -> None:
@@ -87,6 +95,11 @@ class ResidualCorrelation:
         self._products += float((before * after).sum())
         self._squares += 0.5 * float(np.square(before).sum() + np.square(after).sum())
         self._pairs += 3 * len(before)
+
+    def add_images(self, frames: IntArray, uvs_px: Array, whitened: Array) -> None:
+        """Take in what images show together: whitened residuals (N, 3) of sightings (N, 3) px in frames (N,)."""
+        if self.matches:
+            self._neighbours.add(frames, uvs_px, whitened)
 
 
 class LandmarkCorrelation(ResidualCorrelation):

@@ -15,7 +15,7 @@ import numpy as np
 from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, SOUND, ResidualCorrelation
 from filters.smoothing.smart_factors import Sightings
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, IntArray, se3_inverse, transform
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import kind_of, linear_factor
 from toolkit.models.gating import chi2_bound
@@ -94,9 +94,12 @@ class DiscountedTracks:
         return self._correlation.told
 
     def learn(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
-        """Take in what successive frames saw of points (3,) m from poses (K, 4, 4)."""
+        """Take in what the first of two frames saw of points (3,) m, beside the second one, from poses (2, 4, 4)."""
         if self._correlation.matches:
-            self._correlation.add(*successive_residuals(frames, T_world_imu, points, self._rig))
+            left = residuals_of(frames, T_world_imu, points, self._rig)
+            self._correlation.add(*left.successive())
+            first = left.select(left.frames == 0)
+            self._correlation.add_images(first.frames, first.uvs_px, first.whitened)
 
     def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
         """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""
@@ -105,7 +108,7 @@ class DiscountedTracks:
         often = np.bincount(sightings.point, minlength=len(points)) >= FEWEST_SIGHTINGS
         seen = sightings.of_points(np.flatnonzero(often))
         whitened = _whitened(seen.uv_px, T_world_imu[seen.pose], points[seen.point], self._rig)
-        self._correlation.add(*successive(seen.point, seen.pose, whitened))
+        Residuals(seen.point, seen.pose, seen.uv_px, whitened).sound.add_to(self._correlation)
 
 
 def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
@@ -116,36 +119,49 @@ def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
     return {track_id for track_id, sightings in count.items() if sightings >= FEWEST_SIGHTINGS}
 
 
-def successive_residuals(
-    frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array], rig: StereoRig
-) -> tuple[Array, Array]:
-    """Return whitened residuals (n, 3) of sightings of points (3,) m from poses (K, 4, 4), and those a frame later.
+class Residuals(NamedTuple):
+    """Whitened residuals (N, 3) of sightings (N, 3) px of tracks (N,) in frames (N,)."""
 
-    Tracks without a point, and pairs of which one is an outlier by the stated noise, are left out.
-    """
+    tracks: IntArray
+    frames: IntArray
+    uvs_px: Array
+    whitened: Array
+
+    def select(self, rows: BoolArray) -> "Residuals":
+        """Return some of them (N,)."""
+        return Residuals(self.tracks[rows], self.frames[rows], self.uvs_px[rows], self.whitened[rows])
+
+    @property
+    def sound(self) -> "Residuals":
+        """Return those that are no outliers by the stated noise."""
+        return self.select(np.square(self.whitened).sum(axis=1) < chi2_bound(3, SOUND))
+
+    def successive(self) -> tuple[Array, Array]:
+        """Return those (n, 3) of tracks that have one a frame later, and that one (n, 3)."""
+        order = np.lexsort((self.frames, self.tracks))
+        before, after = order[:-1], order[1:]
+        pairs = (self.tracks[before] == self.tracks[after]) & (self.frames[after] == self.frames[before] + 1)
+        return self.whitened[before[pairs]], self.whitened[after[pairs]]
+
+    def add_to(self, correlation: ResidualCorrelation) -> None:
+        """Have a correlation learn how they go together along tracks, and in each image."""
+        correlation.add(*self.successive())
+        correlation.add_images(self.frames, self.uvs_px, self.whitened)
+
+
+def residuals_of(
+    frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array], rig: StereoRig
+) -> Residuals:
+    """Return the residuals of what frames saw of points (3,) m from poses (K, 4, 4), but for outliers."""
     frames = [frame.select(np.array([i in points for i in frame.track_ids.tolist()], dtype=bool)) for frame in frames]
     index = np.repeat(np.arange(len(frames)), [len(frame.track_ids) for frame in frames])
     track_ids = np.concatenate([frame.track_ids for frame in frames])
-    if not track_ids.size:
-        return np.empty((0, 3)), np.empty((0, 3))
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
-    seen = np.array([points[i] for i in track_ids.tolist()])
-    return successive(track_ids, index, _whitened(uvs_px, T_world_imu[index], seen, rig))
+    seen = np.array([points[i] for i in track_ids.tolist()]).reshape(-1, 3)
+    return Residuals(track_ids, index, uvs_px, _whitened(uvs_px, T_world_imu[index], seen, rig)).sound
 
 
 def _whitened(uvs_px: Array, T_world_imu: Array, points: Array, rig: StereoRig) -> Array:
     """Return the whitened residuals (N, 3) of sightings (N, 3) px of points (N, 3) m from poses (N, 4, 4)."""
     predicted_px, _ = stereo.images(transform(se3_inverse(T_world_imu), points), rig)
     return left_only.whitened_residuals(uvs_px, predicted_px, rig)
-
-
-def successive(tracks: IntArray, frames: IntArray, whitened: Array) -> tuple[Array, Array]:
-    """Return those of N residuals (N, 3), of tracks (N,) in frames (N,), that have one a frame later, and that one.
-
-    Pairs of which one is an outlier are left out.
-    """
-    order = np.lexsort((frames, tracks))
-    before, after = order[:-1], order[1:]
-    sound = np.square(whitened).sum(axis=1) < chi2_bound(3, SOUND)
-    pairs = (tracks[before] == tracks[after]) & (frames[after] == frames[before] + 1) & sound[before] & sound[after]
-    return whitened[before[pairs]], whitened[after[pairs]]

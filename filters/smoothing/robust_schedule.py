@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from filters.kalman.residual_correlation import ResidualCorrelation
-from filters.smoothing.discounted_tracks import discounted, seen_often, successive_residuals
+from filters.smoothing.discounted_tracks import discounted, residuals_of, seen_often
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
@@ -76,7 +76,7 @@ def solve_robustly(
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
     poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
-    correlation.add(*successive_residuals(frames, poses, points, rig))
+    residuals_of(frames, poses, points, rig).add_to(correlation)
     rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
     if values.exists(SCALE):
         sightings = ChainedSightings.of(frames, rig)

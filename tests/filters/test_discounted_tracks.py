@@ -6,11 +6,11 @@ import pytest
 
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.smoothing.discounted_tracks import (
+    Residuals,
     discounted,
     discounted_past,
+    residuals_of,
     seen_often,
-    successive,
-    successive_residuals,
 )
 from filters.smoothing.graph_builder import GraphBuilder
 from toolkit.estimator import Setup
@@ -136,7 +136,9 @@ def test_pairs_are_of_one_track_in_successive_frames_and_of_no_outlier():
     tracks, frames = np.array([7, 7, 7, 9, 9, 8, 8]), np.array([0, 1, 3, 0, 1, 1, 2])
     whitened = np.arange(21.0).reshape(7, 3) / 20.0
     whitened[4] = 10.0
-    before, after = successive(tracks, frames, whitened)
+    residuals = Residuals(tracks, frames, np.zeros((7, 3)), whitened).sound
+    before, after = residuals.successive()
+    np.testing.assert_array_equal(residuals.tracks, np.delete(tracks, 4))
     np.testing.assert_array_equal(before, whitened[[0, 5]])
     np.testing.assert_array_equal(after, whitened[[1, 6]])
 
@@ -147,10 +149,10 @@ def test_residuals_are_those_of_the_points_that_are_known(rig):
     exact = [stereo.predict(np.array(list(points.values())), T, rig).uv_px for T in poses]
     off_px = np.linalg.inv(rig.whitener) @ np.array([0.5, -0.2, 0.1])
     frames = [frame([3, 4, 5], [*(uv + off_px), [0.0, 0.0, 0.0]]) for uv in exact]
-    before, after = successive_residuals(frames, poses, points, rig)
+    before, after = residuals_of(frames, poses, points, rig).successive()
     np.testing.assert_allclose(before, np.tile([0.5, -0.2, 0.1], (2, 1)), atol=1e-9)
     np.testing.assert_allclose(after, before, atol=1e-9)
-    assert all(len(each) == 0 for each in successive_residuals(frames, poses, {}, rig))
+    assert all(len(each) == 0 for each in residuals_of(frames, poses, {}, rig).successive())
 
 
 def test_tracks_seen_often_have_four_sightings():
