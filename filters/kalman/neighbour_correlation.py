@@ -3,8 +3,9 @@
 What shifts one patch of an image shifts the patches beside it: patches that overlap, a surface that moves or shines,
 what a calibration leaves of the lens. Where each error is correlated with those of its neighbours by s in sum, the sum
 of n of them has 1 + s times the variance of n independent ones, and so many tell as much as one (Kish 1965, "Survey
-sampling", chapter 5: the design effect of clusters). Only what is near counts: what all tracks of an image share is
-taken for motion by every estimator, and leaves no residual to know it by.
+sampling", chapter 5: the design effect of clusters). What a wrong pose makes of an image is
+alike as well, and no error of tracks: so residuals are freed of the pose that explains them best, and with it of what
+all tracks of an image share, which every estimator takes for motion.
 """
 
 import numpy as np
@@ -50,3 +51,17 @@ class NeighbourCorrelation:
         self._pairs += 3 * np.bincount(ring, minlength=len(_RADII_PX))
         self._squares += float(np.square(whitened).sum())
         self._numbers += whitened.size
+
+
+def freed_of_poses(frames: IntArray, whitened: Array, H_pose: Array) -> Array:
+    """Return what residuals (N, 3) in frames (N,) leave once each frame's pose has taken up what it can.
+
+    That is a Gauss-Newton step of the poses, to which the whitened Jacobians are ``H_pose`` (N, 3, 6).
+    """
+    count = int(frames.max(initial=-1)) + 1
+    matrices, vectors = np.zeros((count, 6, 6)), np.zeros((count, 6))
+    H_transposed = np.swapaxes(H_pose, 1, 2)
+    np.add.at(matrices, frames, H_transposed @ H_pose)
+    np.add.at(vectors, frames, (H_transposed @ whitened[..., None])[..., 0])
+    steps = (np.linalg.pinv(matrices, hermitian=True) @ vectors[..., None])[frames]
+    return np.asarray(whitened - (H_pose @ steps)[..., 0])

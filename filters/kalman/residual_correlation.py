@@ -16,7 +16,7 @@ import numpy as np
 
 from filters.kalman import multiview
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.neighbour_correlation import NeighbourCorrelation
+from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound
@@ -96,10 +96,13 @@ class ResidualCorrelation:
         self._squares += 0.5 * float(np.square(before).sum() + np.square(after).sum())
         self._pairs += 3 * len(before)
 
-    def add_images(self, frames: IntArray, uvs_px: Array, whitened: Array) -> None:
-        """Take in what images show together: whitened residuals (N, 3) of sightings (N, 3) px in frames (N,)."""
+    def add_images(self, frames: IntArray, uvs_px: Array, whitened: Array, H_pose: Array) -> None:
+        """Take in what images show together: whitened residuals (N, 3) of sightings (N, 3) px in frames (N,).
+
+        ``H_pose`` (N, 3, 6) are their whitened Jacobians to the poses of the frames.
+        """
         if self.matches:
-            self._neighbours.add(frames, uvs_px, whitened)
+            self._neighbours.add(frames, uvs_px, freed_of_poses(frames, whitened, H_pose))
 
 
 class LandmarkCorrelation(ResidualCorrelation):

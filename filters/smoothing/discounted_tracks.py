@@ -99,7 +99,7 @@ class DiscountedTracks:
             left = residuals_of(frames, T_world_imu, points, self._rig)
             self._correlation.add(*left.successive())
             first = left.select(left.frames == 0)
-            self._correlation.add_images(first.frames, first.uvs_px, first.whitened)
+            first.add_images_to(self._correlation)
 
     def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
         """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""
@@ -107,8 +107,9 @@ class DiscountedTracks:
             return
         often = np.bincount(sightings.point, minlength=len(points)) >= FEWEST_SIGHTINGS
         seen = sightings.of_points(np.flatnonzero(often))
-        whitened = _whitened(seen.uv_px, T_world_imu[seen.pose], points[seen.point], self._rig)
-        Residuals(seen.point, seen.pose, seen.uv_px, whitened).sound.add_to(self._correlation)
+        T, uvs_px = T_world_imu[seen.pose], seen.uv_px
+        left = Residuals(seen.point, seen.pose, uvs_px, *_whitened(uvs_px, T, points[seen.point], self._rig))
+        left.sound.add_to(self._correlation)
 
 
 def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
@@ -120,16 +121,18 @@ def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
 
 
 class Residuals(NamedTuple):
-    """Whitened residuals (N, 3) of sightings (N, 3) px of tracks (N,) in frames (N,)."""
+    """Whitened residuals (N, 3) of sightings (N, 3) px of tracks (N,) in frames (N,), Jacobians (N, 3, 6) to poses."""
 
     tracks: IntArray
     frames: IntArray
     uvs_px: Array
     whitened: Array
+    H_pose: Array
 
     def select(self, rows: BoolArray) -> "Residuals":
         """Return some of them (N,)."""
-        return Residuals(self.tracks[rows], self.frames[rows], self.uvs_px[rows], self.whitened[rows])
+        tracks, frames, uvs_px, whitened, H_pose = self
+        return Residuals(tracks[rows], frames[rows], uvs_px[rows], whitened[rows], H_pose[rows])
 
     @property
     def sound(self) -> "Residuals":
@@ -146,7 +149,11 @@ class Residuals(NamedTuple):
     def add_to(self, correlation: ResidualCorrelation) -> None:
         """Have a correlation learn how they go together along tracks, and in each image."""
         correlation.add(*self.successive())
-        correlation.add_images(self.frames, self.uvs_px, self.whitened)
+        self.add_images_to(correlation)
+
+    def add_images_to(self, correlation: ResidualCorrelation) -> None:
+        """Have a correlation learn how they go together in each image."""
+        correlation.add_images(self.frames, self.uvs_px, self.whitened, self.H_pose)
 
 
 def residuals_of(
@@ -158,10 +165,14 @@ def residuals_of(
     track_ids = np.concatenate([frame.track_ids for frame in frames])
     uvs_px = np.concatenate([frame.uvs_px for frame in frames])
     seen = np.array([points[i] for i in track_ids.tolist()]).reshape(-1, 3)
-    return Residuals(track_ids, index, uvs_px, _whitened(uvs_px, T_world_imu[index], seen, rig)).sound
+    return Residuals(track_ids, index, uvs_px, *_whitened(uvs_px, T_world_imu[index], seen, rig)).sound
 
 
-def _whitened(uvs_px: Array, T_world_imu: Array, points: Array, rig: StereoRig) -> Array:
-    """Return the whitened residuals (N, 3) of sightings (N, 3) px of points (N, 3) m from poses (N, 4, 4)."""
-    predicted_px, _ = stereo.images(transform(se3_inverse(T_world_imu), points), rig)
-    return left_only.whitened_residuals(uvs_px, predicted_px, rig)
+def _whitened(uvs_px: Array, T_world_imu: Array, points: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Return the whitened residuals (N, 3) of sightings (N, 3) px of points (N, 3) m, and Jacobians (N, 3, 6) to poses.
+
+    The poses are (N, 4, 4).
+    """
+    expected = stereo.linearise(transform(se3_inverse(T_world_imu), points), T_world_imu[:, :3, :3], rig)
+    jacobians = left_only.whitener(uvs_px, rig) @ left_only.seen_rows(uvs_px, expected.d_uv_d_pose)
+    return left_only.whitened_residuals(uvs_px, expected.uv_px, rig), jacobians

@@ -136,7 +136,7 @@ def test_pairs_are_of_one_track_in_successive_frames_and_of_no_outlier():
     tracks, frames = np.array([7, 7, 7, 9, 9, 8, 8]), np.array([0, 1, 3, 0, 1, 1, 2])
     whitened = np.arange(21.0).reshape(7, 3) / 20.0
     whitened[4] = 10.0
-    residuals = Residuals(tracks, frames, np.zeros((7, 3)), whitened).sound
+    residuals = Residuals(tracks, frames, np.zeros((7, 3)), whitened, np.zeros((7, 3, 6))).sound
     before, after = residuals.successive()
     np.testing.assert_array_equal(residuals.tracks, np.delete(tracks, 4))
     np.testing.assert_array_equal(before, whitened[[0, 5]])

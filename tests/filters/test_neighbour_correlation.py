@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from filters.kalman.neighbour_correlation import NeighbourCorrelation
+from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from filters.kalman.residual_correlation import ResidualCorrelation
 from toolkit.geometry import Array, IntArray
 from toolkit.simulation import DRIVE, simulate
@@ -78,9 +78,23 @@ def test_tracks_that_are_correlated_count_for_less_by_as_many_neighbours_as_err_
     beside.add(before, after)
     frames, uvs_px, errors = clusters(6, alike=0.5)
     for correlation in (beside, white):
-        correlation.add_images(frames, uvs_px, errors)
+        correlation.add_images(frames, uvs_px, errors, np.zeros((len(frames), 3, 6)))
     together = learnt(frames, uvs_px, errors).erring_as_one(alone.correlation)
     assert beside.share == pytest.approx(alone.share / together, rel=1e-12)
     assert f"{together:.1f} neighbours err as one" in beside.told[0]
     assert "neighbours" not in alone.told[0]
     assert white.share == 1.0  # what an image shares alone is another matter: tracks that are white change no bit
+
+
+def test_what_poses_explain_is_taken_from_each_image_and_nothing_else() -> None:
+    rng = np.random.default_rng(1)
+    frames = rng.permutation(np.repeat(np.arange(3), 20))
+    H_pose, poses, own = rng.normal(size=(60, 3, 6)), rng.normal(size=(3, 6)), rng.normal(size=(60, 3))
+    explained = (H_pose @ poses[frames][..., None])[..., 0]
+    left = freed_of_poses(frames, own + explained, H_pose)
+    np.testing.assert_allclose(left, freed_of_poses(frames, own, H_pose), atol=1e-12)
+    for k in range(3):
+        H = H_pose[frames == k].reshape(60, 6)
+        np.testing.assert_allclose(H.T @ left[frames == k].ravel(), 0.0, atol=1e-11)
+        best = np.linalg.lstsq(H, own[frames == k].ravel(), rcond=None)[0]
+        np.testing.assert_allclose(left[frames == k].ravel(), own[frames == k].ravel() - H @ best, atol=1e-12)
