@@ -3,9 +3,9 @@
 What shifts one patch of an image shifts the patches beside it: patches that overlap, a surface that moves or shines,
 what a calibration leaves of the lens. Where each error is correlated with those of its neighbours by s in sum, the sum
 of n of them has 1 + s times the variance of n independent ones, and so many tell as much as one (Kish 1965, "Survey
-sampling", chapter 5: the design effect of clusters). What a wrong pose makes of an image is
-alike as well, and no error of tracks: so residuals are freed of the pose that explains them best, and with it of what
-all tracks of an image share, which every estimator takes for motion.
+sampling", chapter 5: the design effect of clusters). What a wrong pose makes of an image is alike as well, and no error
+of tracks: so residuals are freed of the pose that explains them best, and with it of what all tracks of an image share,
+which every estimator takes for motion.
 """
 
 import numpy as np
