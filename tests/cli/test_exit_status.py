@@ -157,6 +157,7 @@ def test_a_name_that_is_no_text_is_told_in_any_encoding(encoding: str, tmp_path:
     [
         (MemoryError(), 71, "memory"),
         (OSError(24, "Too many open files"), 71, "Too many open files"),
+        (ImportError("failed to map segment", path="/lib/_fblas.cpython-311-x86_64-linux-gnu.so"), 71, "more memory"),
         (UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed"), 71, "rename it"),
         (ZeroDivisionError("float division\nby zero"), 70, "a defect of vislam"),
         (SystemError("\x1b[2J"), 70, "\\x1b[2J"),
@@ -170,6 +171,17 @@ def test_whatever_nobody_foresaw_is_one_line_with_a_documented_status(
     assert vislam(*QUICK, "--out", "run") == status
     assert says in one_line()
     assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("lack", "status"), [(OSError(24, "Too many open files"), 71), (FileNotFoundError(2, "no"), 70)]
+)
+def test_a_lack_of_means_is_told_where_a_library_hides_it_and_nothing_else_is(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, lack: Exception, status: int
+) -> None:
+    monkeypatch.setattr(runner, "run", _raiser(_hidden(lack)))
+    assert vislam(*QUICK, "--out", "run") == status
+    assert ("Too many open files" in one_line()) == (status == 71)
 
 
 def test_the_place_of_a_defect_is_shown_when_asked_for(
@@ -196,6 +208,60 @@ def test_signals_leave_no_file_and_no_process(
     assert running.returncode == 130
     assert list(tmp_path.iterdir()) == []
     _wait_until(lambda: not _group(running.pid))
+
+
+def test_a_terminal_that_is_closed_is_one_line_though_all_its_processes_are_told(
+    tmp_path: Path, starts_group: StartsGroup
+) -> None:
+    words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "run")
+    running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
+    _wait_until(lambda: len(_group(running.pid)) > 4)  # two workers, and what watches over what they share
+    os.killpg(running.pid, signal.SIGHUP)
+    _, told = running.communicate(timeout=PATIENCE_S)
+    assert told == "vislam: error: interrupted; what was not finished is not written\n"
+    assert running.returncode == 130
+    assert list(tmp_path.iterdir()) == []
+    _wait_until(lambda: not _group(running.pid))
+
+
+def test_an_interrupt_that_comes_out_as_another_error_is_130(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a library whose compiled code answers one with an error of its own."""
+
+    def interrupted(*_: object) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        raise ImportError("initialization failed")
+
+    monkeypatch.setattr(runner, "run", interrupted)
+    assert vislam(*QUICK, "--out", "run") == 130
+    assert "interrupted" in one_line()
+
+
+def test_a_signal_at_the_end_of_the_interpreter_changes_no_status() -> None:
+    program = "import os, signal, sys; from toolkit.cli import main; status = main(); "
+    program += "os.kill(os.getpid(), signal.SIGTERM); sys.exit(status)"
+    ended = subprocess.run([sys.executable, "-c", program, "list"], capture_output=True, check=False)
+    assert ended.returncode == 0
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_reader_that_goes_away_costs_no_results(
+    vislam: Vislam, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def gone(*_: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("toolkit.cli._give_up_output", lambda: None)
+    with monkeypatch.context() as patched:
+        patched.setattr("toolkit.progress.print_above", gone)
+        assert vislam(*QUICK, "--out", "run") == 141
+    with monkeypatch.context() as patched:
+        patched.setattr("toolkit.report.card.card_text", gone)
+        assert vislam("card", "drive", "--max-frames", "20", "--json", "card.json") == 141
+    assert (tmp_path / "run/metrics.json").exists()
+    assert (tmp_path / "card.json").exists()
 
 
 def test_an_interrupt_inside_text_that_is_executed_is_130_as_well(tmp_path: Path) -> None:
@@ -229,6 +295,13 @@ def _wait_until(reached: Callable[[], bool]) -> None:
     while not reached():
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def _hidden(lack: Exception) -> Exception:
+    """Return an error of a library that has another one behind it."""
+    error = UnboundLocalError("cannot access local variable")
+    error.__context__ = lack
+    return error
 
 
 def _raiser(error: Exception) -> Callable[..., None]:

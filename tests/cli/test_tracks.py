@@ -1,5 +1,6 @@
 """``vislam tracks`` and folders of images on the command line: what is written, said and refused."""
 
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,20 @@ def test_stills_replace_stills_and_nothing_else(
     assert vislam("tracks", str(folder), "--out", "stills", "--count", "2") == 4
     assert "mine.txt" in one_line()
     assert Path("stills/mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("words", [("--count", "2"), ("--video",)])
+def test_pictures_on_a_full_disk_are_4_and_none_is_left(
+    folder: Path, vislam: Vislam, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        assert vislam("tracks", str(folder), "--out", "stills", *words) == 4
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "stills cannot be written" in capfd.readouterr().err
+    assert not Path("stills").exists()
 
 
 def test_bad_images_are_named(folder: Path, vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,9 +7,10 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
 from toolkit.cli import (
@@ -45,6 +46,8 @@ _ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP"
 _PATIENCE_S = 10.0
 # What writing fails with; of a file such an error is an OutputError already, so that here it is the output's.
 _NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
+# What the system refuses for lack of it, whatever a library makes of that: open files, memory, processes.
+_TOO_FEW = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
@@ -72,23 +75,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
-    with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN):
-        return _guarded(given)
+    with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as asked_to_end:
+        return _guarded(given, asked_to_end)
 
 
-def _guarded(given: list[str]) -> int:
+def _guarded(given: list[str], asked_to_end: Collection[float]) -> int:
     try:
         return _run(given)
     except VislamError as error:
         return _ended_with(str(error), error.exit_status)
     except KeyboardInterrupt:
-        _forget_where_interrupted()
-        return _ended_with("interrupted; what was not finished is not written", _INTERRUPTED)
+        return _interrupted()
     except BrokenPipeError:
         # Nobody reads on, as in `vislam list | head -1`; the interpreter must not try to flush the rest.
         _give_up_output()
         return _READER_GONE
     except Exception as error:  # the last resort: whatever it is, it is told in one line
+        if asked_to_end:  # compiled code may make any error of an interrupt
+            return _interrupted()
         return _unexpected(error)
 
 
@@ -119,20 +123,44 @@ def _unexpected(error: Exception) -> int:
     """Tell in one line what the commands do not foresee, and return its exit status."""
     if os.environ.get(_WITH_TRACEBACK, "0") not in ("", "0"):
         traceback.print_exc()
+    behind = _means_behind(error)
     if isinstance(error, OSError) and error.filename is None and error.errno in _NOT_WRITTEN:
         _give_up_output()
         return _ended_with(
             f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status
         )
-    if isinstance(error, MemoryError):
+    if isinstance(behind, MemoryError):
         return _ended_with("the memory does not suffice; use fewer --workers, or a part of the recording", _SYSTEM)
-    if isinstance(error, OSError):
-        return _ended_with(f"the system refuses to go on: {error}", _SYSTEM)
+    if isinstance(behind, OSError):
+        return _ended_with(f"the system refuses to go on: {behind}", _SYSTEM)
+    if isinstance(behind, ImportError):
+        what_to_do = "allow more memory, or install it again"
+        return _ended_with(f"a library cannot be loaded ({behind}); {what_to_do}", _SYSTEM)
     if isinstance(error, UnicodeError):
         return _ended_with(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
     return _ended_with(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
+
+
+def _means_behind(error: BaseException | None) -> BaseException | None:
+    """Return the lack of the system's means that an error is or comes from, if any: a library may hide one.
+
+    It is no memory, a call that the system refused, or a library of compiled code that it did not load.
+    """
+    if isinstance(error, OSError):
+        return error
+    while error is not None:
+        compiled = isinstance(error, ImportError) and str(error.path).endswith(tuple(EXTENSION_SUFFIXES))
+        if compiled or isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _TOO_FEW):
+            return error
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    return None
+
+
+def _interrupted() -> int:
+    _forget_where_interrupted()
+    return _ended_with("interrupted; what was not finished is not written", _INTERRUPTED)
 
 
 def _forget_where_interrupted() -> None:
@@ -156,12 +184,14 @@ def _ended_with(message: str, status: int) -> int:
 
 
 @contextmanager
-def _ended_once(afterwards: signal.Handlers) -> Iterator[None]:
+def _ended_once(afterwards: signal.Handlers) -> Iterator[Collection[float]]:
     """Treat SIGTERM and SIGHUP like Ctrl-C, and whichever comes first so once: what is half-written is cleaned up.
 
-    When one has come, further ones meet ``afterwards`` or, where that is the default, what they met before: the
-    interpreter of a command has to clean up at its end, too, and that of a notebook goes on. A signal that the caller
-    has us ignore, as nohup does, stays ignored.
+    Gives the times at which one was raised.
+
+    In the end they meet ``afterwards`` or, where that is the default, what they met before: the interpreter of a
+    command has to clean up at its end, and its status is certain; that of a notebook goes on. A signal that the
+    caller has us ignore, as nohup does, stays ignored.
     """
     first: list[float] = []
 
@@ -175,11 +205,11 @@ def _ended_once(afterwards: signal.Handlers) -> Iterator[None]:
         for number in handlers:
             signal.signal(number, interrupt)
     except ValueError:  # only the main thread may do this; embedded elsewhere, signals are not ours
-        yield
+        yield first
         return
     try:
-        yield
+        yield first
     finally:
-        ignored = first and afterwards == signal.SIG_IGN
+        ignored = afterwards == signal.SIG_IGN
         for number, before in handlers.items():
             signal.signal(number, signal.SIG_IGN if ignored else before or signal.SIG_DFL)

@@ -46,7 +46,7 @@ def command(options: argparse.Namespace) -> int:
     recording = replace(recording_asked(options), max_frames=options.max_frames)
     with of_this_process()(options.sequence) as progress:
         sequence, card = recording_card(recording, progress)
-    print(card_text(sequence, card, width_of_output()))
-    if options.json is not None:
+    if options.json is not None:  # before a reader of the output can have gone away
         write_text(options.json, to_text(card_record(card)))
+    print(card_text(sequence, card, width_of_output()))
     return 0

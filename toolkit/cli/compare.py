@@ -166,10 +166,12 @@ def command(options: argparse.Namespace) -> int:
         open_files.enter_context(_kept_when_interrupted(stores))
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
-            if not (options.json or options.quiet):
-                print_above(comparison_text(comparison, columns, width_of_output()))
-            with progress_for(f"{comparison.name}: figures and report"):
-                write_run(comparison, directory, made_by)
+            try:
+                with progress_for(f"{comparison.name}: figures and report"):
+                    write_run(comparison, directory, made_by)
+            finally:  # after the files, which a reader that goes away must not cost; also where they cannot be written
+                if not (options.json or options.quiet):
+                    print_above(comparison_text(comparison, columns, width_of_output()))
             found = _found(comparison, stores.get(directory))
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())

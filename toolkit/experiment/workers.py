@@ -40,6 +40,8 @@ Needs = Callable[[T], Hashable]
 # A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
 _ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
 _PARENT_POLL_S, _POLL_S = 1.0, 0.1
+# What a terminal sends to every process of its group, and the parent alone is to meet.
+_OF_A_TERMINAL = (signal.SIGINT, signal.SIGHUP)
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])
 # Shown for each unit: its frames take the first half, what a smoother does in the end the second.
@@ -88,7 +90,9 @@ def _executor() -> ProcessPoolExecutor:
 
 def _begin(parent: int) -> None:
     """Leave interrupts to the parent, and end where it ends; the whole of a process' preparation."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in _OF_A_TERMINAL:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_A_TERMINAL)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
@@ -101,8 +105,12 @@ def _end_with(parent: int) -> None:
 
 @contextmanager
 def _interrupts_held_back() -> Iterator[None]:
-    """Have processes started here ignore Ctrl-C from their start; one that comes meanwhile is delivered afterwards."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Keep from processes started here what a terminal sends to all of its group: Ctrl-C, and that it is closed.
+
+    A signal that comes meanwhile is delivered afterwards. Loky's tracker of what is shared ignores Ctrl-C alone and
+    stays with the other one held back: were it to die of it, the next one would tell what it does not know.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_A_TERMINAL)
     try:
         yield
     finally:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.errors import DataError
+from toolkit.errors import DataError, OutputError
 from toolkit.files import replaced_directory
 from toolkit.frontend.cameras import Image
 from toolkit.frontend.images import Unusable
@@ -33,7 +33,7 @@ def write_stills(
     with replaced_directory(directory, _written_by_us) as partial:
         for k, image in _drawn(recording, tracks, frames, progress):
             name = f"{int(tracks.t_ns[k])}.png"
-            cv2.imwrite(str(partial / name), image)
+            (partial / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
             names.append(name)
     return tuple(names)
 
@@ -51,7 +51,20 @@ def write_video(
         for _, image in _drawn(recording, tracks, np.arange(tracks.t_ns.size), progress):
             video.write(image)
         video.release()
+        _check_complete(partial / _VIDEO, tracks.t_ns.size, directory)
     return (_VIDEO,)
+
+
+def _check_complete(video: Path, frames: int, directory: Path) -> None:
+    """Raise OutputError unless a video has all of its frames: OpenCV writes it and does not say where it could not."""
+    import cv2
+
+    reader = cv2.VideoCapture(str(video))
+    there = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
+    reader.release()
+    if there != frames:
+        why = f"{there} of {frames} frames of {_VIDEO} are there; is the disk full?"
+        raise OutputError(f"{directory} cannot be written ({why}); choose another directory with --out")
 
 
 def _written_by_us(directory: Path) -> frozenset[str]:
