@@ -30,7 +30,7 @@ from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCor
 from filters.kalman.track_error_states import TrackErrorBelief
 from filters.kalman.track_gate import TrackGate, track_test
 from filters.kalman.tracks_in_view import TracksInView, steps
-from toolkit.arrays import is_among
+from toolkit.arrays import is_among, rows_of
 from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
@@ -166,9 +166,10 @@ class SlidingWindowFilter:
             joint_landmarks.add_tracks(self._joint, sightings.track_ids, points, linearised)
 
     def _forget_clones(self, which: BoolArray) -> None:
+        """Forget poses (C,), which are the oldest."""
         if which.any():
             self._joint.forget_clones(which)
-            self._tracks.drop_columns(which)
+            self._tracks.drop_oldest(int(which.sum()))
             self._clone_t_ns = self._clone_t_ns[~which]
 
 
@@ -200,21 +201,21 @@ class WindowTracks:
 
     def add_frame(self, frame: StereoFrame) -> None:
         """Append the frame's sightings as a new column; ids unknown so far start new tracks."""
-        new = frame.track_ids[~is_among(frame.track_ids, self._ids)]
-        ids = np.concatenate([self._ids, new])
-        count, window = len(ids), self._seen.shape[1] + 1
+        order = np.argsort(self._ids)
+        at, known = rows_of(frame.track_ids, self._ids[order])
+        new = frame.track_ids[~known]
+        before, count, window = len(self._ids), len(self._ids) + len(new), self._seen.shape[1] + 1
+        rows = np.empty(len(known), dtype=np.int64)
+        rows[known], rows[~known] = order[at[known]], np.arange(before, count)
         uvs_px, seen = np.zeros((count, window, 3)), np.zeros((count, window), dtype=bool)
         ages = np.zeros((count, window), dtype=np.int64)
-        known = slice(len(self._ids))
-        uvs_px[known, :-1], seen[known, :-1], ages[known, :-1] = self._uvs_px, self._seen, self._ages
-        order = np.argsort(ids)
-        rows = order[np.searchsorted(ids, frame.track_ids, sorter=order)]
+        uvs_px[:before, :-1], seen[:before, :-1], ages[:before, :-1] = self._uvs_px, self._seen, self._ages
         uvs_px[rows, -1], seen[rows, -1], ages[rows, -1] = frame.uvs_px, True, frame.ages
-        self._ids, self._uvs_px, self._seen, self._ages = ids, uvs_px, seen, ages
+        self._ids, self._uvs_px, self._seen, self._ages = np.concatenate([self._ids, new]), uvs_px, seen, ages
 
-    def drop_columns(self, which: BoolArray) -> None:
-        """Forget what was seen from some poses (W,)."""
-        self._uvs_px, self._seen, self._ages = self._uvs_px[:, ~which], self._seen[:, ~which], self._ages[:, ~which]
+    def drop_oldest(self, count: int) -> None:
+        """Forget what was seen from that many poses."""
+        self._uvs_px, self._seen, self._ages = self._uvs_px[:, count:], self._seen[:, count:], self._ages[:, count:]
         self._keep(np.asarray(self._seen.any(axis=1)))
 
     def ended(self) -> BoolArray:
@@ -231,13 +232,13 @@ class WindowTracks:
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
-        taken = TrackSightings(self._ids[rows], self._uvs_px[rows], self._seen[rows], self._ages[rows])
+        taken = self.unused().select(np.flatnonzero(rows))
         self._keep(np.logical_not(rows))
         return taken
 
     def _keep(self, rows: BoolArray) -> None:
-        self._ids, self._uvs_px = self._ids[rows], self._uvs_px[rows]
-        self._seen, self._ages = self._seen[rows], self._ages[rows]
+        # Places are found once for all four arrays; a mask has them found for each.
+        self._ids, self._uvs_px, self._seen, self._ages = self.unused().select(np.flatnonzero(rows))
 
 
 def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:

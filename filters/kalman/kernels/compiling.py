@@ -15,9 +15,18 @@ from typing import Any
 from numba import njit, types
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Flags, compile_extra
+from numba.core.compiler import CompilerBase, Flags, compile_extra
+from numba.core.compiler_machinery import PassManager
 from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import (
+    IRLegalization,
+    NativeLowering,
+    NoPythonBackend,
+    NopythonTypeInference,
+    PreLowerStripPhis,
+)
 from numba.core.typing.context import Context
+from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, ReconstructSSA, TranslateByteCode
 
 Arrays = tuple[Any, ...]
 ROW, MATRIX, STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
@@ -52,14 +61,41 @@ class _Unfinished(JITCodeLibrary):
         self._finalized = True
 
 
+class _Passes(CompilerBase):
+    """What numba has to do with these functions, which have no closures, generators or whole arrays in expressions.
+
+    It would look for those, and for what to inline, prune and unroll, in a dozen more passes over each.
+    """
+
+    def define_pipelines(self) -> list[PassManager]:
+        """Return the passes, in their order."""
+        passes = PassManager("kernels")
+        for each in (
+            TranslateByteCode,
+            FixupArgs,
+            IRProcessing,
+            GenericRewrites,
+            ReconstructSSA,
+            NopythonTypeInference,
+            PreLowerStripPhis,
+            IRLegalization,
+            NativeLowering,
+            NoPythonBackend,
+        ):
+            passes.add_pass(each, each.__name__)
+        passes.finalize()
+        return [passes]
+
+
 class _Remembering(Context):
     """numba's rules of types, which are asked once what comes of a call with arguments of some types.
 
-    They would try a dozen of them, for arrays, tuples and texts, at each product of two numbers.
+    They would try a dozen of them, for arrays, tuples and texts, at each product of two numbers, and once more where
+    it becomes code.
     """
 
     def __init__(self, rules: Context) -> None:
-        self.__dict__ = {**rules.__dict__, "_signatures": {}}
+        self.__dict__ = {**rules.__dict__, "_signatures": {}, "_asked": {}}
 
     def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
         """Return the signature of a call."""
@@ -70,10 +106,42 @@ class _Remembering(Context):
             self._signatures[key] = super().resolve_function_type(func, args, kws)
         return self._signatures[key]
 
+    def resolve_value_type(self, val: Any) -> Any:
+        """Return the type of a value, of a function one that is asked once."""
+        found = super().resolve_value_type(val)
+        if not isinstance(found, types.BaseFunction):
+            return found
+        if found not in self._asked:
+            self._asked[found] = _asked_once(found)
+        return self._asked[found]
+
+
+def _asked_once(function: Any) -> Any:
+    """Return a type of functions that finds a call's signature once for each types of its arguments."""
+    asked, signatures = object.__new__(type(function)), {}
+
+    def get_call_type(context: Context, args: Any, kws: Any) -> Any:
+        if kws:
+            return function.get_call_type(context, args, kws)
+        if tuple(args) not in signatures:
+            signatures[tuple(args)] = function.get_call_type(context, args, kws)
+        return signatures[tuple(args)]
+
+    asked.__dict__.update(function.__dict__, get_call_type=get_call_type)
+    return asked
+
 
 @cache
 def _remembering(rules: Context) -> Context:
     return _Remembering(rules)
+
+
+def _translated(dispatcher: Any, args: Any, return_type: Any, flags: Flags, library: JITCodeLibrary | None) -> Any:
+    """Return what numba makes of a function for some types of its arguments, in a library of its own if None."""
+    dispatcher.targetdescr.options.parse_as_flags(flags, dispatcher.targetoptions)
+    rules = _remembering(dispatcher.typingctx)
+    target = dispatcher.targetctx.subtarget(typing_context=rules)
+    return compile_extra(rules, target, dispatcher.py_func, args, return_type, flags, {}, library, _Passes)
 
 
 class _Part(CPUDispatcher):
@@ -87,12 +155,10 @@ class _Part(CPUDispatcher):
 
     def _compile_for_callers(self, args: Any, return_type: Any) -> Any:
         """Return what numba makes of the function for some types of its arguments."""
-        flags = Flags()
-        self.targetdescr.options.parse_as_flags(flags, self.targetoptions)
+        flags, target = Flags(), self.targetctx
         flags.no_compile = True
-        rules, target = _remembering(self.typingctx), self.targetctx
         library = _Unfinished(target.codegen(), self.py_func.__qualname__)
-        result = compile_extra(rules, target, self.py_func, args, return_type, flags, {}, library)
+        result = _translated(self, args, return_type, flags, library)
         # By which callers find it: numba takes the function that Python would call, and there is none.
         name = object()
         target.insert_user_function(name, result.fndesc, [library])
@@ -129,18 +195,25 @@ def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Ca
     """
 
     def compile_or_load(function: Callable[..., Any]) -> Any:
-        kernel = njit(**_OPTIONS)(function)
+        kernel = _kernel(function)
         try:
             kernel._cache = _KeptFor(function, sources_of(folder))
             with _without_collections():
                 kernel.compile(signature)
         except (OSError, RuntimeError):
-            kernel = njit(**_OPTIONS)(function)
+            kernel = _kernel(function)
             kernel.compile(signature)
         kernel.disable_compile()
         return kernel
 
     return compile_or_load
+
+
+def _kernel(function: Callable[..., Any]) -> Any:
+    """Return a function that Python may call, not compiled yet."""
+    kernel = njit(**_OPTIONS)(function)
+    kernel._compiler._compile_core = lambda args, return_type: _translated(kernel, args, return_type, Flags(), None)
+    return kernel
 
 
 @contextmanager
