@@ -72,7 +72,7 @@ class ResidualCorrelation:
         if self.share > _MOST_TOLD:
             return ()
         together = self._neighbours.erring_as_one(self.correlation)
-        neighbours = f" and {together:.1f} neighbours err as one" if together > 1.0 else ""
+        neighbours = f" {together:.1f} neighbours as one," if together > 1.0 else ""
         return (
             f"residuals along {self._of} are correlated, {self.correlation:.2f} from frame to frame,{neighbours} and "
             f"not white as stated: {self._of} came to count for {self.share:.2f} of their information",
