@@ -97,9 +97,7 @@ class DiscountedTracks:
         """Take in what the first of two frames saw of points (3,) m, beside the second one, from poses (2, 4, 4)."""
         if self._correlation.matches:
             left = residuals_of(frames, T_world_imu, points, self._rig)
-            self._correlation.add(*left.successive())
-            first = left.select(left.frames == 0)
-            first.add_images_to(self._correlation)
+            self._learn(left, left.select(left.frames == 0))
 
     def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
         """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""
@@ -109,7 +107,11 @@ class DiscountedTracks:
         seen = sightings.of_points(np.flatnonzero(often))
         T, uvs_px = T_world_imu[seen.pose], seen.uv_px
         left = Residuals(seen.point, seen.pose, uvs_px, *_whitened(uvs_px, T, points[seen.point], self._rig))
-        left.sound.add_to(self._correlation)
+        self._learn(left.sound, left.sound)
+
+    def _learn(self, along_tracks: "Residuals", in_images: "Residuals") -> None:
+        self._correlation.add(*along_tracks.successive())
+        self._correlation.add_images(in_images.frames, in_images.uvs_px, in_images.whitened, in_images.H_pose)
 
 
 def seen_often(frames: Iterable[StereoFrame]) -> set[int]:
@@ -145,15 +147,6 @@ class Residuals(NamedTuple):
         before, after = order[:-1], order[1:]
         pairs = (self.tracks[before] == self.tracks[after]) & (self.frames[after] == self.frames[before] + 1)
         return self.whitened[before[pairs]], self.whitened[after[pairs]]
-
-    def add_to(self, correlation: ResidualCorrelation) -> None:
-        """Have a correlation learn how they go together along tracks, and in each image."""
-        correlation.add(*self.successive())
-        self.add_images_to(correlation)
-
-    def add_images_to(self, correlation: ResidualCorrelation) -> None:
-        """Have a correlation learn how they go together in each image."""
-        correlation.add_images(self.frames, self.uvs_px, self.whitened, self.H_pose)
 
 
 def residuals_of(

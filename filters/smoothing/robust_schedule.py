@@ -76,7 +76,7 @@ def solve_robustly(
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
     poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
-    residuals_of(frames, poses, points, rig).add_to(correlation)
+    correlation.add(*residuals_of(frames, poses, points, rig).successive())
     rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
     if values.exists(SCALE):
         sightings = ChainedSightings.of(frames, rig)
