@@ -13,7 +13,8 @@ from scipy.spatial import KDTree
 
 from toolkit.geometry import Array, IntArray
 
-# Neighbours are counted up to these distances (px): about the width of a tracker's patch, and its doubles.
+# Neighbours are counted up to these distances (px): about the width of a tracker's patch, and its doubles. Where to end
+# was chosen with three of the seven drives and MH_01 in view, beyond which nothing is alike.
 _RADII_PX = np.array([20.0, 40.0, 80.0, 160.0])
 # A sum of correlations is beyond chance from so many standard errors on.
 _STANDARD_ERRORS = 4.0
