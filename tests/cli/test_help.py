@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toolkit.cli import simulate
+from toolkit.cli import recordings
 from toolkit.datasets import load_sequence
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Trajectory
@@ -98,7 +98,7 @@ def write_tables(folder: Path) -> None:
 def test_the_scenarios_offered_are_those_there_are() -> None:
     from toolkit.simulation import SCENARIOS
 
-    assert set(simulate.SCENARIOS) == set(SCENARIOS)
+    assert set(recordings.SCENARIOS) == set(SCENARIOS)
 
 
 def test_version_is_printed(vislam: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from evo.tools import file_interface as evo
 
-from toolkit.cli import export, main
+from toolkit.cli import main, runs
 from toolkit.datasets.trajectories import FORMATS, read_poses
 from toolkit.report.records import read_metrics, read_report
 
@@ -170,4 +170,4 @@ def test_a_comparison_over_seeds_has_nothing_to_export(
 
 
 def test_the_formats_offered_are_those_there_are() -> None:
-    assert tuple(FORMATS) == export.FORMATS
+    assert tuple(FORMATS) == runs.FORMATS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toolkit.cli import main
-from toolkit.cli.baseline import command_to_keep
+from toolkit.cli.gate import command_to_keep
 from toolkit.gate.baseline import installed_releases
 
 Vislam = Callable[..., int]

@@ -1,4 +1,4 @@
-"""The command ``vislam``: one module a subcommand, arguments only; whatever is slow to import is imported to run."""
+"""The command ``vislam``: subcommands by what they are about; whatever is slow to import is imported to run."""
 
 import errno
 import io
@@ -13,25 +13,7 @@ from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
 from types import FrameType
 
-from toolkit.cli import (
-    baseline,
-    card,
-    check,
-    check_data,
-    cite,
-    compare,
-    completion,
-    diff,
-    evaluate,
-    export,
-    import_tables,
-    list_parts,
-    report,
-    reproduce,
-    simulate,
-    tracks,
-    verify,
-)
+from toolkit.cli import compare, completion, evaluate, gate, parts, recordings, runs
 from toolkit.cli.arguments import Parser, ShowVersion, epilog
 from toolkit.errors import OutputError, VislamError, printable
 
@@ -51,8 +33,9 @@ _TOO_FEW = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
-    *(compare, evaluate, diff, report, export, reproduce),
-    *(check, baseline, check_data, card, verify, list_parts, cite, simulate, tracks, import_tables, completion),
+    *(compare.compare, evaluate.evaluate, runs.diff, runs.report, runs.export, runs.reproduce),
+    *(gate.check, gate.baseline, recordings.check_data, recordings.card, parts.verify, parts.list_parts, parts.cite),
+    *(recordings.simulate, recordings.tracks, recordings.import_tables, completion.completion),
 )
 
 
@@ -66,8 +49,8 @@ def parser() -> Parser:
     )
     root.add_argument("--version", action=ShowVersion, help="print the version and exit")
     subcommands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in _COMMANDS:
-        module.add_to(subcommands)
+    for command in _COMMANDS:
+        command.add_to(subcommands)
     return root
 
 

@@ -5,9 +5,10 @@ import math
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
 from toolkit.errors import VislamError, did_you_mean, no_such, printable
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     Subcommands = argparse._SubParsersAction["Parser"]
 
     from toolkit.experiment.recording import Recording
-    from toolkit.gate.trajectory_check import GivenRuns, Truths
     from toolkit.settings import Settings
 
 # Each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
@@ -119,6 +119,32 @@ def epilog(*examples: str) -> str:
     return f"example:\n{lines}\n\n{_EXIT_STATUSES}"
 
 
+class Command(NamedTuple):
+    """A subcommand: its words in the help, what adds its arguments, and what runs it and returns the exit status."""
+
+    name: str
+    summary: str
+    examples: tuple[str, ...]
+    add_arguments: Callable[[Parser], None]
+    run: Callable[[argparse.Namespace], int]
+
+    def add_to(self, subcommands: "Subcommands") -> None:
+        """Add the parser of the subcommand; it puts what runs into ``command``."""
+        description = " ".join((self.run.__doc__ or "").split())
+        parser = subcommands.add_parser(
+            self.name, help=self.summary, description=description, epilog=epilog(*self.examples)
+        )
+        self.add_arguments(parser)
+        parser.set_defaults(command=self.run)
+
+
+def command(
+    name: str, summary: str, *examples: str, arguments: Callable[[Parser], None] = lambda _: None
+) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+    """Make a subcommand of the function that runs it; the function's docstring is the description in its help."""
+    return partial(Command, name, summary, examples, arguments)
+
+
 def names(text: str) -> tuple[str, ...]:
     """Parse names separated by commas; each counts once."""
     found = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
@@ -133,33 +159,6 @@ def named_file(text: str) -> tuple[str, Path]:
     if not (equals and name.strip() and file):
         raise argparse.ArgumentTypeError(f"expected NAME=FILE, not {text!r}")
     return name.strip(), Path(file)
-
-
-def runs_given(place: Path, truths: Iterable[str]) -> "GivenRuns":
-    """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
-
-    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none.
-    """
-    from toolkit.gate.trajectory_check import FolderOfRuns
-
-    if place.is_dir() or place.suffix != ".json":
-        return FolderOfRuns(place, _truths_given(truths))
-    from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
-
-    if list(truths):
-        raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
-    return EvaluatedRuns(place, read_evaluation(place))
-
-
-def _truths_given(given: Iterable[str]) -> "Truths":
-    """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
-    from toolkit.gate.trajectory_check import Truths
-
-    named = [text.partition("=") for text in given if "=" in text and not Path(text).is_dir()]
-    folders = [Path(text) for text in given if "=" not in text or Path(text).is_dir()]
-    if len(folders) > 1:
-        raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
-    return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})
 
 
 def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
@@ -276,6 +275,13 @@ def settings_asked(options: argparse.Namespace) -> "Settings":
     return settings_of(with_assignments(values, assignments_asked(options)), place)
 
 
+def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "the exit status tells") -> None:
+    """Add --json, with what it prints, and --quiet, with where the answer is then; at most one can be given."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--json", action="store_true", help=f"print {as_json}")
+    group.add_argument("--quiet", action="store_true", help=f"print nothing; {quiet}")
+
+
 def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:
     """Add the number of processes; None stands for one a CPU."""
     parser.add_argument("--workers", metavar="N", type=at_least(1, MOST_WORKERS), help=f"{what} (default: one a CPU)")
@@ -329,6 +335,14 @@ def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_mutually_exclusive_group()
     group.add_argument("--no-repair", action="store_true", help="report the faults of a recording, repair none")
     group.add_argument("--keep", metavar="FAULT,...", type=names, default=(), help="do not repair these (see list)")
+
+
+def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the recording, its seed, and what the audit may repair; read it with :func:`recording_asked`."""
+    parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")
+    add_repair_arguments(parser)
+    add_tracks_argument(parser)
+    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of a simulated sequence (default: 0)")
 
 
 def recording_asked(options: argparse.Namespace) -> "Recording":

@@ -14,6 +14,7 @@ from toolkit.cli.arguments import (
     Interrupted,
     UsageError,
     add_estimators_argument,
+    add_output_arguments,
     add_part_arguments,
     add_repair_arguments,
     add_settings_arguments,
@@ -21,7 +22,7 @@ from toolkit.cli.arguments import (
     add_workers_argument,
     assignments_asked,
     at_least,
-    epilog,
+    command,
     kept_faults,
     named_file,
     names,
@@ -32,7 +33,6 @@ from toolkit.errors import VislamError, printable
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from toolkit.cli.arguments import Subcommands
     from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
@@ -41,43 +41,6 @@ if TYPE_CHECKING:
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
-
-
-def add_to(subcommands: Subcommands) -> None:
-    """Add the subcommand."""
-    parser = subcommands.add_parser(
-        "compare",
-        help="run estimators on the same measurements and compare them",
-        description="Run estimators on the same measurements of each SEQUENCE and compare them: a table here, and a "
-        "run directory with report, metrics, trajectories, landmarks and figures.",
-        epilog=epilog("vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive"),
-    )
-    _add_what_to_compare(parser)
-    add_part_arguments(parser)
-    add_repair_arguments(parser)
-    parser.add_argument(
-        "--start",
-        choices=("measurements", "truth"),
-        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
-    )
-    add_tracks_argument(parser)
-    _add_seeds(parser)
-    parser.add_argument(
-        "--columns",
-        metavar="NAME,...",
-        type=names,
-        default=(),
-        help="of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
-    )
-    add_settings_arguments(parser)
-    add_workers_argument(parser)
-    _add_what_is_shown(parser)
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
-    )
-    parser.set_defaults(command=command)
 
 
 def _add_what_to_compare(parser: argparse.ArgumentParser) -> None:
@@ -138,15 +101,49 @@ def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
         default="png",
         help="of the figures; pdf and svg stay sharp in a paper (default: png)",
     )
-    printed = parser.add_mutually_exclusive_group()
-    printed.add_argument(
-        "--json", action="store_true", help="print what metrics.json or seeds.json holds, a line a SEQUENCE, no table"
+    add_output_arguments(
+        parser, "what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"
     )
-    printed.add_argument("--quiet", action="store_true", help="print nothing; the run directory has everything")
 
 
-def command(options: argparse.Namespace) -> int:
-    """Compare, print and return 1 where an estimator diverged or failed."""
+def _compare_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_what_to_compare(parser)
+    add_part_arguments(parser)
+    add_repair_arguments(parser)
+    parser.add_argument(
+        "--start",
+        choices=("measurements", "truth"),
+        help="where the first state comes from; a start from the truth is labelled (default: measurements)",
+    )
+    add_tracks_argument(parser)
+    _add_seeds(parser)
+    parser.add_argument(
+        "--columns",
+        metavar="NAME,...",
+        type=names,
+        default=(),
+        help="of the table: metrics by key or name, or all; bound: how close each comes to the Cramér-Rao bound",
+    )
+    add_settings_arguments(parser)
+    add_workers_argument(parser)
+    _add_what_is_shown(parser)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the Dask cluster whose scheduler is there, as in tcp://host:8786 (see docs/scaling.md)",
+    )
+
+
+@command(
+    "compare",
+    "run estimators on the same measurements and compare them",
+    "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
+    arguments=_compare_arguments,
+)
+def compare(options: argparse.Namespace) -> int:
+    """Run estimators on the same measurements of each SEQUENCE and compare them: a table here, and a run directory
+    with report, metrics, trajectories, landmarks and figures.
+    """
     from toolkit.documents import to_line
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.progress import of_this_process, print_above

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, NamedTuple
 
-from toolkit.cli.arguments import epilog
+from toolkit.cli.arguments import command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from toolkit.cli.arguments import Subcommands
 
 _SHELLS = ("bash", "zsh", "fish")
 
@@ -32,23 +31,21 @@ class _Command(NamedTuple):
     options: tuple[_Option, ...]
 
 
-def add_to(subcommands: Subcommands) -> None:
-    """Add the subcommand."""
-    parser = subcommands.add_parser(
-        "completion",
-        help="print what a shell needs to complete vislam's words",
-        description="Print a script that completes commands, options, their choices, and the names of estimators, "
-        "built-in sequences, metrics, faults and settings that are installed now. bash and zsh: put "
-        'eval "$(vislam completion bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as '
-        "~/.config/fish/completions/vislam.fish.",
-        epilog=epilog("vislam completion bash"),
-    )
+def _completion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shell", choices=_SHELLS, help="which shell")
-    parser.set_defaults(command=command)
 
 
-def command(options: argparse.Namespace) -> int:
-    """Print the script."""
+@command(
+    "completion",
+    "print what a shell needs to complete vislam's words",
+    "vislam completion bash",
+    arguments=_completion_arguments,
+)
+def completion(options: argparse.Namespace) -> int:
+    """Print a script that completes commands, options, their choices, and the names of estimators, built-in
+    sequences, metrics, faults and settings that are installed now. bash and zsh: put eval "$(vislam completion
+    bash)" into ~/.bashrc, or zsh into ~/.zshrc. fish: save the output as ~/.config/fish/completions/vislam.fish.
+    """
     from toolkit.cli import parser
 
     commands = list(_commands(parser(), _known_names()))

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     UsageError,
+    add_output_arguments,
     add_workers_argument,
     at_least,
-    epilog,
+    command,
     known_names,
     names,
     positive_seconds,
@@ -18,56 +19,10 @@ from toolkit.cli.arguments import (
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from toolkit.cli.arguments import Subcommands
     from toolkit.evaluation.standings import Evaluation
     from toolkit.metrics import Metric
 
 _FORMATS = ("text", "markdown", "csv", "latex")
-
-
-def add_to(subcommands: Subcommands) -> None:
-    """Add the subcommand."""
-    parser = subcommands.add_parser(
-        "evaluate",
-        help="score trajectory files of any systems against the truth",
-        description="Score trajectory files against the truth, without a recording: every error with its alignment, "
-        "time coverage, medians over runs, ranks and paired tests over sequences, failures counted. See "
-        "docs/evaluate.md.",
-        epilog=epilog(
-            "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
-            "vislam evaluate runs/drive/trajectories/truth.tum "
-            "ekf=runs/drive/trajectories/ekf_causal.tum --out runs/scores",
-        ),
-    )
-    parser.add_argument(
-        "truth", metavar="TRUTH", type=Path, help="a file of one sequence, or a folder that has SEQUENCE.tum"
-    )
-    parser.add_argument(
-        "given",
-        metavar="NAME=FILE|FOLDER",
-        nargs="+",
-        help="with one truth NAME=FILE, FILE, or NAME=FOLDER of repeated runs; with a folder of truths NAME=FOLDER "
-        "with SEQUENCE.tum or SEQUENCE/RUN.tum, or a FOLDER that has such a folder for each system",
-    )
-    _add_terms(parser)
-    parser.add_argument(
-        "--metric", metavar="KEY", default="ate_se3_m", help="what ranks and is tested (default: ate_se3_m)"
-    )
-    parser.add_argument(
-        "--columns", metavar="KEY,...", type=names, default=(), help="metrics of the table, or all (default: the usual)"
-    )
-    parser.add_argument("--format", choices=_FORMATS, default="text", help="of what is printed (default: text)")
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--json", action="store_true", help="print evaluation.json, and nothing else")
-    what.add_argument("--quiet", action="store_true", help="print nothing; the exit status and --out tell")
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        help="write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV",
-    )
-    add_workers_argument(parser)
-    parser.set_defaults(command=command)
 
 
 def _add_terms(parser: argparse.ArgumentParser) -> None:
@@ -102,8 +57,46 @@ def _add_terms(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def command(options: argparse.Namespace) -> int:
-    """Evaluate, print, write and return 1 where a run failed."""
+def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "truth", metavar="TRUTH", type=Path, help="a file of one sequence, or a folder that has SEQUENCE.tum"
+    )
+    parser.add_argument(
+        "given",
+        metavar="NAME=FILE|FOLDER",
+        nargs="+",
+        help="with one truth NAME=FILE, FILE, or NAME=FOLDER of repeated runs; with a folder of truths NAME=FOLDER "
+        "with SEQUENCE.tum or SEQUENCE/RUN.tum, or a FOLDER that has such a folder for each system",
+    )
+    _add_terms(parser)
+    parser.add_argument(
+        "--metric", metavar="KEY", default="ate_se3_m", help="what ranks and is tested (default: ate_se3_m)"
+    )
+    parser.add_argument(
+        "--columns", metavar="KEY,...", type=names, default=(), help="metrics of the table, or all (default: the usual)"
+    )
+    parser.add_argument("--format", choices=_FORMATS, default="text", help="of what is printed (default: text)")
+    add_output_arguments(parser, "evaluation.json, and nothing else", "the exit status and --out tell")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="write evaluation.json, the leaderboard as a page and as Markdown, and all runs as CSV",
+    )
+    add_workers_argument(parser)
+
+
+@command(
+    "evaluate",
+    "score trajectory files of any systems against the truth",
+    "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
+    "vislam evaluate runs/drive/trajectories/truth.tum ekf=runs/drive/trajectories/ekf_causal.tum --out runs/scores",
+    arguments=_evaluate_arguments,
+)
+def evaluate(options: argparse.Namespace) -> int:
+    """Score trajectory files against the truth, without a recording: every error with its alignment, time coverage,
+    medians over runs, ranks and paired tests over sequences, failures counted. See docs/evaluate.md.
+    """
     from toolkit.evaluation.gathering import gather
     from toolkit.evaluation.scoring import Terms
     from toolkit.evaluation.standings import evaluate

@@ -1,0 +1,338 @@
+"""``vislam baseline`` and ``check``: what is measured once, and whether anything got worse than it, or moved."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import (
+    UsageError,
+    add_estimators_argument,
+    add_settings_arguments,
+    add_workers_argument,
+    at_least,
+    command,
+    positive_seconds,
+    settings_asked,
+)
+from toolkit.errors import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from toolkit.gate.baseline import Baseline, Case
+    from toolkit.gate.trajectory_check import GivenRuns, Truths
+    from toolkit.gate.verdict import Check
+
+SEEDS, FEWEST_SEEDS = 24, 5
+_FILES = {"junit": "JUnit XML", "markdown": "Markdown for a pull request", "json": "JSON"}
+
+
+def _add_trajectories_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("baselines of another system's trajectories")
+    group.add_argument(
+        "--trajectories",
+        metavar="DIR|FILE",
+        type=Path,
+        help="run nothing; score the files SEQUENCE.tum or SEQUENCE/RUN.tum, of frames or keyframes, against --truth; "
+        "or take the scores of an evaluation.json",
+    )
+    group.add_argument(
+        "--align",
+        choices=("se3", "yaw", "sim3"),
+        help="what is fitted before positions are compared (default: se3; sim3 where scale is not observed)",
+    )
+    group.add_argument(
+        "--gap",
+        metavar="S",
+        type=positive_seconds,
+        help="the longest time between two keyframes that counts as covered (default: 5)",
+    )
+
+
+def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "sequences",
+        metavar="SEQUENCE",
+        nargs="*",
+        help="a built-in name, or a recording's path from here or from the folder VISLAM_DATA; drive:5 is 5 s of it",
+    )
+    add_estimators_argument(parser, "what to measure, see 'vislam list'")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
+    parser.add_argument(
+        "--seeds",
+        metavar="N",
+        type=at_least(FEWEST_SEEDS),
+        default=SEEDS,
+        help=f"seeds of each simulated sequence, from 0 (default: {SEEDS})",
+    )
+    parser.add_argument(
+        "--repeats", metavar="N", type=at_least(1), default=1, help="runs of each recorded sequence (default: 1)"
+    )
+    parser.add_argument(
+        "--duration",
+        metavar="S",
+        type=positive_seconds,
+        help="seconds of every sequence without its own (default: all of it)",
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="SEQUENCE=FILE.tum",
+        action="append",
+        default=[],
+        help="ground truth of a recorded sequence, from the same places; may be given several times; with "
+        "--trajectories also a folder that has SEQUENCE.tum",
+    )
+    _add_trajectories_arguments(parser)
+    add_settings_arguments(parser)
+    add_workers_argument(parser)
+
+
+@command(
+    "baseline",
+    "measure the baseline that vislam check compares with",
+    "vislam baseline drive --estimators dead-reckoning,ekf --seeds 5 --duration 2 --out baseline.json",
+    arguments=_baseline_arguments,
+)
+def baseline(options: argparse.Namespace) -> int:
+    """Measure estimators on sequences and write what vislam check compares with: simulated sequences over many
+    seeds, recorded ones once. See docs/gate.md.
+    """
+    if options.trajectories is not None:
+        return _baseline_of_trajectories(options)
+    if options.align or options.gap:
+        raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
+    from toolkit.experiment.workers import usable_cpus
+    from toolkit.files import check_writable, write_text
+    from toolkit.gate.baseline import releases_in_a_name
+    from toolkit.gate.baseline_file import to_text
+    from toolkit.gate.checking import new_baseline
+    from toolkit.progress import of_this_process
+    from toolkit.report.manifest import made_here
+
+    cases = _cases(options)
+    out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
+    check_writable(out)
+    workers = options.workers or usable_cpus()
+    made_by = made_here(command_to_keep(options.command_line))
+    made = new_baseline(cases, workers, made_by, of_this_process(), settings_asked(options))
+    write_text(out, to_text(made))
+    ends = list(_bad_ends(made))
+    print("\n".join(map(printable, [*ends, f"baseline: {out}"])))
+    return 1 if ends else 0
+
+
+def _baseline_of_trajectories(options: argparse.Namespace) -> int:
+    from toolkit.files import check_writable, write_text
+    from toolkit.gate.trajectory_baseline import to_text
+    from toolkit.gate.trajectory_check import new_trajectory_baseline
+    from toolkit.gate.trajectory_files import Scoring
+    from toolkit.report.manifest import made_here
+
+    if options.sequences or options.estimators or options.duration or options.set or options.config:
+        raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
+    out = options.out or Path("trajectory-baseline.json")
+    check_writable(out)
+    scoring = Scoring(options.align or Scoring.align, options.gap or Scoring.gap_s)
+    made_by = made_here(command_to_keep(options.command_line))
+    made = new_trajectory_baseline(_runs_given(options.trajectories, options.truth), scoring, made_by)
+    write_text(out, to_text(made))
+    runs = sum(len(one.files) for one in made.sequences.values())
+    print(printable(f"baseline: {out} ({len(made.sequences)} sequences, {runs} runs)"))
+    return 0
+
+
+def command_to_keep(words: list[str]) -> str:
+    """Return the command line with the output's name alone: a baseline is shared, and its folder is of one machine."""
+    kept = []
+    for before, word in pairwise(["", *words]):
+        option, _, file = word.partition("=")
+        if before == "--out":
+            kept.append(Path(word).name)
+        elif option == "--out" and file:
+            kept.append(f"--out={Path(file).name}")
+        else:
+            kept.append(word)
+    return shlex.join(kept)
+
+
+def _cases(options: argparse.Namespace) -> list[Case]:
+    """Return the cases the command line asks for."""
+    from toolkit.datasets import is_drawn_from_a_seed
+    from toolkit.estimator import defaults, find_all
+    from toolkit.gate.baseline import Case
+    from toolkit.gate.measuring import located
+
+    if not options.sequences:
+        raise UsageError("name a SEQUENCE, or --trajectories DIR (see vislam baseline --help)")
+    estimators = tuple(find_all(options.estimators or defaults()))
+    truths = dict(_split(text, "=", "--truth takes SEQUENCE=FILE.tum") for text in options.truth)
+    cases = []
+    for given in options.sequences:
+        source, seconds = _with_duration(given)
+        simulated = is_drawn_from_a_seed(located(source))
+        seeds = tuple(range(options.seeds if simulated else options.repeats))
+        cases.append(Case(source, simulated, seeds, estimators, seconds or options.duration, truths.pop(source, None)))
+    if len({case.source for case in cases}) != len(cases):
+        raise UsageError("a sequence is named twice (see vislam baseline --help)")
+    if truths:
+        raise UsageError(f"--truth is for {next(iter(truths))}, which is none of the sequences")
+    if any(case.simulated and case.truth for case in cases):
+        raise UsageError("--truth is for recorded sequences; a simulated one has its own")
+    return cases
+
+
+def _split(text: str, separator: str, otherwise: str) -> tuple[str, str]:
+    name, found, value = text.partition(separator)
+    if not found or not name or not value:
+        raise UsageError(f"{otherwise}, not {text}")
+    return name, value
+
+
+def _with_duration(given: str) -> tuple[str, float | None]:
+    """Split ``drive:5`` into the sequence and its seconds; a colon before anything but a number is the path's own."""
+    source, _, seconds = given.rpartition(":")
+    try:
+        return (source, positive_seconds(seconds)) if source else (given, None)
+    except argparse.ArgumentTypeError:
+        return given, None
+
+
+def _bad_ends(baseline: Baseline) -> Iterator[str]:
+    """Yield every estimator that did not end well somewhere."""
+    for case, measured in baseline.cases:
+        for name, series in measured.runs.items():
+            bad = sum(status != "ok" for status in series.status)
+            if bad:
+                yield f"{case.source}: {name} did not end well in {bad} of {len(series.status)} runs: {series.why}"
+
+
+def _check_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--baseline",
+        metavar="FILE",
+        type=Path,
+        required=True,
+        help="what vislam baseline wrote; of a folder, the one for the releases installed here",
+    )
+    add_workers_argument(parser)
+    for name, what in _FILES.items():
+        parser.add_argument(f"--{name}", metavar="FILE", type=Path, help=f"write the verdicts as {what}")
+    parser.add_argument(
+        "--trajectories",
+        metavar="DIR|FILE",
+        type=Path,
+        help="run nothing; judge another system's files, SEQUENCE.tum or SEQUENCE/RUN.tum, or the evaluation.json that "
+        "vislam evaluate made of them, against a baseline that vislam baseline --trajectories wrote",
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="DIR|SEQUENCE=FILE",
+        action="append",
+        default=[],
+        help="with --trajectories: where the truth is, if not where it was for the baseline",
+    )
+    parser.add_argument(
+        "--accept-better",
+        action="store_true",
+        help="let results that moved pass unless they are worse, as after a change that is meant to move them",
+    )
+    parser.add_argument("--skip-speed", action="store_true", help="do not judge time, as on a machine of another make")
+    parser.add_argument(
+        "--speed-against",
+        metavar="REVISION|WHEEL",
+        help="judge time by runs in turn with another version of the code: a git revision of the checkout you stand "
+        "in, or a wheel; sees 15 %%, on any machine",
+    )
+    parser.add_argument(
+        "--allow-other-releases",
+        action="store_true",
+        help="compare although GTSAM or NumPy is another release than the baseline's",
+    )
+
+
+@command(
+    "check",
+    "fail if accuracy, consistency or speed are not a baseline's",
+    "vislam baseline drive --estimators dead-reckoning --seeds 5 --duration 2 --out baseline.json",
+    "vislam check --baseline baseline.json --skip-speed",
+    arguments=_check_arguments,
+)
+def check(options: argparse.Namespace) -> int:
+    """Run again what a baseline lists, on the same measurements, and fail where accuracy, consistency, held-out
+    reprojection or speed got worse, an answer moved, or anything is missing. With --trajectories, judge files of
+    another system in the same way. See docs/gate.md.
+    """
+    from toolkit.files import check_writable
+    from toolkit.report.gate import gate_text, write_check
+    from toolkit.report.prose import width_of_output
+
+    files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
+    for path in files.values():
+        check_writable(path)
+    checked = _check_of_estimators(options) if options.trajectories is None else _check_of_trajectories(options)
+    write_check(checked, files)
+    print(gate_text(checked, width_of_output()))
+    return 0 if checked.passed else 1
+
+
+def _check_of_estimators(options: argparse.Namespace) -> Check:
+    from toolkit.experiment.workers import usable_cpus
+    from toolkit.gate.baseline_file import check_releases, load_baseline
+    from toolkit.gate.checking import How, check
+    from toolkit.progress import of_this_process
+
+    if options.speed_against and options.skip_speed:
+        raise UsageError("--speed-against and --skip-speed exclude each other")
+    if options.truth:
+        raise UsageError("--truth goes with --trajectories; a baseline of estimators names its own truth")
+    baseline = load_baseline(options.baseline)
+    if not options.allow_other_releases:
+        check_releases(baseline, str(options.baseline))
+    how = How(
+        options.workers or usable_cpus(),
+        speed=not options.skip_speed,
+        accept_better=options.accept_better,
+        speed_against=options.speed_against,
+    )
+    return check(baseline, str(options.baseline), how, of_this_process())
+
+
+def _check_of_trajectories(options: argparse.Namespace) -> Check:
+    from toolkit.gate.trajectory_baseline import load_trajectory_baseline
+    from toolkit.gate.trajectory_check import check_trajectories
+
+    if options.speed_against:
+        raise UsageError("--speed-against times estimators; with --trajectories nothing runs")
+    baseline, given = load_trajectory_baseline(options.baseline), _runs_given(options.trajectories, options.truth)
+    return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)
+
+
+def _runs_given(place: Path, truths: Iterable[str]) -> GivenRuns:
+    """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
+
+    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none.
+    """
+    from toolkit.gate.trajectory_check import FolderOfRuns
+
+    if place.is_dir() or place.suffix != ".json":
+        return FolderOfRuns(place, _truths_given(truths))
+    from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
+
+    if list(truths):
+        raise UsageError(f"--truth goes with a folder of trajectories; {place} was scored against its own")
+    return EvaluatedRuns(place, read_evaluation(place))
+
+
+def _truths_given(given: Iterable[str]) -> Truths:
+    """Return what --truth says, a folder or SEQUENCE=FILE; raises UsageError for two folders."""
+    from toolkit.gate.trajectory_check import Truths
+
+    named = [text.partition("=") for text in given if "=" in text and not Path(text).is_dir()]
+    folders = [Path(text) for text in given if "=" not in text or Path(text).is_dir()]
+    if len(folders) > 1:
+        raise UsageError(f"--truth names two folders, {folders[0]} and {folders[1]}; give one")
+    return Truths(folders[0] if folders else None, {name: Path(file) for name, _, file in named})

@@ -1,0 +1,101 @@
+"""``vislam list``, ``cite`` and ``verify``: the estimators, formats and metrics there are, and one of your own."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import add_output_arguments, command
+
+if TYPE_CHECKING:
+    from toolkit.estimator import EstimatorEntry
+    from toolkit.settings import Described
+
+
+@command("list", "list estimators, built-in sequences, formats, metrics, faults and settings", "vislam list")
+def list_parts(_options: argparse.Namespace) -> int:
+    """List what can be named on the command line: estimators, built-in sequences, the formats that are recognised,
+    metrics, the faults the audit knows, and settings.
+    """
+    from toolkit import datasets, metrics
+    from toolkit.audit import faults
+    from toolkit.estimator import discover
+    from toolkit.report.prose import width_of_output
+    from toolkit.report.terminal import listing_text
+    from toolkit.settings import describe
+
+    sections = {
+        "estimators": {name: _estimator(entry) for name, entry in discover().items()},
+        "built-in sequences": dict.fromkeys(datasets.built_in_names(), ""),
+        "formats": datasets.formats() | _marked(datasets.unavailable()),
+        "metrics": metrics.describe() | _marked(metrics.unavailable()),
+        "faults": faults(),
+        "settings": {one.key: _setting(one) for one in describe()},
+    }
+    print("\n\n".join(listing_text(title, entries, width_of_output()) for title, entries in sections.items()))
+    return 0
+
+
+def _estimator(entry: EstimatorEntry) -> str:
+    ignored = "".join(f" (not {rule}: {why})" for rule, why in entry.ignores().items())
+    return f"{entry.summary()}{' (default)' if entry.is_default() else ''}{ignored}"
+
+
+def _setting(one: Described) -> str:
+    facts = (one.unit, f"default {one.default}", one.range)
+    return f"{one.meaning} [{', '.join(filter(None, facts))}]"
+
+
+def _marked(unavailable: Mapping[str, str]) -> dict[str, str]:
+    return {name: f"unavailable: {why}" for name, why in unavailable.items()}
+
+
+def _cite_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "names", metavar="NAME|RUN_DIR", nargs="*", help="an estimator, a format, an estimator's file, a run directory"
+    )
+
+
+@command("cite", "print BibTeX for estimators and data sets", "vislam cite msckf-fej euroc", arguments=_cite_arguments)
+def cite(options: argparse.Namespace) -> int:
+    """Print BibTeX for estimators, data sets or whatever a run directory compared; for all of them without a name."""
+    from toolkit.report.citations import bibtex, citations
+
+    print(bibtex(citations(options.names)), end="")
+    return 0
+
+
+def _verify_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "estimator", metavar="FILE.py|NAME", help="a file or a module with build(setup), or an installed estimator"
+    )
+    add_output_arguments(parser, "the result as JSON")
+
+
+@command(
+    "verify",
+    "check that an estimator of your own keeps what every estimator promises",
+    "vislam verify dead-reckoning",
+    arguments=_verify_arguments,
+)
+def verify(options: argparse.Namespace) -> int:
+    """Run an estimator on simulated recordings and check what every estimator promises: it is causal and
+    deterministic, on any number of threads; it changes nothing it was given; its numbers are finite, its
+    covariances sound and honest; it survives every planted fault. What failed is named, with what to do.
+    """
+    from toolkit.documents import to_text
+    from toolkit.progress import of_this_process
+    from toolkit.report.prose import width_of_output
+    from toolkit.report.verify_text import verification_document, verification_text
+    from toolkit.verify.subject import subject_of
+    from toolkit.verify.verification import verify
+
+    subject = subject_of(options.estimator)
+    with of_this_process()(f"{subject.name}: promises") as progress:
+        found = verify(subject, options.estimator, progress)
+    if options.json:
+        print(to_text(verification_document(found)), end="")
+    elif not options.quiet:
+        print(verification_text(found, width_of_output()))
+    return 0 if found.passed else 1

@@ -1,0 +1,262 @@
+"""``vislam check-data``, ``card``, ``tracks``, ``simulate`` and ``import``: look at a recording, or make one."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import (
+    UsageError,
+    add_recording_arguments,
+    add_settings_arguments,
+    add_topics_argument,
+    at_least,
+    command,
+    positive_seconds,
+    recording_asked,
+    settings_asked,
+)
+from toolkit.errors import printable
+
+if TYPE_CHECKING:
+    from toolkit.frontend import ImageTracks
+    from toolkit.simulation import Scenario
+
+# Repeated from toolkit.simulation.SCENARIOS (a test compares them), which would cost the help half a second.
+SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
+LENSES = ("none", "radtan", "equidistant")
+_LONGEST_EXPOSURE_MS = 40
+_ONLY_WITH_IMAGES = ("lens", "blur", "moving")
+
+
+def _check_data_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth, to check that the two overlap")
+    add_recording_arguments(parser)
+
+
+@command("check-data", "find the faults of a recording", "vislam check-data drive", arguments=_check_data_arguments)
+def check_data(options: argparse.Namespace) -> int:
+    """Find the faults of a recording from its data alone and say which of them are repaired when it is used. Fails
+    on a fault that is not repaired.
+    """
+    from toolkit.experiment.recording import audited_recording
+    from toolkit.progress import of_this_process
+    from toolkit.report.prose import width_of_output
+    from toolkit.report.terminal import audit_text
+
+    recording = replace(recording_asked(options), truth=options.truth)
+    with of_this_process()(options.sequence) as progress:
+        audited = audited_recording(recording, progress)
+    print(audit_text(audited, width_of_output()))
+    return 1 if any(finding.blocking for finding in audited.findings) else 0
+
+
+def _card_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the card as JSON, too (see docs/tracks.md)")
+    parser.add_argument("--max-frames", metavar="N", type=at_least(2), help="use the first N frames only")
+    add_recording_arguments(parser)
+
+
+@command(
+    "card",
+    "say what the tracks of a recording are like",
+    "vislam card drive-realistic --max-frames 60",
+    arguments=_card_arguments,
+)
+def card(options: argparse.Namespace) -> int:
+    """Fit the noise of a recording's tracks and say what they are like: how errors along a track are correlated,
+    how many are at odds with the motion, how vision's scale compares with the measured motion. No truth is used.
+    """
+    from toolkit.documents import to_text
+    from toolkit.experiment.recording import recording_card
+    from toolkit.files import check_writable, write_text
+    from toolkit.progress import of_this_process
+    from toolkit.report.card import card_record, card_text
+    from toolkit.report.prose import width_of_output
+
+    if options.json is not None:
+        check_writable(options.json)
+    recording = replace(recording_asked(options), max_frames=options.max_frames)
+    with of_this_process()(options.sequence) as progress:
+        sequence, card = recording_card(recording, progress)
+    if options.json is not None:  # before a reader of the output can have gone away
+        write_text(options.json, to_text(card_record(card)))
+    print(card_text(sequence, card, width_of_output()))
+    return 0
+
+
+def _tracks_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--count", metavar="N", type=at_least(1), default=10, help="how many stills (default: 10)")
+    what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
+    add_topics_argument(parser)
+    add_settings_arguments(parser)
+
+
+@command(
+    "tracks",
+    "draw stereo tracks over the images they were made of",
+    "vislam tracks kitti/sequences/06 --out stills --count 4",
+    arguments=_tracks_arguments,
+)
+def tracks(options: argparse.Namespace) -> int:
+    """Make the stereo tracks of a folder of images, as compare does, and write stills of them: left and right image
+    side by side, a circle a track, blue where it is new, red where it is old.
+    """
+    import msgspec
+
+    from toolkit.datasets import load_images
+    from toolkit.files import check_parent
+    from toolkit.frontend import track_images
+    from toolkit.frontend.stills import write_stills, write_video
+    from toolkit.progress import of_this_process
+
+    frontend = settings_asked(options).frontend
+    if options.topics is not None:
+        frontend = msgspec.structs.replace(frontend, topics=options.topics)
+    check_parent(options.out.parent)
+    recording = load_images(options.images, frontend)
+    with of_this_process()(options.images) as progress:
+        tracks = track_images(recording.pairs, recording.rig, frontend, progress)
+        if options.video:
+            names = write_video(recording, tracks, options.out, progress)
+        else:
+            names = write_stills(recording, tracks, options.out, options.count, progress)
+    print(f"{printable(options.images)}: {_summary(tracks)}")
+    for skipped in tracks.skipped:
+        print(f"left out: {printable(skipped)}")
+    print(f"{printable(str(options.out))}: {', '.join(names)}")
+    return 0
+
+
+def _summary(tracks: ImageTracks) -> str:
+    """Return the tracks in one line: how many a frame, and how long they live."""
+    import numpy as np
+
+    a_frame = np.bincount(tracks.frame, minlength=tracks.t_ns.size)
+    lives = np.unique(tracks.track_id, return_counts=True)[1]
+    alive = f", seen in {np.median(lives):.0f} frames in the median" if lives.size else ""
+    return f"{tracks.t_ns.size} pairs, {a_frame.mean():.0f} tracks a frame ({a_frame.min()} at least){alive}"
+
+
+def _exposure_ms(text: str) -> float:
+    """Parse an exposure that ends before the next one begins."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= _LONGEST_EXPOSURE_MS:
+        raise argparse.ArgumentTypeError(f"expected milliseconds from 0 to {_LONGEST_EXPOSURE_MS}, not {text!r}")
+    return value
+
+
+def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenario", choices=SCENARIOS, help="what moves, and where")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
+    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="draws every error (default: 0)")
+    parser.add_argument("--duration", metavar="S", type=positive_seconds, help="seconds (default: the scenario's)")
+    images = parser.add_argument_group("images")
+    images.add_argument("--images", action="store_true", help="render the images of a stereo pair (flight)")
+    images.add_argument(
+        "--lens", choices=LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
+    )
+    images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
+    images.add_argument("--moving", metavar="N", type=at_least(0), help="crates that fly about (default: 0)")
+
+
+@command(
+    "simulate",
+    "write a simulated recording",
+    "vislam simulate drive --out recordings/drive-seed-1 --seed 1 --duration 5",
+    "vislam simulate flight --images --lens radtan --out recordings/filmed --duration 0.5",
+    arguments=_simulate_arguments,
+)
+def simulate(options: argparse.Namespace) -> int:
+    """Write a simulated recording with exact truth; the same seed gives the same bits. With --images it is a folder
+    of stereo images in EuRoC's layout, 0.4 MB a pair.
+    """
+    from dataclasses import replace
+
+    from toolkit.datasets import vislam_recording
+    from toolkit.simulation import SCENARIOS as KNOWN
+    from toolkit.simulation import simulate
+
+    scenario = KNOWN[options.scenario]
+    if options.duration is not None:
+        scenario = replace(scenario, duration_s=options.duration)
+    asked = [name for name in _ONLY_WITH_IMAGES if getattr(options, name) is not None]
+    if options.images:
+        return _film(scenario, options)
+    if asked:
+        raise UsageError(f"--{asked[0]} is of images; add --images")
+    vislam_recording.check_folder(options.out)
+    sequence = simulate(scenario, options.seed)
+    vislam_recording.save(sequence, options.out)
+    print(
+        f"{printable(str(options.out))}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, "
+        f"{len(sequence.observations)} stereo observations, {sequence.motion_kind}, seed {options.seed}"
+    )
+    return 0
+
+
+def _film(scenario: Scenario, options: argparse.Namespace) -> int:
+    """Render the images, with the time that is left, and say what was written."""
+    from toolkit.progress import of_this_process
+    from toolkit.simulation.filming import Filming, film
+
+    filming = Filming(options.lens or "none", (options.blur or 0.0) / 1000.0, options.moving or 0)
+    with of_this_process()(str(options.out)) as progress:
+        sequence = film(scenario, options.seed, options.out, filming, progress)
+    print(
+        f"{printable(str(options.out))}: {sequence.frame_count} stereo pairs, {sequence.duration_s:.1f} s, "
+        f"{sequence.motion_kind}, seed {options.seed}"
+    )
+    return 0
+
+
+def _import_tables_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--tracks", metavar="FILE.csv", type=Path, required=True, help="t, track_id, uL, uR and v, or vL and vR"
+    )
+    parser.add_argument(
+        "--motion",
+        metavar="FILE.csv",
+        type=Path,
+        required=True,
+        help="t and ax, ay, az, gx, gy, gz of an IMU, or vx, vy, vz, wx, wy, wz of the body",
+    )
+    parser.add_argument(
+        "--rig", metavar="FILE.toml", type=Path, required=True, help="calibration of the rectified pair, and noise"
+    )
+    parser.add_argument("--truth", metavar="FILE.tum", type=Path, help="ground truth")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
+
+
+@command(
+    "import",
+    "make a recording of your own tables",
+    "vislam import --tracks tracks.csv --motion twist.csv --rig rig.toml --truth truth.tum --out recordings/own",
+    arguments=_import_tables_arguments,
+)
+def import_tables(options: argparse.Namespace) -> int:
+    """Make a recording of stereo tracks, IMU samples or body velocities, and a calibration in tables of your own.
+    Their columns, units and axes are in docs/own-data.md.
+    """
+    from toolkit.datasets import own_tables, vislam_recording
+
+    vislam_recording.check_folder(options.out)
+    read = own_tables.read(options.out.resolve().name, options.tracks, options.motion, options.rig, options.truth)
+    vislam_recording.save(read.sequence, options.out)
+    sequence = read.sequence
+    truth = "no truth" if sequence.truth is None else f"truth of {sequence.truth.t_ns.size} poses"
+    print(
+        f"{printable(str(options.out))}: {sequence.frame_count} frames, {sequence.duration_s:.1f} s, "
+        f"{len(sequence.observations)} stereo observations, {sequence.motion_kind}, {truth}"
+    )
+    for name in read.unused:
+        print(f"not used: {printable(name)}")
+    return 0

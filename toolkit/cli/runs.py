@@ -1,0 +1,214 @@
+"""``vislam report``, ``export``, ``diff`` and ``reproduce``: what is done with run directories."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from contextlib import ExitStack, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names
+from toolkit.errors import VislamError, printable
+
+if TYPE_CHECKING:
+    from toolkit.report.bundle import BundleRecord
+    from toolkit.report.differences import Differences
+
+_NAME = "report.html"
+# Repeated from toolkit.datasets.trajectories.FORMATS (a test compares them), which would cost the help half a second.
+FORMATS = ("tum", "kitti", "euroc", "openvins")
+_MOST_PACKAGES = 12
+
+
+def _report_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("runs", metavar="RUN_DIR", nargs="+", type=Path, help="as vislam compare writes it")
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help=f"the page (default: {_NAME} in the run directory; ./{_NAME} for several)",
+    )
+
+
+@command(
+    "report",
+    "show run directories as one interactive HTML page",
+    "vislam compare drive --estimators dead-reckoning,ekf --max-frames 40 --out runs/drive",
+    "vislam report runs/drive",
+    arguments=_report_arguments,
+)
+def report(options: argparse.Namespace) -> int:
+    """Write one HTML file that opens from disk, with all it needs inside: the table, the trajectories from above
+    and in three dimensions, errors, consistency, time, and what to know in words. Several run directories are laid
+    side by side.
+    """
+    from toolkit.report.html import write_html
+
+    target = options.out
+    if target is None:
+        target = options.runs[0] / _NAME if len(options.runs) == 1 else Path(_NAME)
+    write_html(options.runs, target)
+    print(printable(f"report: {target}"))
+    return 0
+
+
+def _export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN_DIR", type=Path, help="as vislam compare writes it")
+    parser.add_argument("--estimator", metavar="NAME", help="whose, or truth (default: the only one there is)")
+    parser.add_argument("--output", choices=("causal", "final"), help="default: final, where there is one")
+    parser.add_argument("--format", choices=FORMATS, help="of the file; KITTI has no stamps")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="the file to write")
+    parser.add_argument(
+        "--bundle",
+        metavar="FILE.zip",
+        type=Path,
+        help="write settings, versions, hashes, trajectories and metrics of the run as one file for vislam reproduce",
+    )
+
+
+@command(
+    "export",
+    "write a trajectory of a run directory in another program's format, or a bundle",
+    "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
+    "vislam export runs/drive --format kitti --out drive.kitti",
+    "vislam export runs/drive --bundle drive.zip",
+    arguments=_export_arguments,
+)
+def export(options: argparse.Namespace) -> int:
+    """Write a trajectory of a run directory as a TUM, KITTI, EuRoC or OpenVINS file. Poses are those of the IMU in
+    the estimator's world; nothing is aligned. Or bundle what others need to repeat the run.
+    """
+    if options.bundle is not None:
+        return _bundle(options)
+    if options.format is None or options.out is None:
+        raise UsageError("give --format and --out for a trajectory, or --bundle (see vislam export --help)")
+    from toolkit.report.export import export
+
+    written = export(options.run, options.estimator, options.output, options.format, options.out)
+    print(printable(f"{options.out}: {written}"))
+    return 0
+
+
+def _bundle(options: argparse.Namespace) -> int:
+    from toolkit.report.bundle import write_bundle
+
+    if options.format or options.out or options.estimator or options.output:
+        raise UsageError("--bundle goes without --format, --out, --estimator and --output: it has everything")
+    written = write_bundle(options.run, options.bundle)
+    print(printable(f"{options.bundle}: {written}"))
+    return 0
+
+
+def _diff_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("before", metavar="RUN_A", type=Path, help="as vislam compare writes it")
+    parser.add_argument("after", metavar="RUN_B", type=Path, help="the one that is held against it")
+    parser.add_argument(
+        "--columns", metavar="KEY,...", type=names, default=(), help="metrics to show, or all (default: the tables')"
+    )
+    parser.add_argument("--json", action="store_true", help="print every metric and difference as JSON")
+
+
+@command(
+    "diff",
+    "tell what differs between two run directories",
+    "vislam compare drive --estimators ekf --max-frames 40 --out runs/before",
+    "vislam compare drive --estimators ekf --max-frames 40 --set noise.motion_scale=1.2 --out runs/after",
+    "vislam diff runs/before runs/after",
+    arguments=_diff_arguments,
+)
+def diff(options: argparse.Namespace) -> int:
+    """Tell what differs between two run directories: settings, versions, data, how runs ended, and the metrics that
+    moved; over seeds also which of them moved by more than chance.
+    """
+    from toolkit.documents import to_text
+    from toolkit.metrics import known_metrics, metrics_called
+    from toolkit.report.diff_text import diff_document, diff_text
+    from toolkit.report.differences import differences
+    from toolkit.report.prose import width_of_output
+    from toolkit.report.run_files import read_run
+
+    try:
+        columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
+    except VislamError as error:
+        raise UsageError(str(error)) from error
+    found = differences(read_run(options.before), read_run(options.after))
+    if options.json:
+        print(to_text(diff_document(found)), end="")
+    else:
+        print(diff_text(found, columns, width_of_output()))
+    return 0
+
+
+def _reproduce_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("bundle", metavar="BUNDLE", type=Path, help="as vislam export --bundle writes it")
+    parser.add_argument("--data", metavar="SEQUENCE", help="where the recording is here, if not where it was there")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="keep the new run directory (default: it is not kept)")
+    add_output_arguments(parser, "every difference as JSON, and nothing else")
+    add_workers_argument(parser)
+
+
+@command(
+    "reproduce",
+    "run what is in a bundle again and tell what differs",
+    "vislam compare drive --estimators dead-reckoning --max-frames 40 --out runs/drive",
+    "vislam export runs/drive --bundle drive.zip",
+    "vislam reproduce drive.zip",
+    arguments=_reproduce_arguments,
+)
+def reproduce(options: argparse.Namespace) -> int:
+    """Run again, with the settings in a bundle that vislam export --bundle made, and tell what differs: versions,
+    data, how runs ended, metrics. Exits 1 where a result but time and memory is another one.
+    """
+    import tempfile
+
+    from toolkit.documents import to_text
+    from toolkit.report.bundle import unpack_bundle
+    from toolkit.report.diff_text import diff_document
+    from toolkit.report.differences import differences
+    from toolkit.report.run_files import read_run
+
+    with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
+        there = Path(folder) / "there"
+        record = unpack_bundle(options.bundle, there)
+        before = read_run(there)
+        out = Path(folder) / "here" if options.out is None else options.out
+        _run_again(there, out, options)
+        found = replace(differences(before, read_run(out)), names=(str(options.bundle), str(out)))
+    if options.json:
+        print(to_text(diff_document(found)), end="")
+    elif not options.quiet:
+        _print(found, record, options)
+    return 0 if found.same_results else 1
+
+
+def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
+    """Do what vislam compare does with the bundle's manifest; what it prints is not of interest here."""
+    from toolkit.cli import parser
+    from toolkit.report.run_directory import MANIFEST
+
+    sequence = [] if options.data is None else [options.data]
+    workers = [] if options.workers is None else ["--workers", str(options.workers)]
+    words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers]
+    asked = parser().parse_args(words)
+    asked.command_line = ["vislam", *words]
+    with ExitStack() as stack:
+        nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123
+        stack.enter_context(redirect_stdout(nowhere))
+        asked.command(asked)
+
+
+def _print(found: Differences, record: BundleRecord, options: argparse.Namespace) -> None:
+    from toolkit.report.bundle import installed_packages
+    from toolkit.report.diff_text import diff_text
+    from toolkit.report.prose import width_of_output
+
+    here = installed_packages()
+    others = [f"{name} {release}" for name, release in record.packages.items() if here.get(name) != release]
+    print(diff_text(found, width=width_of_output()))
+    if others:
+        more = f" and {len(others) - _MOST_PACKAGES} more" if len(others) > _MOST_PACKAGES else ""
+        print(printable(f"not installed here in the bundle's release: {', '.join(others[:_MOST_PACKAGES])}{more}"))
+    verdict = "reproduced" if found.same_results else "not reproduced: what differs is above"
+    print(printable(f"{options.bundle}: {verdict}"))
