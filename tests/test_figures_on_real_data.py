@@ -10,7 +10,7 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.datasets import load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.estimate import Output, Run
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import score_run

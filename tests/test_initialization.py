@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import Array, about_z, interpolate_poses, so3_exp, so3_log, yaw_of
 from toolkit.initialization import start_from_measurements, start_from_truth

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import toolkit
 from toolkit.datasets import load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import VislamError
 from toolkit.sequence import Sequence
 from toolkit.simulation import faults

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import kitti00, load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.geometry import interpolate_poses, se3_inverse, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples

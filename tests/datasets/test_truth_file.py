@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import course_npz
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory

@@ -22,7 +22,7 @@ import pytest
 from toolkit.audit import audit
 from toolkit.cli import main
 from toolkit.datasets import load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories import tum
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.geometry import se3_exp

@@ -17,7 +17,6 @@ import numpy as np
 
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, observations, stamps_ns
 from toolkit.datasets.io.image_pairs import facts_of, rig_of
-from toolkit.datasets.io.image_spool import ImageSpool
 from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
 from toolkit.datasets.io.sparse import Layout, Named, corners_of, sightings, sparse_array
 from toolkit.errors import DataError
@@ -30,6 +29,7 @@ from toolkit.frontend import (
     rectified,
     track_images,
 )
+from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
 from toolkit.inputs import is_regular, open_input
 from toolkit.measured_motion import TwistSamples

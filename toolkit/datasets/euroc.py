@@ -26,18 +26,27 @@ from toolkit.datasets.io.euroc_calibration import (
 )
 from toolkit.datasets.io.euroc_truth import choose_truth, find_truth
 from toolkit.datasets.io.fields import check_frame_count, observations
-from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock, check_one_trigger
-from toolkit.datasets.io.image_pairs import facts_of, image_folder, images_in, pairs_of_asl, rig_of
+from toolkit.datasets.io.image_pairs import (
+    check_both_cameras,
+    check_one_clock,
+    check_one_trigger,
+    facts_of,
+    image_folder,
+    images_in,
+    pairs_of_asl,
+    rig_of,
+)
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
-from toolkit.datasets.io.tracks_along import tracks_in_a_room
-from toolkit.datasets.io.truth_at_frames import stamps_within, truth_at, truth_near
+from toolkit.datasets.io.truth import stamps_within, truth_at, truth_near
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, rectified, track_images
+from toolkit.geometry import Array
 from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuSamples
 from toolkit.progress import Progress
-from toolkit.sequence import Provenance, Sequence
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
 from toolkit.settings import Frontend, Tracks
+from toolkit.simulation import sensors, world
 from toolkit.simulation.filming import is_simulated
 from toolkit.simulation.scene_errors import with_scene_errors
 from toolkit.simulation.world import Camera
@@ -55,6 +64,13 @@ _MAX_TRACKS, _RATE_HZ, _LOSS_PER_FRAME = 100, 20.0, 0.02
 _NEARLY_ALL = 0.9
 # Up to 14 m the disparity stays five standard deviations above zero.
 _DEPTH_M = (0.5, 14.0)
+# The walls stand this far outside the box of all positions: below, beside and above.
+_MARGIN_LOWER_M, _MARGIN_UPPER_M = np.array([2.0, 2.0, 1.0]), np.array([2.0, 2.0, 1.5])
+# So dense that a pair with EuRoC's field of view has 100 landmarks before it at 2 m from a wall.
+_LANDMARKS_PER_M2 = 20.0
+# A hall of 100 m by 100 m by 20 m; what flies farther flies outdoors, and a damaged truth farther still.
+_MOST_SURFACE_M2 = 28_000.0
+_WORLD_SEED = 20  # draws the landmarks, the same for every seed of the noise
 
 
 @dataclass(frozen=True)
@@ -155,7 +171,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
         rig=calibration.rig,
         noise=calibration.noise,
         frames_t_ns=frames_t_ns,
-        observations=tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
+        observations=_tracks_in_a_room(truth.T_world_imu, calibration.rig, camera, seed).observations,
         motion=imu,
         provenance=Provenance(
             "euroc",
@@ -257,3 +273,37 @@ def _how_simulated(layout: _Layout) -> str:
     if is_simulated(layout.root):
         return f"{ALL_SIMULATED} ({tracks}): no image was read"
     return f"{SIMULATED} ({tracks}): no image was read, and errors of the truth appear as errors of the IMU"
+
+
+@dataclass(frozen=True, eq=False)
+class _RoomTracks:
+    """The tracks, and the landmarks (M, 3) in the world that they are of."""
+
+    observations: Observations
+    points: Array
+
+
+def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: Camera, seed: int) -> _RoomTracks:
+    """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance.
+
+    The room belongs to the trajectory; the seed draws the chance ends of tracks, what is followed, and the
+    noise, each from a stream of its own. The same arguments give the same bits. Raises DataError where the
+    trajectory is too large for a room.
+    """
+    tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
+    points = _room_around(T_world_imu[:, :3, 3])
+    tracks = world.follow(world.visibility(points, T_world_imu, rig, camera), camera, tracks_rng)
+    exact = sensors.sightings(tracks, points, T_world_imu, rig)
+    noisy = sensors.with_pixel_noise(exact, 1.0, rig.cov_uv_px2, camera.step_px, pixels_rng)
+    # Track ids grow with time and a frame's places keep their order, so the rows are sorted already.
+    return _RoomTracks(noisy, points)
+
+
+def _room_around(positions: Array) -> Array:
+    lower, upper = positions.min(axis=0) - _MARGIN_LOWER_M, positions.max(axis=0) + _MARGIN_UPPER_M
+    size = upper - lower
+    surface_m2 = 2.0 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+    if not surface_m2 < _MOST_SURFACE_M2:
+        raise DataError(f"the truth spans {np.ptp(positions, axis=0).max():.3g} m, more than a room; check its unit")
+    count = round(_LANDMARKS_PER_M2 * surface_m2)
+    return world.room(lower, upper, count, np.random.default_rng(_WORLD_SEED))

@@ -13,8 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
-from toolkit.datasets.io.image_checks import check_both_cameras, check_several_stamps
-from toolkit.datasets.io.image_pairs import Listed, facts_of, images_in, images_only, pairs_by_name, rig_of
+from toolkit.datasets.io.image_pairs import (
+    Listed,
+    check_both_cameras,
+    check_several_stamps,
+    facts_of,
+    images_in,
+    images_only,
+    pairs_by_name,
+    rig_of,
+)
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
 from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images

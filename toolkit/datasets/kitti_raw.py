@@ -4,18 +4,24 @@ A folder with ``image_00/data`` and ``image_01/data`` (or ``image_02`` and ``ima
 it or beside it, and ``oxts/data``. Packets at 50 Hz or more are read as an IMU, slower ones as body twists; without any
 a smooth motion is assumed. Whether images are rectified shows in their size. Truth and motion are of one instrument.
 Axes of the IMU: forward, left, up. Source: Geiger, Lenz, Stiller & Urtasun, "Vision meets robotics: the KITTI dataset"
-(IJRR 2013), and the readme of its development kit for the 30 values of a packet.
+(IJRR 2013), and the readme of its development kit for the 30 values of a packet; positions are projected as that kit
+does, by Mercator's projection scaled at the first latitude.
 """
 
+from __future__ import annotations
+
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, observations
-from toolkit.datasets.io.image_checks import check_both_cameras, check_one_clock, check_several_stamps
+from toolkit.datasets.io.fields import Fields, check_frame_count, observations, rigid
 from toolkit.datasets.io.image_pairs import (
     Listed,
+    check_both_cameras,
+    check_one_clock,
+    check_several_stamps,
     facts_of,
     image_folder,
     images_in,
@@ -23,11 +29,10 @@ from toolkit.datasets.io.image_pairs import (
     pairs_by_stamps,
     rig_of,
 )
-from toolkit.datasets.io.kitti_calibration import PairMounting, day_of, mounting
-from toolkit.datasets.io.oxts import Packets, read_packets, read_stamps
 from toolkit.errors import DataError
-from toolkit.frontend import ImageRecording, size_of, track_images
-from toolkit.inputs import is_regular
+from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified, size_of, track_images
+from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
+from toolkit.inputs import is_regular, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, NoSamples, TwistSamples
 from toolkit.models.noise import twist_noise, unmeasured_motion
 from toolkit.progress import SILENT, Progress
@@ -43,6 +48,14 @@ _IMU_FROM_HZ = 50.0
 _IMU_NOISE = ImuNoise(
     accel_noise_density=0.01, gyro_noise_density=1.75e-4, accel_random_walk=1.67e-4, gyro_random_walk=2.91e-6
 )
+_FILES = {"calib_cam_to_cam.txt": "", "calib_velo_to_cam.txt": "velo_to_cam.", "calib_imu_to_velo.txt": "imu_to_velo."}
+_VALUES = 30
+# Where in a packet stand: latitude, longitude (deg), altitude (m); roll, pitch, yaw (rad); north, east, up (m/s).
+_PLACE, _ANGLES, _NORTH_EAST_UP = slice(0, 3), slice(3, 6), [6, 7, 10]
+# Of the body: specific force (m/s^2) and rates (rad/s).
+_ACCEL, _RATES = slice(11, 14), slice(17, 20)
+_EARTH_RADIUS_M = 6378137.0
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -87,7 +100,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     mounted, listed = _mounted(layout), _listed(layout)
     tracks = track_images(listed.pairs, mounted.pair, frontend, progress)
     check_frame_count(layout.root, tracks.t_ns.size)
-    packets = read_packets(layout.root / "oxts")
+    packets = _read_packets(layout.root / "oxts")
     if packets is not None:
         check_one_clock(layout.root, tracks.t_ns, packets.t_ns, "the oxts packets")
     motion, noise, how = _motion(packets, tracks.t_ns)
@@ -121,18 +134,18 @@ def _whole(path: Path) -> _Layout:
 
 def _listed(layout: _Layout) -> Listed:
     left, right = (layout.camera(side) / "timestamps.txt" for side in (0, 1))
-    stamps = read_stamps(left)
-    right_stamps = read_stamps(right) if is_regular(right) else stamps
+    stamps = _read_stamps(left)
+    right_stamps = _read_stamps(right) if is_regular(right) else stamps
     listed = pairs_by_stamps(layout.images(0), layout.images(1), stamps, right_stamps)
     check_several_stamps(left, listed)
     return listed
 
 
-def _mounted(layout: _Layout) -> PairMounting:
+def _mounted(layout: _Layout) -> _PairMounting:
     found = images_in(layout.images(0)) or images_in(layout.images(1))
     size_px = next((size for size in map(_size_or_none, found[:10]) if size is not None), None)
-    day: Fields = day_of(layout.root)
-    return mounting(day, layout.sides, size_of(found[0]) if size_px is None else size_px)
+    day: Fields = _day_of(layout.root)
+    return _mounting(day, layout.sides, size_of(found[0]) if size_px is None else size_px)
 
 
 def _size_or_none(path: Path) -> tuple[int, int] | None:
@@ -142,7 +155,7 @@ def _size_or_none(path: Path) -> tuple[int, int] | None:
         return None
 
 
-def _motion(packets: Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSamples, MotionNoise, str]:
+def _motion(packets: _Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSamples, MotionNoise, str]:
     """Return the motion samples, their noise, and which they are in words."""
     if packets is None:
         how = "no oxts: no motion input, all estimators assume a motion that is smooth"
@@ -156,7 +169,184 @@ def _motion(packets: Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSam
     return TwistSamples(packets.t_ns, v_mps, packets.w_radps), twist_noise(packets.t_ns, v_mps, packets.w_radps), how
 
 
-def _truth(packets: Packets) -> Truth:
+def _truth(packets: _Packets) -> Truth:
     """Return the poses of the same instrument, in order of time."""
     t_ns, first = np.unique(packets.t_ns, return_index=True)
     return Truth(t_ns, packets.T_world_imu[first], packets.v_world[first], independent=False)
+
+
+@dataclass(frozen=True, eq=False)
+class _PairMounting:
+    """A pair for the front end, where its left camera is mounted, as it was before rectification, and how one knows."""
+
+    pair: RectifiedPair
+    T_imu_left: Array
+    source: str
+
+
+def _day_of(root: Path) -> Fields:
+    """Read the three files of a drive's day, in its folder or the one above it.
+
+    Raises DataError where one is missing or not made of names and numbers.
+    """
+    folder = next((f for f in (root, root.parent) if is_regular(f / "calib_cam_to_cam.txt")), root.parent)
+    arrays: dict[str, np.ndarray] = {}
+    for name, prefix in _FILES.items():
+        text = read_text_input(folder / name, "KITTI's calibration is text")
+        for line in text.splitlines():
+            key, colon, rest = line.partition(":")
+            if not colon:
+                continue
+            try:
+                arrays[prefix + key.strip()] = np.array([float(word) for word in rest.split()])
+            except ValueError:
+                continue  # a date
+    return Fields(folder / "calib_cam_to_cam.txt", arrays)
+
+
+def _mounting(day: Fields, sides: tuple[str, str], size_px: tuple[int, int]) -> _PairMounting:
+    """Return the pair of two cameras, as "00" and "01", whose images have a size: the rectified one, or the sensor's.
+
+    Raises DataError where a value is missing or impossible, or images have neither size.
+    """
+    names = [f"{what}_{side}" for side in sides for what in ("S", "K", "D", "R", "T", "S_rect", "P_rect")]
+    day.require(*names, "R_rect_00", *(f"{p}{key}" for p in list(_FILES.values())[1:] for key in ("R", "T")))
+    T_velo_imu, T_cam0_velo = _rigid_motion(day, "imu_to_velo."), _rigid_motion(day, "velo_to_cam.")
+    T_cam0_imu = T_cam0_velo @ T_velo_imu
+    rectified_px, raw_px = (_size(day, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
+    if size_px == rectified_px:
+        T_rect_cam0 = se3(day.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
+        return _already(day, sides, size_px, rigid(day.path, "R_rect_00", T_rect_cam0) @ T_cam0_imu)
+    if size_px != raw_px:
+        raise DataError(f"{day.path}: images of {size_px} px are neither rectified, {rectified_px}, nor raw, {raw_px}")
+    cameras = [_camera(day, side) for side in sides]
+    T_left_cam0, T_right_cam0 = (_rigid_motion(day, "", f"_{side}") for side in sides)
+    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0))
+    return _PairMounting(
+        pair, se3_inverse(T_left_cam0 @ T_cam0_imu), "raw images, rectified with the day's calibration"
+    )
+
+
+def _already(day: Fields, sides: tuple[str, str], size_px: tuple[int, int], T_rect_imu: Array) -> _PairMounting:
+    left, right = (day.constant(f"P_rect_{side}", 12).reshape(3, 4) for side in sides)
+    fx, fy, cx, cy = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
+    baseline_m = float((left[0, 3] - right[0, 3]) / fx) if fx > 0.0 else 0.0
+    if not (fy > 0.0 and baseline_m > 0.0):
+        raise DataError(
+            f"{day.path}: P_rect_{sides[0]} and P_rect_{sides[1]} are not those of a left and a right camera"
+        )
+    T_left_rect = se3(np.eye(3), np.linalg.inv(left[:, :3]) @ left[:, 3])
+    pair = already_rectified((fx, fy, cx, cy), baseline_m, size_px)
+    return _PairMounting(pair, se3_inverse(T_left_rect @ T_rect_imu), "images rectified as the data set has them")
+
+
+def _camera(day: Fields, side: str) -> Camera:
+    K = day.constant(f"K_{side}", 9).reshape(3, 3)
+    pinhole = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    if not (pinhole[0] > 0.0 and pinhole[1] > 0.0):
+        raise DataError(f"{day.path}: K_{side} has no positive focal lengths")
+    return Camera(pinhole, "radtan", day.constant(f"D_{side}", 5), _size(day, f"S_{side}"))
+
+
+def _size(day: Fields, key: str) -> tuple[int, int]:
+    width, height = day.constant(key, 2)
+    return int(width), int(height)
+
+
+def _rigid_motion(day: Fields, prefix: str, suffix: str = "") -> Array:
+    """Return the rigid motion (4, 4) of an R and a T."""
+    rotation = day.constant(f"{prefix}R{suffix}", 9).reshape(3, 3)
+    return rigid(day.path, f"{prefix}R{suffix}", se3(rotation, day.constant(f"{prefix}T{suffix}", 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Packets:
+    """Packets (S,) in the order of their files: poses (S, 4, 4), velocities, specific force and rates (S, 3).
+
+    The world is east, north, up from the first place; the body forward, left, up.
+    """
+
+    t_ns: IntArray
+    T_world_imu: Array
+    v_world: Array
+    accel_mps2: Array
+    w_radps: Array
+
+    @property
+    def v_body_mps(self) -> Array:
+        """Return the velocities (S, 3) in the body's axes."""
+        return np.asarray(np.einsum("nji,nj->ni", self.T_world_imu[:, :3, :3], self.v_world))
+
+
+def _read_packets(folder: Path) -> _Packets | None:
+    """Read the packets that have a stamp; None where there is no such folder.
+
+    Raises DataError, naming the file, where one does not hold thirty finite numbers.
+    """
+    if not folder.is_dir():
+        return None
+    stamps = _read_stamps(folder / "timestamps.txt")
+    files = {int(path.stem): path for path in (folder / "data").glob("*.txt") if path.stem.isdecimal()}
+    numbers = [number for number in sorted(files) if number in stamps]
+    if len(numbers) < 2:
+        raise DataError(f"{folder}: {len(numbers)} packets with a stamp; copy oxts/data and oxts/timestamps.txt again")
+    rows = np.stack([_packet(files[number]) for number in numbers])
+    north, east, up = rows[:, _NORTH_EAST_UP].T
+    return _Packets(
+        np.array([stamps[number] for number in numbers], dtype=np.int64),
+        se3(_attitudes(rows[:, _ANGLES]), _positions(rows[:, _PLACE])),
+        np.stack([east, north, up], axis=1),
+        rows[:, _ACCEL],
+        rows[:, _RATES],
+    )
+
+
+def _read_stamps(file: Path) -> dict[int, int]:
+    """Return the stamp (ns) of each row number of a timestamps.txt; blank rows, as unsynced drives have, have none.
+
+    Raises DataError, naming the line, where one is no date and time.
+    """
+    stamps = {}
+    for row, line in enumerate(read_text_input(file, "expected a date and time in each line").splitlines()):
+        if not line.strip():
+            continue
+        try:
+            stamps[row] = _stamp_ns(line.strip())
+        except ValueError as error:
+            raise DataError(
+                f"{file}: line {row + 1} is no date and time; write it as in 2011-09-26 13:02:25.96"
+            ) from error
+    if not stamps:
+        raise DataError(f"{file}: holds no stamps; copy it again")
+    return stamps
+
+
+def _stamp_ns(words: str) -> int:
+    """Return the nanoseconds since 1970 of a date and time; raises ValueError where it is none."""
+    if not _STAMP.fullmatch(words):
+        raise ValueError(words)
+    return int(np.datetime64(words.replace(" ", "T"), "ns").astype(np.int64))
+
+
+def _packet(file: Path) -> Array:
+    try:
+        values = np.array([float(word) for word in read_text_input(file, "a packet is text").split()])
+    except ValueError as error:
+        raise DataError(f"{file}: {error}; expected {_VALUES} numbers") from error
+    if values.size != _VALUES or not np.isfinite(values).all():
+        raise DataError(f"{file}: {values.size} numbers, expected {_VALUES} finite ones; copy it again")
+    return values
+
+
+def _positions(places: Array) -> Array:
+    """Return (S, 3) m east, north and up of the first of some places (S, 3) deg, deg, m."""
+    latitude, longitude = np.deg2rad(places[:, :2]).T
+    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
+    mapped = np.stack([scale * longitude, scale * np.log(np.tan(np.pi / 4.0 + latitude / 2.0)), places[:, 2]], axis=1)
+    return np.asarray(mapped - mapped[0])
+
+
+def _attitudes(angles: Array) -> Array:
+    """Return rotations (S, 3, 3) of roll, pitch and yaw (S, 3) rad: about z, then y, then x."""
+    about = [so3_exp(angles[:, i : i + 1] * np.eye(3)[i]) for i in range(3)]
+    return np.asarray(about[2] @ about[1] @ about[0])

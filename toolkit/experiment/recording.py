@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.audit import Audit, Finding, audit
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.datasets import load_sequence
-from toolkit.datasets.io.truth_file import load_truth, with_truth
+from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
 from toolkit.linear_algebra import on_one_thread

@@ -1,10 +1,15 @@
-"""Tracks kept on disk under the hash of what they were made of: images, calibration, settings and this front end.
+"""What the front end has on disk: tracks under the hash of what they were made of, and images unpacked for it.
 
-``VISLAM_CACHE`` names the folder, by default ``vislam`` in the user's folder for caches. Any of it may be deleted.
+Tracks depend on images, calibration, settings and this front end. Images that come inside of another file are written
+one by one, for the front end reads image files, and go when their spool is closed, is no longer used or the program
+ends. ``VISLAM_CACHE`` names the folder, by default ``vislam`` in the user's folder for caches; any of it may go.
 """
 
 import hashlib
 import os
+import shutil
+import tempfile
+import weakref
 import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from toolkit.errors import DataError, OutputError
 from toolkit.files import content_digest, replaced_file
@@ -81,3 +87,38 @@ def _digest(path: Path) -> str:
         return hashlib.sha256(read_input(path)).hexdigest()
     except DataError:
         return "missing"
+
+
+class ImageSpool:
+    """A folder of images that is there as long as the spool is."""
+
+    def __init__(self) -> None:
+        try:
+            folder().mkdir(parents=True, exist_ok=True)
+            self.folder = Path(tempfile.mkdtemp(prefix="images-", dir=folder()))
+        except OSError as error:
+            raise _unwritable(error) from error
+        self.close = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def add_grey(self, name: str, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Path:
+        """Write grey values (height, width) of 8 or 16 bits as PGM and return the path; raises OutputError."""
+        height, width = image.shape
+        most = np.iinfo(image.dtype).max
+        header = f"P5\n{width} {height}\n{most}\n".encode()
+        # PGM has the high byte first.
+        return self.add(f"{name}.pgm", header + image.astype(image.dtype.newbyteorder(">")).tobytes())
+
+    def add(self, name: str, content: bytes) -> Path:
+        """Write the content of an image file and return its path; raises OutputError where that cannot be."""
+        path = self.folder / name
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        except OSError as error:
+            raise _unwritable(error) from error
+        return path
+
+
+def _unwritable(error: OSError) -> OutputError:
+    why = error.strerror or error
+    return OutputError(f"{folder()}: images cannot be kept there ({why}); name another folder with VISLAM_CACHE")

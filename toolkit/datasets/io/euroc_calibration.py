@@ -1,5 +1,7 @@
 """Calibration of an ASL folder: its sensor.yaml files, Kalibr's camchain, or as published for all EuRoC recordings.
 
+Cameras are stated by Kalibr's names or EuRoC's.
+
 Where tracks are simulated camera 1 serves for the baseline only: that pair is rectified, with the left camera as it is
 mounted. Real images are rectified with both cameras.
 
@@ -16,11 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.cameras import camera_of, part, pinhole_of
 from toolkit.datasets.io.fields import Fields, rigid
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.errors import DataError
-from toolkit.frontend import Camera, Pinhole
+from toolkit.frontend.cameras import Camera, Distortion, Pinhole
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import ImuNoise
 from toolkit.sequence import StereoRig
@@ -57,6 +58,16 @@ _SAME_PLACE_M = 1e-6
 _STATED_NOISE = ImuNoise(
     accel_noise_density=2e-3, gyro_noise_density=1.6968e-4, accel_random_walk=3e-3, gyro_random_walk=1.9393e-5
 )
+_MODELS: dict[str, Distortion] = {
+    "radial-tangential": "radtan",
+    "radtan": "radtan",
+    "plumb_bob": "radtan",
+    "equidistant": "equidistant",
+    "none": "none",
+}
+# Of radtan: k1 k2 p1 p2, and with five also k3.
+_COUNTS: dict[Distortion, tuple[int, ...]] = {"radtan": (4, 5), "equidistant": (4,), "none": (0, 4, 5)}
+_COEFFICIENTS = "distortion_coefficients|distortion_coeffs"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +130,7 @@ def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
     """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
     fields = read_fields(chain)
     _check_camchain(fields)
-    left, right = (part(fields, name) for name in ("cam0", "cam1"))
+    left, right = (_part(fields, name) for name in ("cam0", "cam1"))
     T_imu_left = se3_inverse(left.rigid("T_cam_imu"))
     mounted = "T_cam_imu" in right
     T_right_left = right.rigid("T_cam_imu") @ T_imu_left if mounted else right.rigid("T_cn_cnm1")
@@ -201,11 +212,11 @@ def _is_right(T_left_right: Array) -> bool:
 def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> Calibration:
     left, right, T_left_right = sides.left, sides.right, sides.T_left_right
     _check_right(right.path, T_left_right, sides.T_left_right_inverted)
-    fx_px, fy_px, cx_px, cy_px = pinhole_of(left)
+    fx_px, fy_px, cx_px, cy_px = _pinhole_of(left)
     width_px, height_px = left.constant("resolution", 2)
     rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
-    cameras = (camera_of(left), camera_of(right)) if whole else None
+    cameras = (_camera_of(left), _camera_of(right)) if whole else None
     return Calibration(
         *(rig, (int(width_px), int(height_px)), noise, f"calibration from {source}", noise_source),
         T_imu_left=sides.T_imu_left,
@@ -231,3 +242,57 @@ def _in_flight(stated: ImuNoise) -> ImuNoise:
         accel_noise_density=ACCEL_FACTOR * stated.accel_noise_density,
         gyro_noise_density=GYRO_FACTOR * stated.gyro_noise_density,
     )
+
+
+def _camera_of(fields: Fields) -> Camera:
+    """Return the camera of a sensor.yaml, or of one camera of a camchain (:func:`_part`).
+
+    Raises DataError where a field is missing or impossible, or the model is one that images are not rectified with.
+    """
+    fx, fy, cx, cy = _pinhole_of(fields)
+    width, height = fields.constant("resolution", 2).tolist()
+    if not (fx > 0.0 and fy > 0.0 and 0.0 < cx < width and 0.0 < cy < height):
+        raise DataError(
+            f"{fields.path}: intrinsics {fx:g} {fy:g} {cx:g} {cy:g} are not of a {width:g}x{height:g} image"
+        )
+    distortion, coefficients = _distortion(fields)
+    return Camera((fx, fy, cx, cy), distortion, coefficients, (int(width), int(height)))
+
+
+def _pinhole_of(fields: Fields) -> Pinhole:
+    """Return (fx, fy, cx, cy) px of a camera; raises DataError where they are missing or of another model."""
+    fields.require("intrinsics", "resolution")
+    model = str(fields.arrays["camera_model"]) if "camera_model" in fields else "pinhole"
+    if model != "pinhole":
+        raise DataError(f"{fields.path}: camera_model {model}; images are rectified of pinhole cameras only")
+    given = fields.vector("intrinsics")
+    if given.size != 4 or not np.isfinite(given).all():
+        raise DataError(f"{fields.path}: intrinsics has {given.size} values, expected four finite ones, fx, fy, cx, cy")
+    fx, fy, cx, cy = given.tolist()
+    return fx, fy, cx, cy
+
+
+def _part(fields: Fields, name: str) -> Fields:
+    """Return what a file says under a name, as ``cam0`` of a camchain; raises DataError where it says nothing."""
+    inner = {key[len(name) + 1 :]: array for key, array in fields.arrays.items() if key.startswith(f"{name}.")}
+    if not inner:
+        raise DataError(f"{fields.path}: holds no {name}; it has {', '.join(sorted(fields.arrays)) or 'nothing'}")
+    return Fields(fields.path, inner)
+
+
+def _distortion(fields: Fields) -> tuple[Distortion, np.ndarray]:
+    given = str(fields.arrays["distortion_model"]) if "distortion_model" in fields else "none"
+    if given not in _MODELS:
+        raise DataError(f"{fields.path}: distortion_model {given} is unknown; there are {', '.join(_MODELS)}")
+    model = _MODELS[given]
+    if model == "none":
+        return model, np.zeros(4)
+    fields.require(_COEFFICIENTS)
+    key = fields.first_of(*_COEFFICIENTS.split("|"))
+    coefficients = fields.vector(key)
+    if coefficients.size not in _COUNTS[model] or not np.isfinite(coefficients).all():
+        wanted = " or ".join(map(str, _COUNTS[model]))
+        raise DataError(
+            f"{fields.path}: {key} has {coefficients.size} values, expected {wanted} finite ones of {given}"
+        )
+    return model, coefficients

@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import extrinsic
 from toolkit.datasets.io.tables import columns_of, read_table
-from toolkit.datasets.io.truth_file import load_truth
+from toolkit.datasets.io.truth import load_truth
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
