@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from toolkit.errors import DataError
-from toolkit.frontend import StampedPair, rigidity, track_images
+from toolkit.frontend import StampedPair, motion, track_images
 from toolkit.frontend.corners import corners, count_in_cells
 from toolkit.frontend.tracker import Sightings, Tracker
 from toolkit.geometry import Array
@@ -218,7 +218,7 @@ def test_what_moves_too_slowly_for_one_step_is_dropped_and_not_begun_anew(
         return int(((first_px > 43.0) & (first_px < 101.0)).all(axis=1).sum())
 
     assert followed_late() <= 1
-    monkeypatch.setattr(rigidity, "_MEDIANS", 1e6)
+    monkeypatch.setattr(motion, "_MEDIANS", 1e6)
     assert followed_late() >= 5
 
 

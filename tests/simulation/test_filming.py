@@ -14,9 +14,8 @@ from toolkit.geometry import Array, se3_inverse
 from toolkit.sequence import Observations
 from toolkit.settings import Frontend, SettingsError
 from toolkit.simulation import DRIVE_IMU, FLIGHT, filming, simulate
-from toolkit.simulation.filming import Filming, LensModel, film
+from toolkit.simulation.filming import Filming, LensModel, errors_px, film
 from toolkit.simulation.renderer import Eye, Floats, Sensor, exposed, light
-from toolkit.simulation.scene_errors import errors_px
 from toolkit.simulation.surfaces import Panel, furnished_hall
 
 SHORT = replace(FLIGHT, duration_s=0.2)

@@ -13,8 +13,7 @@ from toolkit.settings import settings_of
 from toolkit.simulation.faults import few_tracks, identity_intrinsics
 from toolkit.track_errors import Fit, fit_track_noise, in_words
 from toolkit.track_errors.adjustment import adjusted, started
-from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood
-from toolkit.track_errors.linearised import linearised
+from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood, linearised
 from toolkit.track_errors.tracklets import MOST_SIGHTINGS, middle_of_pair, tracklets
 from toolkit.track_noise import TrackNoise
 

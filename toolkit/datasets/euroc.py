@@ -47,8 +47,7 @@ from toolkit.progress import Progress
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation import sensors, world
-from toolkit.simulation.filming import is_simulated
-from toolkit.simulation.scene_errors import with_scene_errors
+from toolkit.simulation.filming import is_simulated, with_scene_errors
 from toolkit.simulation.world import Camera
 
 CITES = ("burri2016euroc",)

@@ -3,6 +3,10 @@
 The metrics are those of :mod:`toolkit.metrics`, from the same functions, and so is the rule of association: poses are
 paired on the stamps of the sparser of both, between whose neighbours the other is interpolated. ``max_dt_s`` asks for
 the rule of evo (Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017) instead: the nearest pose.
+
+A file may state two covariances for each pose: of its orientation, whose error is a turn of the body frame, and of its
+position, in the estimate's world, as OpenVINS has them. Their NEES: Bar-Shalom, Li and Kirubarajan, "Estimation with
+applications to tracking and navigation" (2001), section 5.4.
 """
 
 from collections.abc import Callable
@@ -23,14 +27,22 @@ from toolkit.datasets.trajectories.belonging import (
     range_s,
     turned_body,
 )
-from toolkit.datasets.trajectories.poses import PosesFile, check_order
+from toolkit.datasets.trajectories.poses import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
-from toolkit.evaluation.stated import nees_scores
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
-from toolkit.geometry import Array, IntArray, quaternion_from_rotation, so3_log
+from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
-from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, distance_along
+from toolkit.metrics._shared.alignment import place_pose, place_yaw
+from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
+from toolkit.metrics._shared.consistency import (
+    NOT_MET,
+    NOT_PLACED,
+    OTHER_WORLD,
+    PLACED,
+    chi2_quantile,
+)
 from toolkit.metrics._shared.evaluation import AgainstTruth, PairsAgainstTruth
+from toolkit.models.gating import mahalanobis_squared
 from toolkit.resampling import NS_PER_S
 
 COVERAGE = Metric(
@@ -68,6 +80,8 @@ _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
 # More poses than these, evenly spread, say nothing more of how a body turns.
 _ENOUGH_TURNS = 1000
+_KEYS = ("nees_ori_mean", "nees_pos_mean")
+_NONE = "the file states no covariance"
 
 
 @dataclass(frozen=True)
@@ -213,7 +227,7 @@ def _score(matched: Matched, file: PosesFile, estimate: Poses, truth: TruthFile,
     with np.errstate(all="ignore"):  # what is not finite is no value, with that as its reason
         for file_of_metrics in (ate, rpe, kitti, drift, clock_offset):
             found.append(_or_reason(file_of_metrics.score, pairs, file_of_metrics.METRICS))
-        found.append(nees_scores(file, estimate, truth.stamped, level=terms.level))
+        found.append(_nees_scores(file, estimate, truth.stamped, level=terms.level))
     covered = time_coverage_percent(estimate.t_ns, truth.t_ns, terms.gap_s)
     found.append(Scores({COVERAGE.key: covered, _PAIRS.key: len(matched)}))
     values = {key: value for one in found for key, value in one.values.items()}
@@ -258,3 +272,48 @@ def _axes(turn: Array) -> str:
 
 def _lines_ns(count: int) -> IntArray:
     return np.arange(count, dtype=np.int64) * _FRAME_NS
+
+
+def _nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
+    """Return the mean NEES of orientation and position over their 3 degrees of freedom, None with the reason.
+
+    In the truth's world where the first pose is plausible there under its own covariances; else it is placed on the
+    truth's, its heading and position alone where the vertical is measured (``level``).
+    """
+    try:
+        return _scores(file.covariances, estimate, truth, level=level)
+    except Unavailable as reason:
+        return Scores.none(_KEYS, str(reason))
+
+
+def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
+    if stated is None:
+        raise Unavailable(_NONE)
+    met, true = poses_at(truth.t_ns, truth.poses, estimate.t_ns, median_period_ns(truth.t_ns))
+    if not met.any():
+        raise Unavailable(NOT_MET)
+    poses, covs = estimate.poses[met], (stated.orientation[met], stated.position[met])
+    bad = sum(int((~np.isfinite(cov).all(axis=(1, 2)) | (_least_eigenvalue(cov) <= 0.0)).sum()) for cov in covs)
+    if bad:
+        raise Unavailable(f"{bad} of {2 * len(poses)} covariances are not positive definite")
+    first = _nees(true[:1], poses[:1], covs[0][:1], covs[1][:1])
+    placed = max(float(one[0]) for one in first) > chi2_quantile(1.0 - OTHER_WORLD, 3) / 3.0
+    if placed:
+        if not met[0]:
+            raise Unavailable(NOT_PLACED)
+        # The truth moves into the estimate's world, in which the covariances are stated.
+        true = (place_yaw if level else place_pose)(poses[0], true[0]).apply(true)
+    orientation, position = _nees(true, poses, *covs)
+    scores = Scores(dict(zip(_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
+    return scores.remarked(_KEYS, PLACED if placed else "")
+
+
+def _nees(true: Array, poses: Array, cov_orientation: Array, cov_position: Array) -> tuple[Array, Array]:
+    turned = so3_log((se3_inverse(poses) @ true)[:, :3, :3])
+    moved = true[:, :3, 3] - poses[:, :3, 3]
+    return mahalanobis_squared(turned, cov_orientation) / 3.0, mahalanobis_squared(moved, cov_position) / 3.0
+
+
+def _least_eigenvalue(cov: Array) -> Array:
+    finite = np.where(np.isfinite(cov), cov, 0.0)
+    return np.asarray(np.linalg.eigvalsh(finite)[:, 0])

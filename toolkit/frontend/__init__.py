@@ -1,8 +1,7 @@
 """From images to stereo tracks, with OpenCV: what every estimator reads, made once for all of them.
 
-Read ``tracker`` first: it is the algorithm; its steps are ``corners``, ``rows``, ``flow``, ``motion``, ``patches`` and
-``rigidity``. ``tracking`` runs it over a recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills``
-draw what it found.
+Read ``tracker`` first: it is the algorithm; its steps are ``corners``, ``motion`` and ``patches``. ``tracking`` runs
+it over a recording of ``images`` that ``cameras`` took, with a ``cache``; ``stills`` draw what it found.
 """
 
 from toolkit.frontend.cameras import Camera, Pinhole, RectifiedPair, already_rectified, rectified

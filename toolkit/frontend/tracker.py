@@ -12,12 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.frontend.cameras import Image, RectifiedPair
-from toolkit.frontend.corners import corners, count_in_cells, grid_of
-from toolkit.frontend.flow import Flow
-from toolkit.frontend.motion import StereoMotion
+from toolkit.frontend.corners import Flow, corners, count_in_cells, grid_of, halved, match_rows
+from toolkit.frontend.motion import Rigidity, StereoMotion
 from toolkit.frontend.patches import Floats, Patches, as_floats, inverse
-from toolkit.frontend.rigidity import Rigidity
-from toolkit.frontend.rows import halved, match_rows
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.settings import Frontend
 

@@ -2,11 +2,10 @@
 
 An estimator finds the record in its ``Setup``; the command line, a TOML file, the manifest, the gate and Monte Carlo
 runs carry the same one. A threshold that nobody should have to choose is no setting: it stands in the code, once, with
-its source. Read ``records``, then ``reading``, which makes one of what somebody wrote; ``described`` is for the pages.
+its source. Read ``records``, then ``reading``, which makes one of what somebody wrote and tells of each.
 """
 
-from toolkit.settings.described import Described, describe
-from toolkit.settings.reading import read_toml, settings_of, with_assignments
+from toolkit.settings.reading import Described, describe, read_toml, settings_of, with_assignments
 from toolkit.settings.records import (
     DEFAULTS,
     POLICIES,

@@ -1,20 +1,23 @@
-"""Settings as somebody wrote them, in TOML, a manifest or as ``KEY=VALUE``: made the record, checked key by key."""
+"""Settings as values: made the record of what somebody wrote, checked key by key; each one told for documentation.
+
+They come in TOML, in a manifest or as ``KEY=VALUE``. What is told of a setting is read from the records themselves.
+"""
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean, no_such
 from toolkit.inputs import read_text_input
-from toolkit.settings.described import describe
 from toolkit.settings.records import POLICIES, Settings, SettingsError
 
 _POLICY = "outliers.policy"
+_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def settings_of(given: Mapping[str, Any], place: str) -> Settings:
@@ -99,3 +102,56 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
             raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
+
+
+class Described(NamedTuple):
+    """One setting as documentation shows it: key, unit, default, range in words, what it is."""
+
+    key: str
+    unit: str
+    default: str
+    range: str
+    meaning: str
+
+
+def describe() -> tuple[Described, ...]:
+    """Return every setting, in the order of the record."""
+    return tuple(_described(Settings, ""))
+
+
+def _described(record: type[Struct], prefix: str) -> Iterator[Described]:
+    hints = get_type_hints(record, include_extras=True)
+    for field in msgspec.structs.fields(record):
+        hint = hints[field.name]
+        if isinstance(hint, type) and issubclass(hint, Struct):
+            yield from _described(hint, f"{field.name}.")
+        elif field.name != "estimators":
+            yield _one(f"{prefix}{field.name}", hint, field.default)
+
+
+def _one(key: str, hint: Any, default: Any) -> Described:
+    metas = list(_metas(hint))
+    extra = {name: text for meta in metas for name, text in (meta.extra or {}).items()}
+    bounds = {name: getattr(meta, name) for meta in metas for name in _BOUNDS if getattr(meta, name) is not None}
+    words = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
+    words += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
+    meaning = next(meta.description for meta in metas if meta.description)
+    shown = extra.get("none", "none") if default is None else _shown(default)
+    return Described(key, extra.get("unit", ""), shown, ", ".join(words), meaning)
+
+
+def _shown(default: Any) -> str:
+    return f"{default:.4g}" if isinstance(default, float) else str(default)
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """Yield a type annotation and all it is made of."""
+    yield hint
+    for part in get_args(hint):
+        if not isinstance(part, Meta):
+            yield from _parts(part)
+
+
+def _metas(hint: Any) -> Iterator[Meta]:
+    for part in _parts(hint):
+        yield from (meta for meta in getattr(part, "__metadata__", ()) if isinstance(meta, Meta))

@@ -3,7 +3,7 @@
 Read ``scenarios`` (what is simulated, and ``simulate``), then ``scenes`` (trajectory and landmarks of each),
 ``trajectory`` (B-splines), ``world`` (visibility and tracks) and ``sensors`` (noise). ``faults`` (with ``standstill``,
 at times from ``spans``) and ``track_faults`` plant what goes wrong. ``filming`` takes images instead of tracks, with
-``surfaces`` (what there is to see) and ``renderer``; ``scene_errors`` tells how far tracks made of them are off.
+``surfaces`` (what there is to see) and ``renderer``, and tells how far tracks made of them are off.
 """
 
 from toolkit.simulation import faults, track_faults

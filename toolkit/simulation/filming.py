@@ -2,20 +2,26 @@
 
 Motion, IMU and truth are those of the scenario under the same seed: what differs from its simulated tracks is that
 somebody has to find them. The seed draws the noise of each image, too.
+
+How far tracks made of the images are off says what a front end costs, in pixels. The ray of a track's first sighting,
+from the true pose, meets a point of the hall; from then on every sighting of the track should be where that point is.
+What flies about counts as wrong, as it does to an estimator.
 """
 
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 
+from toolkit.arrays import rows_of
 from toolkit.files import check_replaceable, replaced_directory
-from toolkit.geometry import Array, quaternion_from_rotation, se3, so3_exp
+from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples
+from toolkit.models import stereo
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
@@ -48,6 +54,9 @@ _EUROC_NAMES: dict[LensModel, str] = {
     "radtan": "radial-tangential",
     "equidistant": "equidistant",
 }
+# Scatter is told as the median deviation of a normal variable's sigma, which mismatches do not move.
+_TO_SIGMA = 1.4826
+_MISMATCH_PX = 3.0
 
 
 @dataclass(frozen=True)
@@ -258,3 +267,55 @@ def _written_by_us(directory: Path) -> frozenset[str]:
         if path.stem.isdecimal()
     ]
     return frozenset({ABOUT, *tables, *folders, *images})
+
+
+def errors_px(sequence: Sequence) -> Array:
+    """Return by how much each sighting (N, 3) px is off; NaN where the frame has no truth or the ray meets nothing."""
+    truth, seen, rig = sequence.truth, sequence.observations, sequence.rig
+    if truth is None:
+        return np.full((len(seen), 3), np.nan)
+    row, is_true = rows_of(sequence.frames_t_ns, truth.t_ns)
+    T_world_cam = np.where(is_true[:, None, None], truth.T_world_imu[row] @ rig.T_imu_cam, np.nan)
+    _, first, track = np.unique(seen.track_id, return_index=True, return_inverse=True)
+    rays = np.stack(
+        [
+            (seen.uv_px[first, 0] - rig.cx_px) / rig.fx_px,
+            (seen.uv_px[first, 2] - rig.cy_px) / rig.fy_px,
+            np.ones(first.size),
+        ],
+        axis=1,
+    )
+    points = _met(T_world_cam[seen.frame[first]], rays)
+    return seen.uv_px - stereo.project(transform(se3_inverse(T_world_cam)[seen.frame], points[track]), rig)
+
+
+def _met(T_world_cam: Array, rays: Array) -> Array:
+    """Return the points (M, 3) of the hall that rays (M, 3), each of a camera of its own (M, 4, 4), meet first."""
+    origin, towards = T_world_cam[:, :3, 3], (T_world_cam[:, :3, :3] @ rays[:, :, None])[..., 0]
+    nearest = np.full(len(rays), np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for panel in furnished_hall().standing:
+            axes, corner = panel.T_world_panel[:3, :3], panel.T_world_panel[:3, 3]
+            start, step = (origin - corner) @ axes, towards @ axes
+            reach = -start[:, 2] / step[:, 2]
+            place = start[:, :2] + reach[:, None] * step[:, :2]
+            inside = ((place >= 0.0) & (place <= panel.size_m)).all(axis=1)
+            met = inside & (start[:, 2] > 0.0) & (reach > 0.0) & (reach < nearest)
+            nearest[met] = reach[met]
+        return np.where(np.isfinite(nearest)[:, None], origin + nearest[:, None] * towards, np.nan)
+
+
+def with_scene_errors(sequence: Sequence) -> Sequence:
+    """Return the sequence, made of rendered images, with a fact that says how far its tracks are off."""
+    off_px = errors_px(sequence)
+    off_px = off_px[np.isfinite(off_px).all(axis=1)]
+    if not len(off_px):
+        return sequence
+    u_left, u_right, v = (_TO_SIGMA * np.median(np.abs(off_px), axis=0)).tolist()
+    beyond = 100.0 * float((np.abs(off_px) > _MISMATCH_PX).any(axis=1).mean())
+    fact = (
+        f"against the rendered scene, at the points that tracks began with, sightings are off by {u_left:.2f} px (uL), "
+        f"{u_right:.2f} px (uR) and {v:.2f} px (v), by the median; {beyond:.1f} % by more than {_MISMATCH_PX:g} px"
+    )
+    provenance = sequence.provenance
+    return replace(sequence, provenance=replace(provenance, facts=(provenance.facts[0], fact, *provenance.facts[1:])))

@@ -1,7 +1,7 @@
 """What the errors of real tracks are like, found from a recording's own visible tracks, without truth.
 
-Read ``tracklets`` (the tracks, by length), ``linearised`` (their residuals and derivatives), ``adjustment`` (poses that
-suit all tracks), ``likelihood`` (how probable a noise makes the residuals), ``fit`` (which noise it is), ``card`` (what
+Read ``tracklets`` (the tracks, by length), ``likelihood`` (their residuals, and how probable a noise makes
+them), ``adjustment`` (poses that suit all tracks), ``fit`` (which noise it is), ``card`` (what
 is told of it), and ``statement`` (whether a noise that is stated can be theirs).
 """
 

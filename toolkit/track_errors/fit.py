@@ -14,8 +14,7 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
-from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood
-from toolkit.track_errors.linearised import linearised
+from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood, linearised
 from toolkit.track_errors.tracklets import Tracklets, tracklets
 from toolkit.track_noise import TrackNoise
 

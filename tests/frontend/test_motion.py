@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.frontend import RectifiedPair, already_rectified
-from toolkit.frontend.rigidity import Rigidity
+from toolkit.frontend.motion import Rigidity
 from toolkit.geometry import Array, BoolArray, se3, so3_exp
 
 PAIRS, TRACKS, NOISE_PX = 12, 80, 0.1
