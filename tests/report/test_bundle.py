@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from toolkit.cli import main
-from toolkit.report.bundle import BundleRecord, installed_packages, unpack_bundle
+from toolkit.report.export import BundleRecord, installed_packages, unpack_bundle
 
 COMPARE = ("compare", "drive", "--estimators", "dead-reckoning", "--max-frames", "8", "--workers", "1", "--seed", "3")
 

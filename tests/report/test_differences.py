@@ -9,8 +9,7 @@ import pytest
 
 from toolkit.cli import main
 from toolkit.documents import schema
-from toolkit.report.diff_text import DiffRecord, diff_text
-from toolkit.report.differences import Change, Differences
+from toolkit.report.differences import Change, Differences, DiffRecord, diff_text
 
 DOCUMENTS = Path(__file__).parent / "documents"
 

@@ -13,9 +13,9 @@ from toolkit.geometry import about_z, interpolate_poses, se3
 from toolkit.metrics import Evaluation, in_sample
 from toolkit.report import figures
 from toolkit.report.curves import Components
-from toolkit.report.figures import FigureChoice, components, consistency, drawn, error_map, errors_over_time, top_view
+from toolkit.report.figures import FigureChoice, consistency, drawn, error_map, errors_over_time, top_view
 from toolkit.report.figures.style import NamedFigure
-from toolkit.report.figures.view import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
+from toolkit.report.figures.top_view import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
 from toolkit.sequence import Sequence
 
 ComparisonOf = Callable[..., Comparison]
@@ -51,7 +51,7 @@ def fourteen(comparison: Comparison) -> Comparison:
 
 def of_offset(offset: Comparison) -> Components:
     (row,) = (row for row in offset.lines if row.estimator == "offset")
-    found = components.components(offset, row)
+    found = errors_over_time.components(offset, row)
     assert found is not None
     return found
 
@@ -77,7 +77,7 @@ def test_stated_deviations_turn_with_the_body(offset: Comparison, sequence: Sequ
 
 
 def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comparison) -> None:
-    one = next(figure for figure in components.draw(offset) if figure.name == "components_offset")
+    one = next(figure for figure in errors_over_time.draw_components(offset) if figure.name == "components_offset")
     found, axes = of_offset(offset), one.figure.axes[0]
     assert found.sigma is not None
     lower, upper, error = (np.asarray(line.get_ydata()) for line in axes.get_lines()[:3])
@@ -88,7 +88,7 @@ def test_the_band_is_three_deviations_and_all_of_the_error_is_shown(offset: Comp
 
 
 def test_without_truth_components_are_differences_from_the_last_answer(without_truth: Comparison) -> None:
-    (one,) = components.draw(without_truth)
+    (one,) = errors_over_time.draw_components(without_truth)
     assert one.name == "components_steady"
     assert "no truth" in one.caption
     assert "late final" in one.caption

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Repeated from toolkit.simulation.SCENARIOS (a test compares them), which would cost the help half a second.
 SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
-LENSES = ("none", "radtan", "equidistant")
+_LENSES = ("none", "radtan", "equidistant")
 _LONGEST_EXPOSURE_MS = 40
 _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 
@@ -162,7 +162,7 @@ def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
     images = parser.add_argument_group("images")
     images.add_argument("--images", action="store_true", help="render the images of a stereo pair (flight)")
     images.add_argument(
-        "--lens", choices=LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
+        "--lens", choices=_LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
     )
     images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
     images.add_argument("--moving", metavar="N", type=at_least(0), help="crates that fly about (default: 0)")

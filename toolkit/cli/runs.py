@@ -13,8 +13,8 @@ from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_
 from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
-    from toolkit.report.bundle import BundleRecord
     from toolkit.report.differences import Differences
+    from toolkit.report.export import BundleRecord
 
 _NAME = "report.html"
 # Repeated from toolkit.datasets.trajectories.FORMATS (a test compares them), which would cost the help half a second.
@@ -92,7 +92,7 @@ def export(options: argparse.Namespace) -> int:
 
 
 def _bundle(options: argparse.Namespace) -> int:
-    from toolkit.report.bundle import write_bundle
+    from toolkit.report.export import write_bundle
 
     if options.format or options.out or options.estimator or options.output:
         raise UsageError("--bundle goes without --format, --out, --estimator and --output: it has everything")
@@ -124,8 +124,7 @@ def diff(options: argparse.Namespace) -> int:
     """
     from toolkit.documents import to_text
     from toolkit.metrics import known_metrics, metrics_called
-    from toolkit.report.diff_text import diff_document, diff_text
-    from toolkit.report.differences import differences
+    from toolkit.report.differences import diff_document, diff_text, differences
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_files import read_run
 
@@ -164,9 +163,8 @@ def reproduce(options: argparse.Namespace) -> int:
     import tempfile
 
     from toolkit.documents import to_text
-    from toolkit.report.bundle import unpack_bundle
-    from toolkit.report.diff_text import diff_document
-    from toolkit.report.differences import differences
+    from toolkit.report.differences import diff_document, differences
+    from toolkit.report.export import unpack_bundle
     from toolkit.report.run_files import read_run
 
     with tempfile.TemporaryDirectory(prefix="vislam-") as folder:
@@ -200,8 +198,8 @@ def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
 
 
 def _print(found: Differences, record: BundleRecord, options: argparse.Namespace) -> None:
-    from toolkit.report.bundle import installed_packages
-    from toolkit.report.diff_text import diff_text
+    from toolkit.report.differences import diff_text
+    from toolkit.report.export import installed_packages
     from toolkit.report.prose import width_of_output
 
     here = installed_packages()

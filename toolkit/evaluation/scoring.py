@@ -56,14 +56,14 @@ COVERAGE = Metric(
     table="always",
 )
 _PAIRS = next(metric for metric in coverage.METRICS if metric.key == "pairs")
-NEES_KEYS = ("nees_ori_mean", "nees_pos_mean")
+_NEES_KEYS = ("nees_ori_mean", "nees_pos_mean")
 METRICS: tuple[Metric, ...] = (
     *ate.METRICS,
     *rpe.METRICS,
     *kitti.METRICS,
     *drift.METRICS,
     *clock_offset.METRICS,
-    *(metric for metric in nees.METRICS if metric.key in NEES_KEYS),
+    *(metric for metric in nees.METRICS if metric.key in _NEES_KEYS),
     COVERAGE,
     _PAIRS,
 )
@@ -73,14 +73,13 @@ _OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRIC
 # What depends on the body's axes, and not on where the body is alone.
 _OF_THE_BODY = (
     *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
-    *("end_drift_percent", *NEES_KEYS),
+    *("end_drift_percent", *_NEES_KEYS),
 )
 # Frames without stamps are taken to be so far apart where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
 # More poses than these, evenly spread, say nothing more of how a body turns.
 _ENOUGH_TURNS = 1000
-_KEYS = ("nees_ori_mean", "nees_pos_mean")
 _NONE = "the file states no covariance"
 
 
@@ -283,7 +282,7 @@ def _nees_scores(file: PosesFile, estimate: Poses, truth: Poses, *, level: bool)
     try:
         return _scores(file.covariances, estimate, truth, level=level)
     except Unavailable as reason:
-        return Scores.none(_KEYS, str(reason))
+        return Scores.none(_NEES_KEYS, str(reason))
 
 
 def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level: bool) -> Scores:
@@ -304,8 +303,8 @@ def _scores(stated: StatedApart | None, estimate: Poses, truth: Poses, *, level:
         # The truth moves into the estimate's world, in which the covariances are stated.
         true = (place_yaw if level else place_pose)(poses[0], true[0]).apply(true)
     orientation, position = _nees(true, poses, *covs)
-    scores = Scores(dict(zip(_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
-    return scores.remarked(_KEYS, PLACED if placed else "")
+    scores = Scores(dict(zip(_NEES_KEYS, (float(orientation.mean()), float(position.mean())), strict=True)))
+    return scores.remarked(_NEES_KEYS, PLACED if placed else "")
 
 
 def _nees(true: Array, poses: Array, cov_orientation: Array, cov_position: Array) -> tuple[Array, Array]:

@@ -43,7 +43,7 @@ def corners(image: Image, free: BoolArray, present: IntArray, spacing_px: float,
     peaks = peaks[(strength.ravel()[peaks] > least) & free.ravel()[peaks]]
     rows, columns = np.divmod(peaks, image.shape[1])
     points = np.stack([columns, rows], axis=1).astype(np.float64)
-    cells = cells_of(points, (image.shape[1], image.shape[0]), (present.shape[0], present.shape[1]))
+    cells = _cells_of(points, (image.shape[1], image.shape[0]), (present.shape[0], present.shape[1]))
     by_cell = np.lexsort((-strength[rows, columns], cells))
     in_order = cells[by_cell]
     place = np.arange(cells.size) - np.searchsorted(in_order, in_order) + present.ravel()[in_order]
@@ -60,11 +60,11 @@ def grid_of(size_px: tuple[int, int], tracks: int) -> tuple[int, int]:
 
 def count_in_cells(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
     """Return how many points (N, 2) lie in each cell (rows, columns)."""
-    cells = cells_of(points_px, size_px, grid)
+    cells = _cells_of(points_px, size_px, grid)
     return np.bincount(cells, minlength=grid[0] * grid[1]).reshape(grid)
 
 
-def cells_of(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
+def _cells_of(points_px: Array, size_px: tuple[int, int], grid: tuple[int, int]) -> IntArray:
     """Return the cell (N,) of each point (N, 2), counted row by row."""
     column = np.clip(points_px[:, 0] * grid[1] / size_px[0], 0, grid[1] - 1).astype(np.int64)
     row = np.clip(points_px[:, 1] * grid[0] / size_px[1], 0, grid[0] - 1).astype(np.int64)

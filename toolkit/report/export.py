@@ -1,15 +1,38 @@
-"""A trajectory of a run directory in another program's format."""
+"""A run directory handed on: a trajectory in another program's format, or the run as one file to check and repeat.
 
-from pathlib import Path
+A bundle is a zip archive with bundle.json (``vislam.bundle/1``), requirements.txt (the release of every package that is
+installed) and the run's files but for its figures. The same directory gives the same bytes.
+"""
 
+import hashlib
+import zipfile
+import zlib
+from collections.abc import Mapping
+from importlib.metadata import distributions
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal
+
+from msgspec import UNSET, Meta, Struct
+
+from toolkit import documents
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
-from toolkit.files import write_text
+from toolkit.experiment.outcome_store import OUTCOMES
+from toolkit.files import replaced_file, write_text
+from toolkit.inputs import open_input
 from toolkit.report.records import Report
-from toolkit.report.run_files import SeedsFiles, read_run
+from toolkit.report.run_directory import MANIFEST
+from toolkit.report.run_files import RunFiles, SeedsFiles, read_run
 
 TRUTH = "truth"
+BUNDLE, LOCK = "bundle.json", "requirements.txt"
+_NEVER_IN = ("figures/",)
+# The oldest stamp that a zip archive can hold, for every entry: when a file was written says nothing.
+_STAMP = (1980, 1, 1, 0, 0, 0)
+_MOST_BYTES = 4 * 2**30
+_REMEDY = "make it again with vislam export --bundle"
+_DAMAGED = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
 
 
 def export(directory: Path, estimator: str | None, output: Output | None, format_name: str, target: Path) -> str:
@@ -60,3 +83,115 @@ def _check_every_frame(what: str, trajectory: Trajectory, frames: int) -> None:
             f"{what} has {len(trajectory)} poses for {frames} frames, and KITTI's rows are the frames; "
             "choose a format with stamps"
         )
+
+
+class BundleRecord(Struct, frozen=True, kw_only=True):
+    """What a bundle holds."""
+
+    schema: Literal["vislam.bundle/1"]
+    name: Annotated[str, Meta(description="of the run directory")]
+    hashes: Annotated[
+        tuple[str | None, ...], Meta(description="SHA-256 of what the estimators read, one a seed; null where unknown")
+    ]
+    packages: Annotated[dict[str, str], Meta(description="every installed package's release")]
+    files: Annotated[dict[str, str], Meta(description="SHA-256 of each file, by its path in the run directory")]
+
+    def __post_init__(self) -> None:
+        for name in self.files:
+            path = PurePosixPath(name)
+            if path.is_absolute() or ".." in path.parts or "\\" in name or not path.parts:
+                raise ValueError(f"files has {name!r}, which is no path inside a run directory")
+
+
+def write_bundle(directory: Path, target: Path) -> str:
+    """Write the bundle of a run directory and return in words what is in it.
+
+    Raises DataError where the directory is none, OutputError where the file cannot be written.
+    """
+    run = read_run(directory)
+    contents = {name: (directory / name).read_bytes() for name in _names(run)}
+    record = BundleRecord(
+        schema="vislam.bundle/1",
+        name=directory.resolve().name,
+        hashes=hashes_of(run),
+        packages=installed_packages(),
+        files={name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
+    )
+    contents |= {
+        BUNDLE: documents.to_text(record).encode(),
+        LOCK: "".join(f"{name}=={release}\n" for name, release in record.packages.items()).encode(),
+    }
+    with replaced_file(target) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in sorted(contents.items()):
+            archive.writestr(zipfile.ZipInfo(name, _STAMP), content, zipfile.ZIP_DEFLATED)
+    return f"{len(record.files)} files of {record.name}, {len(record.packages)} packages"
+
+
+def hashes_of(run: RunFiles | SeedsFiles) -> tuple[str | None, ...]:
+    """Return the hash of what the estimators read under each seed."""
+    return run.scores.hashes if isinstance(run, SeedsFiles) else (run.scores.sequence.hash,)
+
+
+def installed_packages() -> dict[str, str]:
+    """Return the release of every installed package, by its name."""
+    found = {str(one.metadata["Name"]).lower().replace("_", "-"): one.version for one in distributions()}
+    return dict(sorted(found.items()))
+
+
+def unpack_bundle(path: Path, directory: Path) -> BundleRecord:
+    """Write the run's files of a bundle into an empty directory and return what it says of them.
+
+    Only files that bundle.json lists are written, each after its hash has been checked. Raises DataError, in one line,
+    where the file is no bundle, or damaged.
+    """
+    try:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
+            if BUNDLE not in archive.namelist():
+                raise DataError(f"{path}: it is a zip archive without {BUNDLE}; {_REMEDY}")
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+                raise DataError(f"{path}: it would unpack to more than 4 GB, which no bundle does")
+            record = _record(path, archive.read(BUNDLE))
+            contents = {name: _checked(path, archive, name, digest) for name, digest in record.files.items()}
+    except DataError:
+        raise
+    except _DAMAGED as error:
+        raise DataError(f"{path}: it cannot be read as a bundle ({error}); {_REMEDY}") from error
+    _write(contents, directory)
+    return record
+
+
+def _record(path: Path, content: bytes) -> BundleRecord:
+    try:
+        return documents.parse(content, BundleRecord)
+    except DataError as error:
+        raise DataError(f"{path}: {BUNDLE} {error}; {_REMEDY}") from error
+
+
+def _checked(path: Path, archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
+    if name not in archive.namelist():
+        raise DataError(f"{path}: {name} is missing; {_REMEDY}")
+    content = archive.read(name)
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise DataError(f"{path}: {name} is not as it was when the bundle was made; {_REMEDY}")
+    return content
+
+
+def _write(contents: Mapping[str, bytes], directory: Path) -> None:
+    for name, content in contents.items():
+        place = directory / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(content)
+
+
+def _names(run: RunFiles | SeedsFiles) -> list[str]:
+    """Return the files of a run that are bundled: all that its manifest lists but figures and what a sweep keeps."""
+    listed = run.manifest.files
+    if listed is UNSET:
+        raise DataError(
+            f"{run.directory / MANIFEST} lists no files, as an earlier version left it; repeat the comparison"
+        )
+    names = [name for name in listed if not name.startswith(_NEVER_IN) and name != OUTCOMES]
+    for name in names:
+        if not (run.directory / name).is_file():
+            raise DataError(f"{run.directory / name} is missing, and {MANIFEST} lists it; repeat the comparison")
+    return names

@@ -11,8 +11,8 @@ from toolkit.documents import schema
 from toolkit.evaluation.document import EvaluationRecord
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
-from toolkit.report.bundle import BundleRecord
-from toolkit.report.diff_text import DiffRecord
+from toolkit.report.differences import DiffRecord
+from toolkit.report.export import BundleRecord
 from toolkit.report.records import CardRecord, CheckDocument, Manifest, Metrics, Report, Seeds, SeedsReport
 from toolkit.report.verify_text import VerificationRecord
 

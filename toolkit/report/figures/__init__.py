@@ -1,6 +1,6 @@
 """The figures of a comparison as files, PNG, PDF or SVG, one module a kind; drawn without a display.
 
-Reading order: style -> view, panels -> the kinds, which __init__ lists; the numbers are those of report.curves.
+Reading order: style -> panels -> the kinds, which __init__ lists; the numbers are those of report.curves.
 """
 
 import warnings
@@ -17,7 +17,6 @@ from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.figures import (
     against_bound,
-    components,
     consistency,
     error_map,
     errors_over_time,
@@ -48,7 +47,7 @@ _MORE: tuple[_Drawing, ...] = (
     frame_times.draw,
     error_map.draw_trajectories,
     error_map.draw_maps,
-    components.draw,
+    errors_over_time.draw_components,
     top_view.draw_each,
 )
 _OVER_SEEDS: tuple[_Drawing, ...] = (over_seeds.draw,)

@@ -34,7 +34,7 @@ from toolkit.report.figures.style import (
     new_figure,
     style_axes,
 )
-from toolkit.report.figures.view import (
+from toolkit.report.figures.top_view import (
     NOWHERE,
     PathFromAbove,
     View,

@@ -1,20 +1,32 @@
-"""Position and heading error over time against the truth; without truth, the differences between estimators."""
+"""Errors over time: position and heading of all estimators, and of one by component, with what it states.
 
-from collections.abc import Iterator
+Against the truth; without truth, the differences between estimators.
+"""
+
+from collections.abc import Collection, Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from toolkit.experiment.comparison import Comparison, Row
+from toolkit.estimate import Output
+from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array
 from toolkit.metrics._shared.residuals import rmse
-from toolkit.report.curves import ErrorCurves, Errors, error_curves
-from toolkit.report.figures.panels import scale_by_decades
+from toolkit.models.state import POSITION, ROTATION
+from toolkit.report.curves import Components, ErrorCurves, Errors, components, error_curves, reference_estimate
+from toolkit.report.figures.panels import COLOUR_OF, scale_by_decades
 from toolkit.report.figures.style import (
+    TITLE_PT,
+    ZERO_COLOUR,
+    Entry,
     NamedFigure,
     colour_of,
     entries_of,
     legend_below,
+    line_of,
     line_of_estimator,
     new_figure,
     style_axes,
@@ -26,6 +38,12 @@ _ROOM_FOR_DIVERGED = 1.5
 # Estimators that agree to rounding shall look so: no axis is narrower than this (m, deg).
 _LEAST_POSITION_M, _LEAST_HEADING_DEG = 1e-3, 1e-2
 _ORDER_OF_MAGNITUDE, _BELOW_LEAST, _LEAST_LOGARITHMIC_M = 12.0, 0.2, 1e-5
+_SIGMAS = 3.0
+_ROWS = ("x", "y", "z")
+# An axis shows all of the error, and of the band at most so many times the largest error.
+_BAND_REACH = 6.0
+_BAND_ALPHA = 0.16
+_LEAST_M, _LEAST_DEG = 1e-3, 1e-3
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -79,3 +97,90 @@ def _without_wraps(heading_deg: Array) -> Array:
     broken = heading_deg.copy()
     broken[1:][np.abs(np.diff(heading_deg)) > 180.0] = np.nan
     return broken
+
+
+def draw_components(comparison: Comparison) -> Iterator[NamedFigure]:
+    """Yield a figure for each estimator with a trajectory that has something to be compared with."""
+    for run in comparison.runs:
+        rows = [row for row in comparison.lines if row.run is run]
+        found = {row.output: one for row in rows if (one := components(comparison, row)) is not None}
+        if found:
+            yield _components_figure(comparison, run.estimator, run.final_is_causal, found)
+
+
+def _components_figure(comparison: Comparison, name: str, both: bool, found: dict[Output, Components]) -> NamedFigure:
+    figure = new_figure(4.6)
+    grid = figure.subplots(3, 2, sharex=True)
+    what = _what(comparison)
+    for column, block, unit, least in ((0, POSITION, "m", _LEAST_M), (1, ROTATION, "deg", _LEAST_DEG)):
+        for i, axis in enumerate(_ROWS):
+            axes = grid[i, column]
+            for output, one in found.items():
+                _plot(axes, comparison.sequence.elapsed_s(one.t_ns), one, block.start + i, "final" if both else output)
+            _limit(axes, found.values(), block.start + i, least)
+            style_axes(
+                axes, "", "time [s]" if i == 2 else "", f"{axis} [{unit}]" if column == 0 else f"about {axis} [{unit}]"
+            )
+    grid[0, 0].set_title(f"{comparison.name}, {name}: position {what}", fontsize=TITLE_PT, loc="left")
+    grid[0, 1].set_title(f"rotation {what}", fontsize=TITLE_PT, loc="left")
+    figure.align_ylabels(grid)
+    legend_below(figure, _entries(found, both, what.split()[0]))
+    return NamedFigure(f"components_{plain_name(name)}", _caption(comparison, name), figure)
+
+
+def _what(comparison: Comparison) -> str:
+    """Return how to call what is drawn: the error, or without truth the difference from whom."""
+    reference = None if comparison.sequence.truth is not None else reference_estimate(comparison)
+    return "error" if reference is None else f"difference from {reference.name}"
+
+
+def _plot(axes: Axes, t_s: Array, one: Components, i: int, shown_as: Output) -> None:
+    colour, line = COLOUR_OF[shown_as], line_of(shown_as)
+    if one.sigma is not None:
+        band = _SIGMAS * one.sigma[:, i]
+        if shown_as == "final":
+            axes.fill_between(t_s, -band, band, color=colour, alpha=_BAND_ALPHA, linewidth=0.0)
+        for side in (-band, band):
+            axes.plot(t_s, side, color=colour, linestyle=line, linewidth=0.6)
+    axes.plot(t_s, one.error[:, i], color=colour, linestyle=line, linewidth=1.1)
+
+
+def _limit(axes: Axes, drawn: Collection[Components], i: int, least: float) -> None:
+    """Show all of the error around zero, and the band unless that would flatten the error."""
+    error = max(float(np.abs(one.error[:, i]).max()) for one in drawn)
+    bands = [_SIGMAS * float(np.nanmax(one.sigma[:, i])) for one in drawn if one.sigma is not None]
+    reach = max(error, least, min(max(bands, default=0.0), _BAND_REACH * max(error, least)))
+    axes.set_ylim(-1.08 * reach, 1.08 * reach)
+    axes.axhline(0.0, color=ZERO_COLOUR, linewidth=0.8, zorder=1)
+
+
+def _entries(found: dict[Output, Components], both: bool, what: str) -> list[Entry]:
+    entries = []
+    for output, one in found.items():
+        shown_as: Output = "final" if both else output
+        name, colour = "causal = final" if both else output, COLOUR_OF[shown_as]
+        entries.append(Entry(f"{name}: {what}", (Line2D([], [], color=colour, linestyle=line_of(shown_as)),)))
+        if one.sigma is not None:
+            band = Patch(facecolor=to_rgba(colour, _BAND_ALPHA if shown_as == "final" else 0.0), edgecolor=colour)
+            band.set(linestyle=line_of(shown_as), linewidth=0.6)
+            entries.append(Entry(f"{name}: ± 3 standard deviations", (band,)))
+    return entries
+
+
+def _caption(comparison: Comparison, name: str) -> str:
+    """Say what the panels show and how the band is to be read."""
+    axes = "by component along and about the world's axes, z up"
+    if comparison.sequence.truth is None:
+        reference = reference_estimate(comparison)
+        of_whom = "" if reference is None else f" from {reference.name}"
+        return (
+            f"There is no truth: difference of {name}{of_whom} {axes}, not aligned. The band is three standard "
+            f"deviations that {name} states; a difference far outside it says that one of the two is too sure."
+        )
+    placed = (
+        "as the NEES takes it: where the start is not in the truth's world, its first pose is placed on the truth's"
+    )
+    return (
+        f"Error of {name} {axes}, {placed}. The band is three standard deviations that it states: an honest estimator "
+        "is inside nearly always, and fills it."
+    )

@@ -5,31 +5,30 @@ Over seeds: means with their spread, every seed's value, NEES and its band.
 
 import base64
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from msgspec import UNSET, UnsetType, to_builtins
 from msgspec.structs import asdict
 
-from toolkit.geometry import Array
+from toolkit.documents import number, numbers
+from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
+from toolkit.report import curves
 from toolkit.report.html.highlights import highlights
-from toolkit.report.html.thinning import (
-    MOST_LANDMARKS,
-    MOST_OF_COMPONENTS,
-    MOST_POSES,
-    coordinates,
-    evenly,
-    running_median,
-    thinned,
-)
 from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
 from toolkit.report.records.scores import Judged, RunOverSeeds
 from toolkit.report.run_files import DrawnPath, RunFiles, SeedsFiles
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
+_MOST_POSES = 1500
+_MOST_SAMPLES = 1200
+_MOST_OF_COMPONENTS = 400
+_MOST_LANDMARKS = 5000
+_MILLIMETRES = 3
+_LARGE_M = 1e7
 
 
 def payload_of(runs: Sequence[Files]) -> Json:
@@ -163,7 +162,7 @@ def _moved(points: Array, drawn: DrawnRun) -> Array:
 
 
 def _drawn(track: DrawnPath) -> Json:
-    kept = evenly(track.t_s.size, MOST_POSES)
+    kept = evenly(track.t_s.size, _MOST_POSES)
     return {"t_s": [round(t, 4) for t in track.t_s[kept].tolist()], **coordinates(track.positions[kept])}
 
 
@@ -171,7 +170,7 @@ def _map(one: DrawnMap, files: RunFiles, rows: list[Json]) -> Json:
     """Return a run's landmarks, moved with its last word onto the truth."""
     points, name = files.landmarks[one.landmarks], one.estimator
     last = next(run for run in files.report.runs if (run.estimator, run.output) == (name, one.output))
-    shown = _moved(points[evenly(len(points), MOST_LANDMARKS)], last)
+    shown = _moved(points[evenly(len(points), _MOST_LANDMARKS)], last)
     return {"estimator": name, "rows": _rows_of(name, rows), "count": len(points), **coordinates(shown)}
 
 
@@ -183,7 +182,7 @@ def _with_median(series: Json, leading: str) -> Json:
 def _components(series: ComponentSeries) -> Json:
     """Return the errors by component with their stated deviations, at few enough times for twelve columns."""
     columns = asdict(series)
-    kept = evenly(len(series.t_s), MOST_OF_COMPONENTS)
+    kept = evenly(len(series.t_s), _MOST_OF_COMPONENTS)
     return {name: [column[i] for i in kept.tolist()] for name, column in columns.items()}
 
 
@@ -289,3 +288,52 @@ def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
         "nees": None if nees is None else thinned({"t_s": t_s, **asdict(nees)}, "pose"),
         "errors": None if errors_m is None else thinned({"t_s": t_s, "position_m": errors_m}, "position_m"),
     }
+
+
+def evenly(count: int, most: int) -> IntArray:
+    """Return at most ``most`` of the indices 0 ... count - 1, evenly spread, the first and the last among them."""
+    if count <= most:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+
+
+def with_peaks(values: Array, most: int) -> IntArray:
+    """Return at most ``most`` indices into values (N,) that keep the least and the largest of each stretch.
+
+    So a single bad frame among thousands stays visible. NaN never wins; the first and the last index stay.
+    """
+    if values.size <= most:
+        return np.arange(values.size)
+    edges = np.linspace(0, values.size, max(most // 2 - 1, 1) + 1).round().astype(np.int64)
+    kept = {0, values.size - 1}
+    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = values[begin:end]
+        kept |= {begin + int(np.where(np.isnan(part), np.inf, part).argmin())}
+        kept |= {begin + int(np.where(np.isnan(part), -np.inf, part).argmax())}
+    return np.array(sorted(kept))
+
+
+def thinned(series: Mapping[str, Sequence[float | None]], leading: str) -> dict[str, list[float | None]]:
+    """Return the lists of a series, all thinned alike, so that the peaks of the ``leading`` one stay."""
+    values = _as_array(series[leading])
+    kept = with_peaks(values, _MOST_SAMPLES).tolist()
+    return {name: [column[i] for i in kept] for name, column in series.items() if len(column) == values.size}
+
+
+def running_median(values: Sequence[float | None]) -> list[float | None]:
+    """Return the median of the known values around each; None where there are none."""
+    return list(numbers(curves.running_median(_as_array(values))))
+
+
+def _as_array(values: Sequence[float | None]) -> Array:
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+
+def coordinates(points: Array) -> dict[str, list[float | None]]:
+    """Return points (N, 3) as lists of x, y and z to the millimetre; what flew off keeps six digits."""
+    axes = zip("xyz", points.T.tolist(), strict=True)
+    return {axis: [_metres(value) for value in values] for axis, values in axes}
+
+
+def _metres(value: float) -> float | None:
+    return round(value, _MILLIMETRES) if abs(value) < _LARGE_M else number(value)

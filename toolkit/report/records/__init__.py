@@ -8,10 +8,9 @@ tracks are like), manifest, check. How they are read and written is :mod:`toolki
 from pathlib import Path
 
 from toolkit.documents import read
-from toolkit.report.records.card import CardRecord
 from toolkit.report.records.check import OLDER, CheckDocument
 from toolkit.report.records.manifest import Manifest
-from toolkit.report.records.report import Report, SeedsReport
+from toolkit.report.records.report import CardRecord, Report, SeedsReport
 from toolkit.report.records.scores import Metrics, Seeds
 
 __all__ = [

@@ -1,7 +1,8 @@
 """``report.json``, the contract ``vislam.report/1``: what a report draws and says beyond the scores (docs/report.md).
 
 It has two forms: of a comparison, and of one over seeds. Times ``t_s`` count from the first frame; numbers have six
-digits; what is not finite is null.
+digits; what is not finite is null. The card of a recording in it is a document of its own, the contract
+``vislam.card/1`` (docs/tracks.md).
 """
 
 from collections.abc import Sized
@@ -11,12 +12,49 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import asdict
 
 from toolkit.estimate import Output
-from toolkit.report.records.card import CardRecord
 from toolkit.report.records.scores import Undecided
 
+Channels = Annotated[tuple[float, float, float], Meta(description="in mean column, disparity, row")]
+Quantiles = Annotated[tuple[float, float, float], Meta(description="10, 50 and 90 %")]
+Lags = Annotated[
+    tuple[tuple[float | None, float | None, float | None], ...],
+    Meta(description="at lags of 1, 2 ... frames, in mean column, disparity, row; null where tracks are too short"),
+]
 Times = Annotated[tuple[float, ...], Meta(description="seconds from the first frame")]
 Numbers = tuple[float | None, ...]
 Vector = tuple[float, float, float]
+
+
+class CardRecord(Struct, frozen=True, kw_only=True):
+    """What the visible tracks of a recording are like, without truth."""
+
+    schema: Literal["vislam.card/1"]
+    tracks: Annotated[int, Meta(description="that the noise was fitted to", ge=0)]
+    tracks_a_frame: float
+    seen_frames: Annotated[Quantiles, Meta(description="sightings of a track")]
+    depth_m: Quantiles
+    intervals: Annotated[int, Meta(ge=0)]
+    intervals_without_common_track: Annotated[int, Meta(ge=0)]
+    correlated: Annotated[bool, Meta(description="whether the errors of a track are correlated")]
+    white_px: Channels
+    walk_px: Annotated[Channels, Meta(description="per root frame")]
+    offset_px: Channels
+    degrees_of_freedom: Annotated[float, Meta(description="of the tracks' Student-t: the fewer, the heavier its tails")]
+    gain: Annotated[float, Meta(description="log-likelihood a track over white noise")]
+    gain_error: float
+    correlation: Annotated[Lags, Meta(description="autocorrelation of residuals along a track")]
+    structure_px2: Annotated[Lags, Meta(description="half the mean square of the difference of residuals")]
+    fitted_px2: Annotated[Lags, Meta(description="the same as the fitted noise has it")]
+    left_right_correlation: float
+    tails: Annotated[float, Meta(description="share of residuals beyond four robust sigmas", ge=0, le=1)]
+    at_odds: Annotated[float, Meta(description="share of tracks at odds with the motion", ge=0, le=1)]
+    scale: Annotated[float | None, Meta(description="translation by vision over the measured one, or null")]
+    scale_error: float | None
+    left_out: (
+        Annotated[float, Meta(description="share of sightings not given to estimators, where some are", ge=0, le=1)]
+        | UnsetType
+    ) = UNSET
+    words: Annotated[tuple[str, ...], Meta(description="what that means for filters and smoothers")]
 
 
 class _Columns(Struct, frozen=True, kw_only=True):
