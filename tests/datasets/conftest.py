@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 
 Refused = Callable[..., None]
@@ -73,6 +74,18 @@ def openvins(tmp_path: Path) -> Path:
     truth = [f"{0.1 * k + 0.1:.1f},{k},1,0,0,0,1,2,3,4,5,6,.1,.2,.3,.4,.5,.6" for k in range(4)]
     (folder / "truth_cam.csv").write_text("\n".join([columns, *truth]) + "\n")
     return folder
+
+
+@pytest.fixture
+def assert_folder_refused() -> Refused:
+    """Return a check that reading a folder as a recording fails in one line that holds a pattern."""
+
+    def check(folder: Path, pattern: str) -> None:
+        with pytest.raises(DataError, match=pattern) as raised:
+            load_sequence(str(folder))
+        assert "\n" not in str(raised.value)
+
+    return check
 
 
 @pytest.fixture

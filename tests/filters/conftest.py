@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
+from filters.kalman.joint import JointBelief
+from filters.kalman.linearisation import AtLatestEstimates, propagate
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
@@ -203,6 +205,23 @@ def oracle() -> SimpleNamespace:
         batch_of=batch_of,
         error_at=error_at,
     )
+
+
+def with_clones(scenario: Scenario, seed: int, count: int) -> tuple[Sequence, JointBelief]:
+    """Return a recording and the joint belief after its first frames, of which it has a clone each, without vision."""
+    sequence = simulate(scenario, seed)
+    model = motion_model(sequence.noise, sequence.gravity_world)
+    joint = JointBelief(model.initial_belief(sequence.prior))
+    for packet in list(sequence.packets())[:count]:
+        propagate(joint, model, AtLatestEstimates(), packet.motion)
+        joint.clone(packet.index)
+    return sequence, joint
+
+
+@pytest.fixture(scope="session")
+def window_of_clones() -> Callable[[Scenario, int, int], tuple[Sequence, JointBelief]]:
+    """Return a maker of windows of exact clones, of a scenario under a seed."""
+    return with_clones
 
 
 @pytest.fixture

@@ -11,8 +11,7 @@ import pytest
 
 from filters.kalman import track_gate, tracks_in_view
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtFirstEstimates, AtLatestEstimates, propagate
+from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_gate import Window
@@ -21,8 +20,7 @@ from filters.kalman.triangulation import nearest_view
 from toolkit.compilation import Compilation
 from toolkit.models import stereo
 from toolkit.models.gating import chi2_bound
-from toolkit.models.motion import motion_model
-from toolkit.simulation import FLIGHT, simulate
+from toolkit.simulation import FLIGHT
 from toolkit.track_noise import TrackNoise
 
 WINDOW, TRACKS = 9, 40
@@ -45,14 +43,9 @@ def compiled(kernels):
 
 
 @pytest.fixture(scope="module")
-def flight():
+def flight(window_of_clones):
     """A window of a flight, corrected once so that first and latest estimates differ."""
-    sequence = simulate(replace(FLIGHT, duration_s=1.0), 2)
-    model = motion_model(sequence.noise, sequence.gravity_world)
-    joint = JointBelief(model.initial_belief(sequence.prior))
-    for packet in list(sequence.packets())[:WINDOW]:
-        propagate(joint, model, AtLatestEstimates(), packet.motion)
-        joint.clone(packet.index)
+    sequence, joint = window_of_clones(replace(FLIGHT, duration_s=1.0), 2, WINDOW)
     clones = joint.clone_columns
     joint.update(np.eye(6, 6 * WINDOW, 6 * WINDOW - 6) * 40.0, np.full(6, 0.3), clones)
     return sequence.rig, Window(joint.clones, AtFirstEstimates().clones(joint), joint.cov[clones, clones])

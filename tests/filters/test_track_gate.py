@@ -7,29 +7,22 @@ import pytest
 
 from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
-from filters.kalman.joint import JointBelief
-from filters.kalman.linearisation import AtLatestEstimates, propagate
+from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TrackGate, innovation_covs
 from filters.kalman.triangulation import triangulate
 from toolkit.models import stereo
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.models.motion import motion_model
-from toolkit.simulation import DRIVE, simulate
+from toolkit.simulation import DRIVE
 
 WINDOW, TRACKS = 6, 12
 AGES = np.tile(np.arange(WINDOW), (TRACKS, 1))
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene(window_of_clones):
     """A window of exact clones and tracks of exact points seen from all of them, with ordinary noise."""
-    sequence = simulate(replace(DRIVE, duration_s=1.5), 2)
-    model = motion_model(sequence.noise, sequence.gravity_world)
-    joint = JointBelief(model.initial_belief(sequence.prior))
-    for packet in list(sequence.packets())[:WINDOW]:
-        propagate(joint, model, AtLatestEstimates(), packet.motion)
-        joint.clone(packet.index)
+    sequence, joint = window_of_clones(replace(DRIVE, duration_s=1.5), 2, WINDOW)
     rng = np.random.default_rng(0)
     ahead = np.stack([rng.uniform(14, 25, TRACKS), rng.uniform(-6, 6, TRACKS), rng.uniform(-2, 2, TRACKS)], axis=1)
     points = ahead @ joint.clones[-1][:3, :3].T + joint.clones[-1][:3, 3]

@@ -1,5 +1,6 @@
 """What a baseline keeps: what was run, with which releases, on which measurements, what came of it, what is worse."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -31,6 +32,11 @@ class Criterion:
 
     worse: Worse
     percent: float
+
+    @property
+    def margin(self) -> float:
+        """The worsening that nobody minds, as a log ratio."""
+        return math.log1p(self.percent / 100.0)
 
 
 @dataclass(frozen=True)

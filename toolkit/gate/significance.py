@@ -48,23 +48,23 @@ class Where:
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
-    """One metric under the seeds (..., n) both sides have, in the baseline and now; of many checks at once, too."""
+class Compared:
+    """One metric in the runs of both sides: (m,) in the baseline, (n,) now."""
 
     where: Where
     criterion: Criterion
     before: Array
     after: Array
 
+
+@dataclass(frozen=True, eq=False)
+class Pairs(Compared):
+    """One metric under the seeds (..., n) both sides have, in the baseline and now; of many checks at once, too."""
+
     @property
     def differences(self) -> Array:
         """Log ratios (..., n) of the value now to the baseline's, positive where it grew."""
         return log_of(self.after) - log_of(self.before)
-
-    @property
-    def margin(self) -> float:
-        """The worsening that nobody minds, as a log ratio."""
-        return float(np.log1p(self.criterion.percent / 100.0))
 
 
 def log_of(values: Array) -> Array:
@@ -81,8 +81,8 @@ def moved_p(pairs: Pairs) -> Array:
 def worse_p(pairs: Pairs) -> Array:
     """Return the p-value (...) of having become worse by more than the margin; 1 where what changed is not worse."""
     if pairs.criterion.worse == "larger":
-        return paired_p(pairs.differences, pairs.margin)
-    return _away_p(log_of(pairs.before), log_of(pairs.after), pairs.margin, _band(pairs))
+        return paired_p(pairs.differences, pairs.criterion.margin)
+    return _away_p(log_of(pairs.before), log_of(pairs.after), pairs.criterion.margin, _band(pairs))
 
 
 def _band(pairs: Pairs) -> tuple[float, float]:
@@ -124,7 +124,7 @@ def judge_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False)
         finding: Finding = "regressed" if p_worse <= rate / 2.0 else "moved" if p <= rate else "same"
         if finding == "moved" and accept_better:
             finding = "better" if _is_nearer(pairs) else "worse"
-        margin = pairs.margin if accept_better else ROUNDING
+        margin = pairs.criterion.margin if accept_better else ROUNDING
         seen = smallest_seen(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
         verdicts.append(_verdict(pairs, finding, p_worse if finding == "regressed" else p, seen))
     return verdicts

@@ -13,7 +13,7 @@ from toolkit.errors import DataError, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import place_of
-from toolkit.gate.significance import FEWEST_RUNS, MeanChange, Where, geometric_mean, holm, percent_text
+from toolkit.gate.significance import FEWEST_RUNS, Compared, MeanChange, Where, geometric_mean, holm, percent_text
 from toolkit.gate.trajectory_baseline import BOUND_PERCENT, ScoredSequence, TrajectoryBaseline
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, Scoring, files_by_sequence, read_stamped, scores
 from toolkit.gate.verdict import Check, Finding, Verdict
@@ -101,7 +101,7 @@ def check_trajectories(
     """
     began, there = time.monotonic(), given.sequences
     verdicts: list[Verdict] = []
-    compared: list[_Compared] = []
+    compared: list[Compared] = []
     for sequence, before in baseline.sequences.items():
         try:
             now = _now(sequence, before, given, baseline.scoring)
@@ -115,35 +115,20 @@ def check_trajectories(
                 verdicts.append(Verdict(sequence, "", "", key, "missing", lost))
             elif any(value is not None for value in before.scores[key]):
                 sides = _array(before.scores[key]), _array(now[key])
-                compared.append(_Compared(Where(sequence, "", "", key), Criterion("larger", percent), *sides))
+                compared.append(Compared(Where(sequence, "", "", key), Criterion("larger", percent), *sides))
     tested = _judged(compared, baseline.false_alarm_rate, accept_better=accept_better)
     order = list(baseline.sequences)
     verdicts = sorted([*verdicts, *tested], key=lambda verdict: order.index(verdict.sequence))
     unknown = sorted(set(there) - set(order))
     notes = (f"not in the baseline, and not judged: {', '.join(unknown)}",) if unknown else ()
-    tests = sum(one.is_tested for one in compared)
+    tests = sum(_is_tested(one) for one in compared)
     seconds = time.monotonic() - began
     return Check(name, tuple(verdicts), notes, baseline.false_alarm_rate, tests, {}, seconds, accept_better)
 
 
-@dataclass(frozen=True, eq=False)
-class _Compared:
-    """One metric in the runs of both sides (m,), (n,)."""
-
-    where: Where
-    criterion: Criterion
-    before: Array
-    after: Array
-
-    @property
-    def is_tested(self) -> bool:
-        """Whether there are runs enough to tell chance by."""
-        return min(self.before.size, self.after.size) >= FEWEST_RUNS
-
-    @property
-    def margin(self) -> float:
-        """The growth that is allowed, of the logarithm."""
-        return float(np.log1p(self.criterion.percent / 100.0))
+def _is_tested(one: Compared) -> bool:
+    """Say whether there are runs enough to tell chance by."""
+    return min(one.before.size, one.after.size) >= FEWEST_RUNS
 
 
 def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scoring) -> Mapping[str, Values]:
@@ -179,24 +164,24 @@ def _coverage(sequence: str, before: ScoredSequence, now: Mapping[str, Values], 
     yield Verdict(sequence, "", "", TIME_COVERAGE, finding, words if worse else "", was, is_)
 
 
-def _judged(compared: list[_Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
+def _judged(compared: list[Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
     """Yield a verdict for each metric: by a test where there are runs enough, else by its bound alone."""
-    tested = [one for one in compared if one.is_tested]
+    tested = [one for one in compared if _is_tested(one)]
     spreads = [MeanChange.of(one.before, one.after) for one in tested]
+    with_margins = [(spread, one.criterion.margin) for spread, one in zip(spreads, tested, strict=True)]
     up, down = (
-        holm(np.array([spread.beyond_p(one.margin, sign) for spread, one in zip(spreads, tested, strict=True)]))
-        for sign in (1.0, -1.0)
+        holm(np.array([spread.beyond_p(margin, sign) for spread, margin in with_margins])) for sign in (1.0, -1.0)
     )
     for one, spread, p_up, p_down in zip(tested, spreads, up.tolist(), down.tolist(), strict=True):
         yield _tested(one, spread, (p_up, p_down), rate / 2.0, rate / len(tested) / 2.0, accept_better=accept_better)
     for one in compared:
-        if not one.is_tested:
+        if not _is_tested(one):
             was, is_ = float(np.median(one.before)), float(np.median(one.after))
             yield judge_recorded(one.where, one.criterion, was, is_, accept_better=accept_better)
 
 
 def _tested(
-    one: _Compared, spread: MeanChange, p_values: tuple[float, float], rate: float, each: float, *, accept_better: bool
+    one: Compared, spread: MeanChange, p_values: tuple[float, float], rate: float, each: float, *, accept_better: bool
 ) -> Verdict:
     worse, better = (p <= rate for p in p_values)
     finding: Finding = "regressed" if worse else "same"
@@ -211,5 +196,5 @@ def _tested(
         where.sequence, where.estimator, where.output, where.metric, finding, words,
         before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
-        seen_percent=100.0 * float(np.expm1(spread.seen(one.margin, each))),
+        seen_percent=100.0 * float(np.expm1(spread.seen(one.criterion.margin, each))),
     )  # fmt: skip
