@@ -20,8 +20,8 @@ from filters.smoothing.robust_loss import Huber, Loss, Squares
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only, stereo
 from toolkit.models.correlated_noise import Chain, channels_of, in_channels
-from toolkit.models.disparity_scale import d_uv_d_scale, scaled_rig
 from toolkit.models.factors import SCALE, L, X, linear_factor
+from toolkit.models.stereo import d_uv_d_scale, scaled_rig
 from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.track_noise import TrackNoise
 

@@ -13,11 +13,11 @@ from toolkit.geometry import se3_exp, transform
 from toolkit.measured_motion import NoSamples
 from toolkit.metrics import score_run
 from toolkit.models import stereo
-from toolkit.models.disparity_scale import scaled_rig
 from toolkit.models.factors import SCALE, L, StereoFactors, X, joint_cov, kind_of
 from toolkit.models.motion import motion_model, state_cov
 from toolkit.models.noise import unmeasured_motion
 from toolkit.models.state_covariances import covs_beside
+from toolkit.models.stereo import scaled_rig
 from toolkit.sequence import StereoFrame
 from toolkit.settings import Noise, Settings
 from toolkit.simulation import DRIVE, simulate

@@ -16,8 +16,7 @@ import numpy as np
 
 from toolkit.datasets import vislam_recording
 from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations
-from toolkit.datasets.io.named_columns import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file
-from toolkit.datasets.io.tables import find_table
+from toolkit.datasets.io.tables import NANOSECONDS, SECONDS, Columns, columns_given, columns_of_file, find_table
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError, did_you_mean

@@ -1,5 +1,6 @@
 """The stereo measurement z = K_s pi(T_oi T_iw m), reduced to (uL, uR, v), with its Jacobians (Kang, eqs. 3-7, 11)."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,8 @@ from toolkit.sequence import StereoRig
 
 # What a depth is divided by at least.
 _LEAST_DIVISIBLE_M = 1e-3
+# (uL, uR) of a disparity that is added: half of it on either side.
+_OF_A_DISPARITY = np.array([0.5, -0.5, 0.0])
 
 
 class StereoPrediction(NamedTuple):
@@ -103,3 +106,21 @@ def disparity_px(uvs_px: Array) -> Array:
     """Return uL - uR (...,) px."""
     disparity: Array = uvs_px[..., 0] - uvs_px[..., 1]
     return disparity
+
+
+def scaled_rig(rig: StereoRig, scale: float) -> StereoRig:
+    """Return the rig whose sightings have disparities larger by a share, which is more than -1.
+
+    d becomes d (1 + scale), the mean column c = (uL + uR) / 2 and the row stay. That is, exactly, a pair whose baseline
+    is b (1 + scale) about the same middle: the left camera is half of what is added further to the left. A baseline or
+    a focal length that is calibrated wrong does so, and matching that prefers one side; one about the left camera would
+    move c by half a scaled disparity as well.
+    """
+    T_imu_cam = rig.T_imu_cam.copy()
+    T_imu_cam[:3, 3] -= 0.5 * scale * rig.baseline_m * T_imu_cam[:3, 0]
+    return replace(rig, baseline_m=rig.baseline_m * (1.0 + scale), T_imu_cam=T_imu_cam)
+
+
+def d_uv_d_scale(uv_px: Array, scale: float) -> Array:
+    """Return the derivatives (..., 3) of what a scaled rig predicts, (..., 3) px, by its scale."""
+    return np.asarray(disparity_px(uv_px)[..., None] / (1.0 + scale) * _OF_A_DISPARITY)

@@ -1,22 +1,33 @@
-"""Columns of CSV tables by name, plain or gzipped, and tables of the ASL format with stamps in whole nanoseconds.
+"""Tables: columns by name, of a CSV file, plain or gzipped, or of a program's own values; a complaint names the place.
 
-ASL: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016), section 3.
+Tables of one's own may be written in several ways, and are read value by value. Those of the ASL format have stamps in
+whole nanoseconds and are read at once: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016), section 3.
 """
 
+import csv
 import gzip
 import io
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from toolkit.errors import DataError
+from toolkit.datasets.io.fields import probable_unit, probable_unit_of_ns, stamps_ns
+from toolkit.errors import DataError, nearest, printable
 from toolkit.geometry import Array, IntArray
 from toolkit.inputs import is_regular, open_input, read_input, read_text_input
+from toolkit.resampling import NS_PER_S
 
 _LONGEST_LINE = 1 << 16
 _GZIP_MAGIC = b"\x1f\x8b"
+SECONDS, NANOSECONDS = "t", "t_ns"
+_SEPARATORS = (",", ";", "\t")
+_LARGEST = 2**63 - 1
 
 
 def find_table(folder: Path, name: str) -> Path | None:
@@ -41,7 +52,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
 
     Raises DataError where the file is damaged, a column is missing (all are listed), or a row is not numeric.
     """
-    header, _, body = read_whole(path).partition(b"\n")
+    header, _, body = _read_whole(path).partition(b"\n")
     columns = [name.strip() for name in header.decode(errors="replace").split(",")]
     missing = [name for name in names if name not in columns]
     if missing:
@@ -56,7 +67,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
     return table
 
 
-def read_whole(path: Path) -> bytes:
+def _read_whole(path: Path) -> bytes:
     """Return the content of a table, plain or gzipped; raises DataError where it cannot be read or is damaged."""
     content = read_input(path)
     try:
@@ -108,3 +119,207 @@ def read_stamps(path: Path, header_lines: int = 0) -> IntArray:
         return np.array([int(entry) for entry in entries], dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise DataError(f"{path}: a stamp is not in whole nanoseconds ({error}); write seconds times 1e9") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """A table: what it is called in a complaint, its columns (N,), texts or numbers, by name, and what rows are called.
+
+    ``numbers_of_rows`` are those of a file's lines, as an editor counts them; None counts from 0.
+    """
+
+    what: Path
+    values: Mapping[str, Sequence[Any] | npt.NDArray[Any]]
+    row: str = "row"
+    numbers_of_rows: tuple[int, ...] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all columns."""
+        return tuple(self.values)
+
+    def require(self, *alternatives: str) -> None:
+        """Raise DataError for columns that are missing, with the like-named there are; ``"a|b"`` is either."""
+        missing = [names for names in alternatives if not any(name in self.values for name in names.split("|"))]
+        if not missing:
+            return
+        hints = (self._hint(names.split("|")) for names in missing)
+        wanted = ", ".join(names.replace("|", " or ") + hint for names, hint in zip(missing, hints, strict=True))
+        there = printable(", ".join(self.names))[:200] or "nothing"
+        raise DataError(f"{self.what}: missing column {wanted}; it has {there}")
+
+    def _hint(self, wanted: Sequence[str]) -> str:
+        free = [name for name in self.names if name not in wanted]
+        close = next((near for name in wanted if (near := nearest(name, free))), "")
+        return f" (rename {printable(close)}?)" if close else ""
+
+    def numbers(self, *names: str) -> Array:
+        """Return columns side by side (N, C) as float64, NaN included; raises DataError naming the row of a text."""
+        return np.stack([self._numbers(name) for name in names], axis=1)
+
+    def numbers_or_none(self, *names: str) -> Array:
+        """Return columns as :meth:`numbers` does, with NaN where a CSV has nothing."""
+        filled = {name: [cell or "nan" for cell in self.values[name]] for name in names if self._is_text(name)}
+        return replace(self, values={**self.values, **filled}).numbers(*names)
+
+    def _is_text(self, name: str) -> bool:
+        return all(isinstance(cell, str) for cell in self.values[name])
+
+    def whole(self, name: str) -> IntArray:
+        """Return a column of whole numbers (N,); raises DataError naming the row of anything else."""
+        values = self.values[name]
+        if isinstance(values, np.ndarray) and values.dtype.kind in "iu":
+            return values.astype(np.int64)
+        return np.array([self._whole(name, i, value) for i, value in enumerate(values)], dtype=np.int64)
+
+    def stamps(self) -> IntArray:
+        """Return the stamps (N,) of a column t, in seconds, or t_ns, as int64 nanoseconds, rounded only there.
+
+        Raises DataError where there are both or neither, one is no time, or they are not in seconds.
+        """
+        self.require(f"{SECONDS}|{NANOSECONDS}")
+        if SECONDS in self.values and NANOSECONDS in self.values:
+            raise DataError(f"{self.what}: has the columns {SECONDS} and {NANOSECONDS}; leave one out")
+        if NANOSECONDS in self.values:
+            t_ns = self.whole(NANOSECONDS)
+            unit = probable_unit_of_ns(t_ns)
+            if unit is not None:
+                raise DataError(f"{self.what}: {NANOSECONDS} must be in nanoseconds, but the stamps look like {unit}")
+            return t_ns
+        values = self.values[SECONDS]
+        if isinstance(values, np.ndarray) and values.dtype.kind in "fiu":
+            return stamps_ns(self.what, SECONDS, values.astype(np.float64))
+        exact = [self._decimal(i, str(value)) for i, value in enumerate(values)]
+        unit = probable_unit(np.array(exact, dtype=np.float64))
+        if unit is not None:
+            raise DataError(f"{self.what}: {SECONDS} must be in seconds, but the stamps look like {unit}")
+        return np.array([self._ns(i, seconds) for i, seconds in enumerate(exact)], dtype=np.int64)
+
+    def at(self, row: int) -> str:
+        """Return how a row is called."""
+        return f"{self.row} {row if self.numbers_of_rows is None else self.numbers_of_rows[row]}"
+
+    def unused(self, used: Iterable[str]) -> tuple[str, ...]:
+        """Return the names of the columns that are none of those used."""
+        known = set(used)
+        return tuple(name for name in self.names if name not in known)
+
+    def _numbers(self, name: str) -> Array:
+        values = np.asarray(self.values[name])
+        if values.ndim != 1:
+            raise DataError(f"{self.what}: column {name} has shape {values.shape}, expected one number a row")
+        try:
+            if values.dtype.kind == "U" and (np.strings.find(values, "_") >= 0).any():
+                raise ValueError  # Python takes 1_0 for ten
+            return values.astype(np.float64)
+        except (TypeError, ValueError):
+            bad = next(i for i, value in enumerate(values.tolist()) if not _is_number(value))
+            shown = printable(str(values[bad]))[:50] or "empty"
+            point = " with a decimal point" if "," in shown else ""
+            raise DataError(f"{self.what}: {self.at(bad)}: {name} is {shown}, expected a number{point}") from None
+
+    def _whole(self, name: str, row: int, value: Any) -> int:
+        try:
+            exact = Decimal(value.replace("_", "?")) if isinstance(value, str) else value
+            number = int(exact) if abs(exact) <= _LARGEST else None
+        except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
+            exact, number = value, None
+        if number is None or number != exact:
+            shown = printable(str(value))[:50] or "empty"
+            raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number")
+        return number
+
+    def _decimal(self, row: int, text: str) -> Decimal:
+        try:
+            seconds = Decimal(text.replace("_", "?"))
+        except InvalidOperation:
+            seconds = Decimal("nan")
+        if not seconds.is_finite():
+            shown = printable(text)[:50] or "empty"
+            raise DataError(f"{self.what}: {self.at(row)}: {SECONDS} is {shown}, expected seconds")
+        return seconds
+
+    def _ns(self, row: int, seconds: Decimal) -> int:
+        t_ns = int((seconds * NS_PER_S).to_integral_value())
+        if abs(t_ns) > _LARGEST:
+            shown = f"{seconds:.6g}"
+            raise DataError(f"{self.what}: {self.at(row)}: {SECONDS} is {shown}, beyond any clock; check its unit")
+        return t_ns
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return "_" not in str(value)
+
+
+def columns_of_file(path: Path) -> Columns:
+    """Read a CSV, plain or gzipped, whose first line names its columns; comments and units after names are left out.
+
+    Cells stand between commas, semicolons or tabs, in quotes or not. Raises DataError where the file cannot be read,
+    has no names or no rows, a column twice, or a row of another length.
+    """
+    try:
+        text = _read_whole(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file; write a CSV, one row a line, with names in the first") from error
+    heading, lines = _heading(path, text)
+    separator = max(_SEPARATORS, key=heading.count)
+    if separator not in heading and len(heading.split()) > 1:
+        raise DataError(f"{path}: its columns stand between blanks; separate them by commas, semicolons or tabs")
+    names = [name.strip().lstrip("#").partition("[")[0].strip() for name in _cells(heading, separator)]
+    kept = names[:-1] if names[-1] == "" else names  # some programs end each line with a separator
+    if len(set(kept)) < len(kept):
+        raise DataError(f"{path}: a column name is there twice in {printable(heading)[:200]}; rename or remove one")
+    rows = [_cells(line, separator) for _, line in lines]
+    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
+    if wrong is not None:
+        raise DataError(f"{path}: line {lines[wrong][0]} has {len(rows[wrong])} columns, expected {len(names)}")
+    if not rows:
+        raise DataError(f"{path}: holds no rows; its first line names the columns, the others hold them")
+    values = dict(zip(kept, zip(*rows, strict=True), strict=False))
+    return Columns(path, values, "line", tuple(number for number, _ in lines))
+
+
+def _heading(path: Path, text: str) -> tuple[str, list[tuple[int, str]]]:
+    """Return the line that names the columns, and the others with their numbers, without comments and empty ones.
+
+    The names may be a comment, the last one before the rows. Raises DataError where no line names them.
+    """
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
+    before = [line for number, line in lines if not rows or number < rows[0][0]]
+    if rows and not _begins_with_number(rows[0][1]):
+        return rows[0][1], rows[1:]
+    if not before:
+        what = "holds numbers and no names" if rows else "holds no rows"
+        raise DataError(f"{path}: {what}; its first line names the columns, the others hold them")
+    return before[-1], rows
+
+
+def _begins_with_number(line: str) -> bool:
+    return any(_is_number(_cells(line, separator)[0]) for separator in _SEPARATORS)
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if '"' in line:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [cell.strip() for cell in line.split(separator)]
+
+
+def columns_given(what: str, given: Any) -> Columns:
+    """Return what a program gives as columns: a mapping of names to values (N,), or anything like a data frame.
+
+    Raises DataError where it is none, or its columns differ in length.
+    """
+    try:
+        values = {str(name): np.asarray(given[name]) for name in given}
+        lengths = {name: len(column) for name, column in values.items()}
+    except (TypeError, KeyError, IndexError, ValueError) as error:
+        raise DataError(f"{what}: is no mapping of column names to values ({error}); give a dict of arrays") from error
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise DataError(f"{what}: its columns differ in length: {told}")
+    return Columns(Path(what), values)
