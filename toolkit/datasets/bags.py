@@ -37,9 +37,9 @@ from toolkit.settings import DEFAULTS, Frontend
 
 # Of images that are rectified already so many times as many corners have the same row as they are.
 _CLEARLY = 2
+_NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 
 uses_images = images_only
-_NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 
 
 def recognises(path: Path) -> bool:

@@ -21,8 +21,8 @@ _BLOCK_PX = 5
 _HALF_PX = 5  # the template is 11 x 11 px of the halved image
 _ROWS_PX = 1  # rows searched above and below
 _LEAST_CORRELATION = 0.7
+# Of Lucas-Kanade; on the way back no pyramid is needed: it begins near the true place.
 _ITERATIONS, _STOP_PX = 30, 0.01
-# Near the true place already: no pyramid is needed on the way back.
 _LEVELS_BACK = 1
 
 

@@ -20,7 +20,7 @@ from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_exp, skew, tra
 from toolkit.models import stereo
 from toolkit.sequence import StereoRig
 
-_FEWEST = 8
+_FEWEST_OF_A_POSE = 8
 _ITERATIONS, _CONFIDENCE = 200, 0.999
 # A depth from a small disparity is uncertain, and with it what is expected in the right image.
 _LEAST_DISPARITY_PX = 0.5
@@ -112,7 +112,7 @@ def pose_of(points: Array, left_px: Array, rig: RectifiedPair | StereoRig, thres
     """
     import cv2
 
-    if len(points) < _FEWEST:
+    if len(points) < _FEWEST_OF_A_POSE:
         return None
     K = np.array([[rig.fx_px, 0.0, rig.cx_px], [0.0, rig.fy_px, rig.cy_px], [0.0, 0.0, 1.0]])
     found, turn, shift, inliers = cv2.solvePnPRansac(
@@ -122,7 +122,7 @@ def pose_of(points: Array, left_px: Array, rig: RectifiedPair | StereoRig, thres
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or inliers is None or len(inliers) < max(_FEWEST, 0.3 * len(points)):
+    if not found or inliers is None or len(inliers) < max(_FEWEST_OF_A_POSE, 0.3 * len(points)):
         return None
     return se3(np.asarray(cv2.Rodrigues(turn)[0], dtype=float), np.ravel(shift))
 
