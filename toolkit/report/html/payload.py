@@ -1,6 +1,7 @@
 """Everything the page shows, as one JSON value; its numbers are those of the run directories' own documents.
 
 Over seeds: means with their spread, every seed's value, NEES and its band.
+Series have fewer points than a recording, none of them made up: what a screen can show, in a file that can be mailed.
 """
 
 import base64
