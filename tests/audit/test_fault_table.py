@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.report.terminal import audit_text
+from toolkit.report.comparison_text import audit_text
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

@@ -19,12 +19,11 @@ from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_o
 from toolkit.experiment.units import Outcome
 from toolkit.metrics import Scores, describe
 from toolkit.metrics._shared.consistency import nees_band
+from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.messages import note_lines, paired_lines
 from toolkit.report.records import Seeds
-from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import seeds_document
-from toolkit.report.terminal import comparison_text
 
 Document = dict[str, Any]
 

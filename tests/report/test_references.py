@@ -17,10 +17,10 @@ from toolkit.experiment.references import reference_runs
 from toolkit.experiment.units import outcome_of
 from toolkit.geometry import Array, quaternion_from_rotation
 from toolkit.metrics import cost, score_run
+from toolkit.report.comparison_text import comparison_text
 from toolkit.report.figures import errors_over_time, frame_times
 from toolkit.report.records import read_metrics
 from toolkit.report.run_directory import MadeBy, write_run
-from toolkit.report.terminal import comparison_text
 from toolkit.sequence import Sequence
 from toolkit.simulation import FLIGHT, simulate
 

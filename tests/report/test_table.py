@@ -12,7 +12,7 @@ from toolkit.errors import VislamError
 from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, known_metrics
-from toolkit.report.report_md import report_text
+from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.table import (
     Table,
     as_markdown,
@@ -23,7 +23,6 @@ from toolkit.report.table import (
     heading,
     shown_metrics,
 )
-from toolkit.report.terminal import comparison_text
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

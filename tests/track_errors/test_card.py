@@ -12,10 +12,9 @@ from toolkit.documents import to_line
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
 from toolkit.report.card import card_lines, card_record, card_text
+from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.records import read_card
 from toolkit.report.report_json import report_document
-from toolkit.report.report_md import report_text
-from toolkit.report.terminal import comparison_text
 from toolkit.sequence import Sequence
 from toolkit.settings import settings_of
 from toolkit.simulation.track_faults import disparity_scale, persistent_mismatch

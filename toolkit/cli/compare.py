@@ -147,10 +147,10 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.documents import to_line
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.progress import of_this_process, print_above
+    from toolkit.report.comparison_text import comparison_text
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import directories_for, write_run
     from toolkit.report.scores_json import scores_document
-    from toolkit.report.terminal import comparison_text
 
     columns = _columns(options.columns)
     asked = _configuration(options)

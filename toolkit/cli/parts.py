@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from toolkit.estimator import EstimatorEntry
     from toolkit.settings import Described
 
+_INDENT = "  "
+
 
 @command("list", "list estimators, built-in sequences, formats, metrics, faults and settings", "vislam list")
 def list_parts(_options: argparse.Namespace) -> int:
@@ -21,8 +23,6 @@ def list_parts(_options: argparse.Namespace) -> int:
     from toolkit import datasets, metrics
     from toolkit.audit import faults
     from toolkit.estimator import discover
-    from toolkit.report.prose import width_of_output
-    from toolkit.report.terminal import listing_text
     from toolkit.settings import describe
 
     sections = {
@@ -33,8 +33,18 @@ def list_parts(_options: argparse.Namespace) -> int:
         "faults": faults(),
         "settings": {one.key: _setting(one) for one in describe()},
     }
-    print("\n\n".join(listing_text(title, entries, width_of_output()) for title, entries in sections.items()))
+    print("\n\n".join(_listing(title, entries) for title, entries in sections.items()))
     return 0
+
+
+def _listing(title: str, entries: Mapping[str, str]) -> str:
+    """Return names with their one-line summaries under a title."""
+    from toolkit.report.prose import filled, width_of_output
+
+    longest, width = max((len(name) for name in entries), default=0), width_of_output()
+    further = " " * (longest + 2 * len(_INDENT))
+    lines = (filled(text, width, f"{_INDENT}{name:<{longest}}{_INDENT}", further) for name, text in entries.items())
+    return "\n".join([f"{title}:", *(line.rstrip() for line in lines)])
 
 
 def _estimator(entry: EstimatorEntry) -> str:

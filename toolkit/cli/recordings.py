@@ -43,8 +43,8 @@ def check_data(options: argparse.Namespace) -> int:
     """
     from toolkit.experiment.recording import audited_recording
     from toolkit.progress import of_this_process
+    from toolkit.report.comparison_text import audit_text
     from toolkit.report.prose import width_of_output
-    from toolkit.report.terminal import audit_text
 
     recording = replace(recording_asked(options), truth=options.truth)
     with of_this_process()(options.sequence) as progress:

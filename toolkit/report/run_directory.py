@@ -20,11 +20,11 @@ from toolkit.experiment.pipeline import PreparedCase
 from toolkit.files import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
+from toolkit.report.comparison_text import report_text
 from toolkit.report.curves import truth_during
 from toolkit.report.manifest import manifest_document
 from toolkit.report.records import Manifest, read_manifest
 from toolkit.report.records.report import CameraFrame
-from toolkit.report.report_md import report_text
 from toolkit.report.scores_json import metrics_document, seeds_document
 
 if TYPE_CHECKING:

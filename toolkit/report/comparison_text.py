@@ -1,19 +1,26 @@
-"""``report.md``: the table, the figures and, in plain words, what they mean and how far to trust them."""
+"""A comparison in words and tables: as it is printed, and as ``report.md``; and what the audit alone found.
+
+The table, and around it everything a reader must know before believing it: what numbers mean, how far to trust them.
+"""
 
 from collections.abc import Mapping
 
+from toolkit.audit import Audit, Finding
+from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.card import card_lines
-from toolkit.report.header import header_lines
+from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
     note_lines,
+    outcome,
     paired_lines,
     remark_lines,
+    undecided_lines,
 )
-from toolkit.report.prose import in_markdown, markdown_section
-from toolkit.report.table import as_markdown, comparison_table, explained_metrics
+from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
+from toolkit.report.table import Columns, Table, as_markdown, as_text, comparison_table, explained_metrics
 
 _READ_BEFORE = """\
 Causal and held-out are said of what an estimator is given. Before its first packet, the same for all: with raw IMU
@@ -66,6 +73,24 @@ quartiles over all runs.
 {_OUTSIDE_BY_DESIGN}"""
 
 
+def comparison_text(comparison: Comparison, columns: Columns = None, width: Width = WIDTH) -> str:
+    """Return the comparison as plain text, its prose no wider than ``width``; the table is never wrapped or cut.
+
+    Raises VislamError for an unknown column.
+    """
+    lines = [filled(entry, width) for entry in header_lines(comparison, columns)]
+    lines += ["", as_text(comparison_table(comparison, columns)), ""]
+    lines += section("start", [comparison.prior.source], width)
+    lines += section("audit", finding_lines(comparison), width)
+    lines += section("facts", comparison.sequence.provenance.facts, width)
+    if comparison.card is not None:
+        lines += section("card", card_lines(comparison.card), width)
+    lines += section("pairs", paired_lines(comparison), width)
+    lines += section("nees", consistency_lines(comparison), width)
+    lines += section("notes", note_lines(comparison, columns), width)
+    return "\n".join(lines)
+
+
 def report_text(comparison: Comparison, captions: Mapping[str, str]) -> str:
     """Return the report; ``captions`` maps the file names of the figures, beside the report, to their captions."""
     seeds = f", {len(comparison.seeds)} seeds" if comparison.over_seeds else ""
@@ -97,3 +122,30 @@ def _figure(name: str, caption: str) -> str:
 def _meanings(comparison: Comparison) -> str:
     """Return a line for each metric of the table."""
     return "\n".join(f"- **{metric.name}**: {metric.meaning}" for metric in explained_metrics(comparison))
+
+
+def audit_text(audited: Audit, width: Width = WIDTH) -> str:
+    """Return what the audit found as plain text: fault, count, outcome, and the details below each."""
+    findings = audited.findings
+    lines = [printable(sequence_line(audited.sequence)), ""]
+    if findings:
+        headings = (("fault",), ("outcome",), ("count",))
+        rows = tuple((f.fault, outcome(f), str(f.count)) for f in findings)
+        lines += [as_text(Table(headings, rows, labels=2)), ""]
+        lines += [filled(f"{finding.fault}: {finding.detail}", width) for finding in findings]
+    else:
+        lines += ["no fault found"]
+    lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
+    if any(f.blocking for f in findings):
+        lines += ["", *_spoiling(findings)]
+    elif any(f.warning for f in findings):
+        lines += ["", f"results have to be read with this in mind: {', '.join(f.fault for f in findings if f.warning)}"]
+    elif findings and not audited.undecided:
+        lines += ["", "nothing is left that spoils a result"]
+    return "\n".join(lines)
+
+
+def _spoiling(findings: tuple[Finding, ...]) -> list[str]:
+    """Return a line for each way in which findings spoil a result, with their names."""
+    by_outcome = {how: [f.fault for f in findings if outcome(f) == how] for how in ("not repaired", "too much lost")}
+    return [f"{how}: {', '.join(names)}" for how, names in by_outcome.items() if names]
