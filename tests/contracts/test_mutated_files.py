@@ -30,6 +30,7 @@ from toolkit.errors import VislamError
 # A recording as its files: the content by the name in the folder; one file alone has the name "".
 Files = dict[str, bytes]
 Original = Callable[[str], Files]
+Test = Callable[..., None]
 VALUES = ("nan", "inf", "-inf", "0", "-1", "1e300", "-1e300", "1e-300", "1e19", "99999999999999999999", "", "x", "null")
 _DTYPES = ("f4", "i8", "u1", "c16", "U8", "?", "i2")
 _NUMBER = re.compile(rb"-?\d[\d.eE+-]*")
@@ -192,14 +193,16 @@ NEWER = ("course npy", "own tables")
 TRAJECTORIES = ("tum file", "kitti file", "euroc file", "openvins file")
 
 
-def examples(count: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    return settings(
+def mutating(names: tuple[str, ...], kinds: tuple[str, ...], count: int) -> Callable[[Test], Test]:
+    """Return what gives a test the ``name`` of each original and, for each, so many times what ``happened`` to it."""
+    examples = settings(
         max_examples=count,
         derandomize=True,
         database=None,
         deadline=None,
         suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.differing_executors],
     )
+    return lambda test: pytest.mark.parametrize("name", names)(given(happened=mutations(kinds))(examples(test)))
 
 
 def read_or_refused(read: Callable[[Path], object], files: Files) -> None:
@@ -224,45 +227,35 @@ def test_what_is_not_mutated_is_read(original: Original, tmp_path: Path, name: s
     _load(write(original(name), tmp_path / "given"))
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
-@given(happened=mutations(KINDS))
-@examples(200)
+@mutating(RECORDINGS, KINDS, 200)
 def test_a_mutated_recording_is_read_or_refused_in_one_line(
     original: Original, name: str, happened: list[Mutation]
 ) -> None:
     read_or_refused(_load, mutated(original(name), happened))
 
 
-@pytest.mark.parametrize("name", NEWER)
-@given(happened=mutations(KINDS))
-@examples(70)
+@mutating(NEWER, KINDS, 70)
 def test_a_mutated_pickle_or_table_is_read_or_refused_in_one_line(
     original: Original, name: str, happened: list[Mutation]
 ) -> None:
     read_or_refused(_load, mutated(original(name), happened))
 
 
-@pytest.mark.parametrize("name", NEWER)
-@given(happened=mutations(KINDS))
-@examples(12)
-def test_the_command_line_survives_a_mutated_pickle_or_table(
-    original: Original, name: str, happened: list[Mutation], capfd: pytest.CaptureFixture[str]
-) -> None:
-    run_on(mutated(original(name), happened), capfd)
-
-
-@pytest.mark.parametrize("name", TRAJECTORIES)
-@given(happened=mutations(tuple(RAW)))
-@examples(135)
+@mutating(TRAJECTORIES, tuple(RAW), 135)
 def test_a_mutated_trajectory_is_read_or_refused_in_one_line(
     original: Original, name: str, happened: list[Mutation]
 ) -> None:
     read_or_refused(read_poses, mutated(original(name), happened))
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
-@given(happened=mutations(KINDS))
-@examples(45)
+@mutating(NEWER, KINDS, 12)
+def test_the_command_line_survives_a_mutated_pickle_or_table(
+    original: Original, name: str, happened: list[Mutation], capfd: pytest.CaptureFixture[str]
+) -> None:
+    run_on(mutated(original(name), happened), capfd)
+
+
+@mutating(RECORDINGS, KINDS, 45)
 def test_the_command_line_survives_a_mutated_recording(
     original: Original, name: str, happened: list[Mutation], capfd: pytest.CaptureFixture[str]
 ) -> None:
