@@ -165,13 +165,23 @@ def bridged(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> gtsam.Non
 
 
 def kept_twist(kept: KeptTwist, k: int) -> gtsam.NonlinearFactor:
-    """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist."""
+    """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist.
+
+    It is :meth:`KeptTwist.change` with its derivatives in GTSAM's arithmetic: single matrices are slow in NumPy, and a
+    solve asks for thousands of them.
+    """
+    lasting_s = (kept.before_s, kept.after_s)
 
     def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        poses = np.array([values.atPose3(key).matrix() for key in this.keys()])  # noqa: SIM118 - not a mapping
+        poses = [values.atPose3(key) for key in this.keys()]  # noqa: SIM118 - not a mapping
+        steps = [start.between(end) for start, end in pairwise(poses)]
+        logs = [gtsam.Pose3.Logmap(step) for step in steps]
         if jacobians is not None:
-            jacobians[0], jacobians[1], jacobians[2] = np.hsplit(kept.derivatives(poses), 3)
-        return kept.change(poses)
+            ends = [gtsam.Pose3.LogmapDerivative(log) / dt_s for log, dt_s in zip(logs, lasting_s, strict=True)]
+            starts = [-end @ step.inverse().AdjointMap() for end, step in zip(ends, steps, strict=True)]
+            jacobians[0], jacobians[1], jacobians[2] = -starts[0], starts[1] - ends[0], ends[1]
+        before, after = (log / dt_s for log, dt_s in zip(logs, lasting_s, strict=True))
+        return np.asarray(after - before)
 
     covariance = gtsam.noiseModel.Diagonal.Sigmas(kept.sigmas)
     return gtsam.CustomFactor(covariance, [X(k - 2), X(k - 1), X(k)], residual)
