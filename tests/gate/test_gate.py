@@ -13,7 +13,8 @@ from toolkit.cli.gate import command_to_keep
 from toolkit.gate.baseline import installed_releases
 
 Vislam = Callable[..., int]
-MAKE = ("baseline", "drive:1", "data-copy:4", "--estimators", "dead-reckoning,ekf", "--seeds", "5")
+ONE_PROCESS = ("--workers", "1")
+MAKE = ("baseline", "drive:1", "data-copy:4", "--estimators", "dead-reckoning,ekf", "--seeds", "5", *ONE_PROCESS)
 PROJECT = Path(__file__).parents[2]
 
 
@@ -55,8 +56,7 @@ def changed(change: Callable[[dict], object]) -> None:
     Path("base.json").write_text(json.dumps(document))
 
 
-# The baseline is made in several processes and checked in one.
-CHECK = ("check", "--baseline", "base.json", "--skip-speed", "--workers", "1")
+CHECK = ("check", "--baseline", "base.json", "--skip-speed", *ONE_PROCESS)
 
 
 def test_a_baseline_says_by_which_command_it_was_made_but_not_in_which_folder(made: str) -> None:

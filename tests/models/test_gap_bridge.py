@@ -85,6 +85,18 @@ def test_the_factor_has_the_derivatives_of_its_residual(seed):
             np.testing.assert_allclose(derivatives[:, 6 * which + i], numeric, atol=1e-4, rtol=1e-6)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1e-2, 0.3, 2.0])
+def test_the_factor_says_what_the_filters_correct_by(size):
+    """Its arithmetic is GTSAM's, theirs NumPy's; the numbers are of the order of 1 / 0.1 s."""
+    rng = np.random.default_rng(4)
+    first, *steps = (se3_exp(scale * rng.normal(size=6)) for scale in (1.0, size, size))
+    poses = np.array([first, first @ steps[0], first @ steps[0] @ steps[1]])
+    kept = KeptTwist(0.1, 0.15, NOISE)
+    derivatives, right_side = kept_twist(kept, 2).linearize(values_of(poses)).jacobian()
+    np.testing.assert_allclose(derivatives * kept.sigmas[:, None], kept.derivatives(poses), atol=1e-12)
+    np.testing.assert_allclose(-right_side * kept.sigmas, kept.change(poses), atol=1e-12)
+
+
 def test_intervals_are_as_long_as_their_stamps_say():
     frames = frames_of([1], [2], [2])
     twist = np.array([0.0, 0.0, 0.3, 8.0, 0.0, 0.0])

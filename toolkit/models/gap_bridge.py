@@ -32,7 +32,8 @@ _ROUNDING = 1e-6
 
 def gaps(frames: Sequence[StereoFrame]) -> IntArray:
     """Return the places k of the frames (K,) that have no track in common with the frame before, k - 1."""
-    common = [np.intersect1d(one.track_ids, other.track_ids).size for one, other in pairwise(frames)]
+    pairs = ((one.track_ids, other.track_ids) for one, other in pairwise(frames))
+    common = [np.intersect1d(*ids, assume_unique=True).size for ids in pairs]
     return 1 + np.flatnonzero(np.array(common, dtype=np.int64) == 0)
 
 
@@ -55,8 +56,9 @@ class TwistChange:
         """
         before_s, after_s = (np.diff(t_ns) / NS_PER_S).tolist()
         between_s = 0.5 * (before_s + after_s)
-        twists = [se3_log(se3_inverse(poses[i]) @ poses[i + 1]) / dt_s for i, dt_s in ((0, before_s), (1, after_s))]
-        change = np.square(twists[1] - twists[0]) / between_s
+        # Every frame is learnt from: GTSAM's logarithm of one pose takes a hundredth of NumPy's time.
+        before, after = (gtsam.Pose3.Logmap(a.between(b)) for a, b in pairwise(map(gtsam.Pose3, poses)))
+        change = np.square(after / after_s - before / before_s) / between_s
         if not self._count:
             self._stated = 2.0 * np.square(self._measured / between_s)
         self._squares = self._squares + np.minimum(change, _MOST_SIGMAS**2 * self._mean_squares)
@@ -122,6 +124,8 @@ class GapBridge:
     def __init__(self, window_s: float, measured: TwistNoise) -> None:
         self._window_s, self._change = window_s, TwistChange(measured)
         self._frames: list[StereoFrame] = []
+        # Whether no track leads over the last two intervals.
+        self._blind: list[bool] = []
         self._poses: list[Array] = []
         self._twists: list[Array] = []
 
@@ -133,11 +137,14 @@ class GapBridge:
     def added(self, frame: StereoFrame, motion: Motion | None) -> KeptTwist | None:
         """Return what a frame adds, and the motion before it: that the last two twists are the same, or nothing."""
         self._frames = [*self._frames[-2:], frame]
+        self._blind = [*self._blind[-1:], bool(gaps(self._frames[-2:]).size)]
         if isinstance(motion, TwistMotion):
             twists = np.hstack([motion.w_radps, motion.v_mps])
             self._twists = [*self._twists[-1:], np.average(twists, axis=0, weights=motion.dt_s)]
+        if len(self._frames) < 3 or not any(self._blind):
+            return None
         noise = self.noise
-        if noise is None or len(self._frames) < 3 or not gaps(self._frames).size:
+        if noise is None:
             return None
         before_s, after_s = _durations_s(self._frames)
         # Of two states further apart the first had left when the second came.
@@ -146,7 +153,7 @@ class GapBridge:
     def learn(self, T_world_imu: Array) -> None:
         """Take in the pose (4, 4) that was found for the last frame."""
         self._poses = [*self._poses[-2:], T_world_imu]
-        if len(self._poses) == 3 and not gaps(self._frames).size:
+        if len(self._poses) == 3 and not any(self._blind):
             t_ns = np.array([frame.t_ns for frame in self._frames])
             self._change.learn(t_ns, np.array(self._poses), np.array(self._twists))
 
@@ -165,13 +172,23 @@ def bridged(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> gtsam.Non
 
 
 def kept_twist(kept: KeptTwist, k: int) -> gtsam.NonlinearFactor:
-    """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist."""
+    """Return the factor on X(k - 2), X(k - 1), X(k) whose residual (6,) is the change of the twist.
+
+    It is :meth:`KeptTwist.change` with its derivatives in GTSAM's arithmetic: single matrices are slow in NumPy, and a
+    solve asks for thousands of them.
+    """
+    lasting_s = (kept.before_s, kept.after_s)
 
     def residual(this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        poses = np.array([values.atPose3(key).matrix() for key in this.keys()])  # noqa: SIM118 - not a mapping
+        poses = [values.atPose3(key) for key in this.keys()]  # noqa: SIM118 - not a mapping
+        steps = [start.between(end) for start, end in pairwise(poses)]
+        logs = [gtsam.Pose3.Logmap(step) for step in steps]
         if jacobians is not None:
-            jacobians[0], jacobians[1], jacobians[2] = np.hsplit(kept.derivatives(poses), 3)
-        return kept.change(poses)
+            ends = [gtsam.Pose3.LogmapDerivative(log) / dt_s for log, dt_s in zip(logs, lasting_s, strict=True)]
+            starts = [-end @ step.inverse().AdjointMap() for end, step in zip(ends, steps, strict=True)]
+            jacobians[0], jacobians[1], jacobians[2] = -starts[0], starts[1] - ends[0], ends[1]
+        before, after = (log / dt_s for log, dt_s in zip(logs, lasting_s, strict=True))
+        return np.asarray(after - before)
 
     covariance = gtsam.noiseModel.Diagonal.Sigmas(kept.sigmas)
     return gtsam.CustomFactor(covariance, [X(k - 2), X(k - 1), X(k)], residual)
