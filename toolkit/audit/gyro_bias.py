@@ -1,18 +1,20 @@
-"""A constant bias of the gyro: reported, never repaired, for the filters estimate it as it is.
+"""A constant bias of the gyro: reported and left to the estimators, unless their prior denies it.
 
 Where the vehicle stands, its gyro must read nothing; a recording without a standstill is compared with the
-rotation its own tracks show, which is good to half a degree a second only.
+rotation its own tracks show, which is good to half a degree a second only. An estimator whose prior has 0 +- 0.0005
+rad/s and that meets a bias of 0.05 believes the prior and loses its way: the prior is then widened by what it lacks.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.robust import median_error
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 from toolkit.measured_motion import TwistSamples
-from toolkit.sequence import Sequence
+from toolkit.sequence import Prior, Sequence
 
 # Measured speed below which the vehicle stands, and the fewest samples of a standstill that is used.
 STANDING_MPS = 0.05
@@ -40,17 +42,46 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     bias_radps = np.median(reading.residual_radps, axis=0)
     error_radps = np.hypot(median_error(reading.residual_radps), reading.systematic_radps)
-    biased = np.abs(bias_radps) > SIGMAS * error_radps
+    prior = evidence.sequence.prior
+    denied = np.zeros(3, dtype=bool) if prior is None else _denied(prior, bias_radps, error_radps)
+    biased = (np.abs(bias_radps) > SIGMAS * error_radps) | denied
     if not biased.any():
         return None
     values = ", ".join(f"{b:.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
+    detail = f"the gyro reads ({values}) rad/s too much about x, y, z ({reading.source})"
+    if prior is None or not denied.any():
+        return Symptom(
+            count=int(biased.sum()),
+            detail=detail,
+            treatment="left to the estimators, which carry a gyro bias",
+            remedy=None,
+            harmful=False,
+        )
+    stated = ", ".join(f"{b:.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
     return Symptom(
         count=int(biased.sum()),
-        detail=f"the gyro reads ({values}) rad/s too much about x, y, z ({reading.source})",
-        treatment="left to the estimators, which carry a gyro bias",
-        remedy=None,
-        harmful=False,
+        detail=f"{detail}, and the prior has ({stated})",
+        treatment="the prior's covariance of it is widened by the difference",
+        remedy=replace(evidence.sequence, prior=_widened(prior, bias_radps, error_radps)),
     )
+
+
+def _denied(prior: Prior, bias_radps: Array, error_radps: Array) -> BoolArray:
+    """Say about which axes (3,) a prior has the bias elsewhere, beyond what is chance."""
+    apart = np.abs(bias_radps - prior.bias[3:])
+    return np.asarray(apart > SIGMAS * np.hypot(_sigma_radps(prior), error_radps))
+
+
+def _sigma_radps(prior: Prior) -> Array:
+    """Return the standard deviations (3,) rad/s that a prior states of the gyro's bias."""
+    return np.sqrt(np.diag(prior.cov)[-3:])
+
+
+def _widened(prior: Prior, bias_radps: Array, error_radps: Array) -> Prior:
+    """Return a prior that allows the bias, about all axes: of one it denies by less it knows no better."""
+    cov = prior.cov.copy()
+    cov[-3:, -3:] += np.diag((bias_radps - prior.bias[3:]) ** 2 + error_radps**2)
+    return replace(prior, cov=cov, source=f"{prior.source}; its gyro bias widened by the audit")
 
 
 def _standstill(sequence: Sequence) -> _Reading | None:
