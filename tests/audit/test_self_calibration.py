@@ -168,6 +168,12 @@ def test_a_translation_is_named_by_the_slip_that_explains_it() -> None:
     assert "as if" not in told.said
 
 
+def test_a_clock_is_judged_by_all_that_tracks_and_imu_tell() -> None:
+    """From rotations alone these five sound seconds have an offset of 7 ms, beyond five standard errors."""
+    sound = simulate(replace(FLIGHT_REALISTIC, duration_s=5.0, varied=True), 501)
+    assert "time-offset" not in {finding.fault for finding in audit(sound).findings}
+
+
 def test_intrinsics_that_hardly_any_rotation_shows_are_not_decidable() -> None:
     outcome = audit(recorded(DRIVE_IMU, 0, 5.0))
     assert "would not show" in outcome.undecided["miscalibration"]
