@@ -174,6 +174,14 @@ def test_a_clock_is_judged_by_all_that_tracks_and_imu_tell() -> None:
     assert "time-offset" not in {finding.fault for finding in audit(sound).findings}
 
 
+def test_a_turned_camera_is_no_late_one() -> None:
+    """Rotations alone have it 57 +- 5 ms late."""
+    outcome = audit(faults.turned_camera(recorded(FLIGHT, 7, 6.0), 0.1, 7))
+    found = {finding.fault for finding in outcome.findings}
+    assert "miscalibration" in found
+    assert "time-offset" not in found
+
+
 def test_intrinsics_that_hardly_any_rotation_shows_are_not_decidable() -> None:
     outcome = audit(recorded(DRIVE_IMU, 0, 5.0))
     assert "would not show" in outcome.undecided["miscalibration"]

@@ -81,9 +81,17 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 
 
 def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
-    """Return the offset by which tracks and IMU fit together, where that of the rotations is near: they err more."""
-    if found is None or abs(found.value) > NEAR_S or (fitted := evidence.self_calibration) is None:
+    """Return the offset by which tracks and IMU fit together, where that of the rotations is near or fits nothing.
+
+    Rotations err more, and of a camera that is turned they make an offset of up to a tenth of a second.
+    """
+    fitted = evidence.self_calibration
+    if found is None or fitted is None:
         return found
+    if abs(found.value) > NEAR_S:
+        shifted = evidence.after(_shifted(evidence.sequence, found.value))
+        if shifted.self_calibration is not None:
+            return found
     return Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
 
 

@@ -26,11 +26,12 @@ from toolkit.sequence import Sequence, is_left_only
 STRIDE_S, WINDOW_S, MOST_WINDOWS, FEWEST_KEYS = 0.2, 4.0, 6, 4
 # Tracks that are used: the longest of those seen in so many key frames.
 FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, MOST_TRACKS, FEWEST_TRACKS = 3, 2.0, 200, 20
-ITERATIONS = 4
+MOST_ITERATIONS = 10
+# Settled is what changes by less than this share of its standard errors.
+SETTLED = 0.4
 # Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, rad/s, m/s^2. What is beyond
-# them, or still changes by more than so many standard errors, is no solution.
+# them is no solution.
 OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 3, 3])
-MOST_UNSETTLED = 1.0
 # What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
 # ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
 GYRO_ERROR = 0.1
@@ -61,28 +62,28 @@ def self_calibration(sequence: Sequence, camera: CameraMotion, intervals: Interv
     if not windows:
         return None
     try:
-        value, step, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), _noise(sequence))
+        value, settled, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), _noise(sequence))
         cov = _cov(all_reduced)
     except (np.linalg.LinAlgError, DataError):  # steps that lead nowhere: singular, or a rig that is none
         return None
-    settled = np.abs(step) < MOST_UNSETTLED * np.sqrt(np.diag(cov))
-    if not settled.all() or (np.abs(value) > OFF_BY).any():
+    if not settled or (np.abs(value) > OFF_BY).any():
         return None
     value[GYRO_BIAS] += w_bias
     return SelfCalibration(value, cov)
 
 
-def _adjusted(windows: list[Window], calibration: Calibration, noise: Noise) -> tuple[Array, Array, list[Reduced]]:
-    """Return the calibration's change (18,) after some steps of Gauss-Newton, the last step, and what it rests on."""
-    value, step = np.zeros(COMMON), np.zeros(COMMON)
-    for k in range(ITERATIONS):
+def _adjusted(windows: list[Window], calibration: Calibration, noise: Noise) -> tuple[Array, bool, list[Reduced]]:
+    """Return the calibration's change (18,) by Gauss-Newton, whether it settled, and what it rests on."""
+    value = np.zeros(COMMON)
+    for _ in range(MOST_ITERATIONS):
         all_reduced = [reduce(window, calibration, noise) for window in windows]
         step = _step(all_reduced, value)
         value = value + step
-        if k < ITERATIONS - 1:
-            windows = [moved(window, reduced, step) for window, reduced in zip(windows, all_reduced, strict=True)]
-            calibration = calibration.moved(step)
-    return value, step, all_reduced
+        if (np.abs(step) < SETTLED * np.sqrt(np.diag(np.linalg.inv(_information(all_reduced))))).all():
+            return value, True, all_reduced
+        windows = [moved(window, reduced, step) for window, reduced in zip(windows, all_reduced, strict=True)]
+        calibration = calibration.moved(step)
+    return value, False, all_reduced
 
 
 def _noise(sequence: Sequence) -> Noise:
