@@ -44,6 +44,8 @@ HELD_OUT_ONE_IN = 10
 NO_FEATURES = "no image features in this file"
 # The fact by which a recording says that its extrinsic may be inverted, or in camera axes x forward, y left, z up.
 EXTRINSIC_IN_DOUBT = "the extrinsic's direction and camera axes are not certain in this format"
+# The fact by which a recording says that it was given one row for both images of a sighting.
+ONE_ROW_FOR_BOTH = "one row v stands for both images of a sighting in this file"
 # Of a recording or a trajectory: names become those of files, of which systems allow 255 bytes.
 LONGEST_NAME = 200
 # A calibration written with three decimals is off by less; a product of doubles is off by no more.

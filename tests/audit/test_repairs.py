@@ -235,10 +235,31 @@ def test_noise_does_not_make_the_mean_of_two_samples_look_right(clean_recording:
 def test_a_gyro_bias_is_reported_and_left_to_the_filters(clean_recording: Make) -> None:
     clean = clean_recording("drive")
     motion = replace(clean.motion, w_radps=clean.motion.w_radps - 0.01)
-    outcome = audit(replace(clean, motion=motion))
+    outcome = audit(replace(clean, motion=motion, prior=None))
     (finding,) = outcome.findings
     assert (finding.fault, finding.count, finding.repaired, finding.blocking) == ("gyro-bias", 3, False, False)
     assert outcome.sequence.motion is motion
+
+
+def test_a_prior_that_denies_the_gyro_bias_is_widened_to_allow_it(clean_recording: Make) -> None:
+    clean, bias_radps = clean_recording("drive"), np.array([0.0, 0.0, -0.02])
+    outcome = audit(replace(clean, motion=replace(clean.motion, w_radps=clean.motion.w_radps + bias_radps)))
+    (finding,) = outcome.findings
+    assert (finding.fault, finding.repaired, finding.blocking) == ("gyro-bias", True, False)
+    assert clean.prior is not None
+    assert outcome.sequence.prior is not None
+    added = np.diag(outcome.sequence.prior.cov - clean.prior.cov)
+    np.testing.assert_allclose(np.sqrt(added), np.abs(np.r_[np.zeros(12), bias_radps]), atol=0.004)  # 3 sigma
+
+
+def test_a_gyro_bias_that_a_prior_allows_is_left_to_it(clean_recording: Make) -> None:
+    clean = clean_recording("drive")
+    assert clean.prior is not None
+    allowed = replace(clean.prior, bias=np.r_[np.zeros(5), -0.02])
+    motion = replace(clean.motion, w_radps=clean.motion.w_radps - np.array([0.0, 0.0, 0.02]))
+    outcome = audit(replace(clean, motion=motion, prior=allowed))
+    assert [(finding.fault, finding.repaired) for finding in outcome.findings] == [("gyro-bias", False)]
+    assert outcome.sequence.prior is allowed
 
 
 def test_the_gyro_bias_of_an_imu_is_found_on_its_axis(clean_recording: Make) -> None:

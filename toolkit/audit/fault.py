@@ -9,6 +9,7 @@ import numpy as np
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import OneStep, one_step
+from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -116,12 +117,21 @@ class Evidence:
         """The scale of vision and the place of the camera; None where ``intervals`` is, or where nothing tells them."""
         return None if self.intervals is None else alignment(self.sequence, self.camera_motion, self.intervals)
 
+    @cached_property
+    def self_calibration(self) -> SelfCalibration | None:
+        """The calibration that fits tracks and IMU; None beside anything else, or where it cannot be found."""
+        if self.intervals is None or self.sequence.motion_kind != "imu":
+            return None
+        return self_calibration(self.sequence, self.camera_motion, self.intervals)
+
     def after(self, remedy: Sequence) -> "Evidence":
         """Return the evidence after a repair; what tracks alone show is kept where it left them as they were."""
         now, before = Evidence(remedy, self.spoilt_by), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
-            known = ("camera_motion", "one_step")
+            known = ["camera_motion", "one_step"]
+            if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
+                known += ["intervals", "alignment", "self_calibration"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

@@ -1,16 +1,24 @@
 """A calibration that is nearly right: the camera turned in its mount, a principal point or a scale a little off.
 
-Too little to be told from noise in single frames, and enough to bend every trajectory. What is wrong the recording does
-not say: a camera turned by an angle and a principal point off by the focal length times that angle look the same.
+Too little to be told from noise in single frames, and enough to bend every trajectory. From frame to frame the
+recording does not say what is wrong: a camera turned by an angle and a principal point off by the focal length times
+that angle look the same. Beside an IMU, points that are followed for a second tell most of it apart
+(`parts.self_calibration`).
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.calibration_limits import Wrong, hidden, wrong
+from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.self_calibration import SelfCalibration
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
+from toolkit.sequence import StereoRig
 
 SIGMAS = 5.0
 # What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
@@ -22,45 +30,65 @@ LARGEST_RAD = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
-    """Compare directions and sizes of the camera's motion with the measured ones."""
-    intervals, rig = evidence.intervals, evidence.sequence.rig
+    """Compare directions and sizes of the camera's motion with the measured ones, or adjust the calibration to them."""
+    intervals = evidence.intervals
     if intervals is None:
         return evidence.blind
-    said, checks, turn = list[str](), list[str](), turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
-    least_rad = SYSTEMATIC_RAD[evidence.sequence.motion_kind] + turn.by_chance_rad
-    if (np.abs(turn.rad) > least_rad).any():
-        angle = float(np.linalg.norm(turn.rad))
-        said.append(
-            f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
-            f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
-        )
-        checks.append("the extrinsic and the principal point")
-    rotation = rotation_ratio(intervals)
+    judged = _fitted(evidence.self_calibration, evidence.sequence.rig) or _by_turn(evidence, intervals)
+    wrongs, rotation = list(judged.wrongs), rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
-        said.append(f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera")
-        checks.append("the scale of the gyro and the focal length")
+        said = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
+        wrongs.append(Wrong(said, "the scale of the gyro and the focal length"))
     force = force_ratio(evidence.sequence)
     if force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO and _is_off(force):
-        said.append(f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)")
-        checks.append("the scale and the bias of the accelerometer")
-    if not said:
-        return _undecided(float(least_rad.min()), intervals.v_mps is not None)
+        said = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
+        wrongs.append(Wrong(said, "the scale and the bias of the accelerometer"))
+    if not wrongs:
+        return None if judged.hidden is None else Undecided(judged.hidden)
     return Symptom(
-        count=len(said),
-        detail="; ".join(said),
-        treatment=f"check {', '.join(checks)}",
+        count=len(wrongs),
+        detail="; ".join(one.said for one in wrongs),
+        treatment=f"check {', '.join(dict.fromkeys(one.check for one in wrongs))}",
         remedy=None,
         harmful=False,
         warns=True,
     )
 
 
-def _undecided(least_rad: float, by_velocity: bool) -> Undecided | None:
+class _Judged(NamedTuple):
+    """What is wrong, and in words what would not show."""
+
+    wrongs: list[Wrong]
+    hidden: str | None
+
+
+def _fitted(found: SelfCalibration | None, rig: StereoRig) -> _Judged | None:
+    return None if found is None else _Judged(wrong(found, rig), hidden(found))
+
+
+def _by_turn(evidence: Evidence, intervals: Intervals) -> _Judged:
+    """Judge where the camera looks from frame to frame, which leaves the intrinsics beside an IMU open."""
+    rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
+    turn = turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
+    least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
+    if not (np.abs(turn.rad) > least_rad).any():
+        looks = _undecided(float(least_rad.min()), kind == "twist")
+        unfit = "no tracks are seen for long enough beside the IMU, or no calibration near the given one fits them"
+        return _Judged([], looks or (f"the intrinsics: {unfit}" if kind == "imu" else None))
+    angle = float(np.linalg.norm(turn.rad))
+    said = (
+        f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
+        f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
+    )
+    return _Judged([Wrong(said, "the extrinsic and the principal point")], None)
+
+
+def _undecided(least_rad: float, by_velocity: bool) -> str | None:
     if least_rad < LARGEST_RAD:
         return None
     cause = "what odometry slips by for seconds is no less" if by_velocity else "too little change of rotation"
     hidden = "any turn of it" if not np.isfinite(least_rad) else f"a turn of it by less than {least_rad:.2f} rad"
-    return Undecided(f"where the camera looks: {hidden} would not show, for {cause}")
+    return f"where the camera looks: {hidden} would not show, for {cause}"
 
 
 def _is_off(ratio: Scalar) -> bool:

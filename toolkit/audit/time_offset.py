@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.bundle import LATE
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
 from toolkit.audit.parts.robust import Scalar, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
@@ -37,6 +38,8 @@ LEAST_OFF_FRAMES = 0.25
 # The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
 # intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
+# A self-calibration finds offsets (s) no larger than this.
+NEAR_S = 0.025
 # With a larger standard error (s) than these no offset is ruled out; one that is beyond chance is believed up to twice
 # as much, but where a twist leaves open which interval it describes.
 LARGEST_ERROR_S, LARGEST_TWIST_ERROR_S, LARGEST_BEYOND = 0.0064, 0.0125, 2.0
@@ -56,7 +59,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if intervals is None:
         return evidence.blind
     w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
-    found = camera_offset(sequence, intervals, w_imu)
+    found = _refined(camera_offset(sequence, intervals, w_imu), evidence)
     if found is None:
         return Undecided("too little change of rotation: the offset of camera and gyro is unknown")
     expected_s, least_s = _expected(sequence)
@@ -75,6 +78,21 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         treatment="the frames are shifted by it",
         remedy=_shifted(sequence, offset_s),
     )
+
+
+def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
+    """Return the offset by which tracks and IMU fit together, where that of the rotations is near or fits nothing.
+
+    Rotations err more, and of a camera that is turned they make an offset of up to a tenth of a second.
+    """
+    fitted = evidence.self_calibration
+    if found is None or fitted is None:
+        return found
+    if abs(found.value) > NEAR_S:
+        shifted = evidence.after(_shifted(evidence.sequence, found.value))
+        if shifted.self_calibration is not None:
+            return found
+    return Scalar(float(fitted.value[LATE]), float(fitted.error[LATE]))
 
 
 def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:

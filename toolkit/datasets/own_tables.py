@@ -24,7 +24,7 @@ from toolkit.geometry import Array, IntArray
 from toolkit.inputs import is_regular, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, TwistNoise, TwistSamples
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
-from toolkit.sequence import GRAVITY_WORLD, Observations, Provenance, Sequence, StereoRig, Truth
+from toolkit.sequence import GRAVITY_WORLD, ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig, Truth
 
 TRACKS, ONE_ROW, TWO_ROWS = ("track_id", "uL", "uR"), ("v",), ("vL", "vR")
 IMU = ("ax", "ay", "az", "gx", "gy", "gz")
@@ -87,6 +87,7 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
     place, calibration = _calibration(rig)
     frames_t_ns, observations = _observations(sightings)
     samples, noise = _motion(measured, place, calibration.get(_NOISE, {}))
+    facts = () if _has_two_rows(sightings) else (ONE_ROW_FOR_BOTH,)
     sequence = Sequence(
         name=name,
         rig=_rig(place, calibration, 2 if TWO_ROWS[0] in sightings.values else 1),
@@ -94,7 +95,7 @@ def read(name: str, tracks: Table, motion: Table, rig: Table, truth: Table | Non
         frames_t_ns=frames_t_ns,
         observations=observations,
         motion=samples,
-        provenance=Provenance("own-tables", ", ".join(str(table.what) for table in (sightings, measured))),
+        provenance=Provenance("own-tables", ", ".join(str(table.what) for table in (sightings, measured)), facts),
         gravity_world=_gravity(place, calibration),
     )
     if truth is not None:
@@ -110,9 +111,13 @@ def _unused(table: Columns, used: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{table.what}: {name}" for name in table.unused((*used, *_STAMPS)))
 
 
+def _has_two_rows(table: Columns) -> bool:
+    return any(name in table.values for name in TWO_ROWS)
+
+
 def _observations(table: Columns) -> tuple[IntArray, Observations]:
     """Return the stamps of the frames (K,) and the sightings in them."""
-    rows = TWO_ROWS if any(name in table.values for name in TWO_ROWS) else ONE_ROW
+    rows = TWO_ROWS if _has_two_rows(table) else ONE_ROW
     table.require("|".join(_STAMPS), *TRACKS, *rows)
     frames_t_ns, frame = np.unique(table.stamps(), return_inverse=True)
     check_frame_count(table.what, frames_t_ns.size)

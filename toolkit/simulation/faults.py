@@ -296,6 +296,23 @@ def negative_focal(sequence: Sequence, dose: float = -1.0, seed: int = 0) -> Seq
     return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
 
 
+def wrong_focal_length(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
+    """Multiply both focal lengths by the dose: a data sheet instead of a calibration, another zoom."""
+    return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px, fy_px=dose * sequence.rig.fy_px)
+
+
+def wrong_aspect(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
+    """Multiply fx alone by the dose: images that were resized in one direction."""
+    return _with_rig(sequence, fx_px=dose * sequence.rig.fx_px)
+
+
+def shifted_centre(sequence: Sequence, dose: float = 15.0, seed: int = 0) -> Sequence:
+    """Write the principal point so many pixels away, in a direction drawn: the middle of the image taken for it."""
+    angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    cx_px, cy_px = sequence.rig.cx_px + dose * np.cos(angle), sequence.rig.cy_px + dose * np.sin(angle)
+    return _with_rig(sequence, cx_px=float(cx_px), cy_px=float(cy_px))
+
+
 def skewed_pixels(sequence: Sequence, dose: float = 50.0, seed: int = 0) -> Sequence:
     """Give the images a skew of the dose (px), as a K may state one that no rectified pair has."""
     rig, uv_px = sequence.rig, sequence.observations.uv_px
@@ -309,7 +326,7 @@ def baseline_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Se
 
 
 def extrinsic_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
-    """Multiply the camera's position in the IMU frame by the dose: 1000 for millimetres."""
+    """Multiply the camera's position in the IMU frame by the dose: 1000 for millimetres, -1 for a sign mixed up."""
     T_imu_cam = sequence.rig.T_imu_cam
     return _with_rig(sequence, T_imu_cam=se3(T_imu_cam[:3, :3], dose * T_imu_cam[:3, 3]))
 

@@ -1,0 +1,188 @@
+"""The calibration that tracks and an IMU fit: exact where they are, honest where they err, told beyond its limits."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from toolkit.audit import audit
+from toolkit.audit.fault import Evidence
+from toolkit.audit.parts.bundle import COMMON, Calibration, Window, predicted, stride_equations
+from toolkit.audit.parts.calibration_limits import hidden, wrong
+from toolkit.audit.parts.self_calibration import SelfCalibration, _windows, self_calibration
+from toolkit.geometry import Array, se3, so3_exp
+from toolkit.sequence import Sequence, StereoRig
+from toolkit.simulation import DRIVE_IMU, FLIGHT, FLIGHT_REALISTIC, Scenario, faults, noise_free, simulate
+
+# Shares of fx and fy, px of cx and cy, a share of the baseline, rad, m, s: by what the rig is off below.
+OFF = np.array([0.03, -0.02, 8.0, -5.0, 0.04, 0.02, -0.01, 0.03, 0.05, -0.04, 0.03, 0.004])
+
+
+@cache
+def recorded(scenario: Scenario, seed: int, duration_s: float = 4.0) -> Sequence:
+    return simulate(replace(scenario, duration_s=duration_s), seed)
+
+
+def fitted(sequence: Sequence) -> SelfCalibration:
+    evidence = Evidence(sequence)
+    assert evidence.intervals is not None
+    found = self_calibration(sequence, evidence.camera_motion, evidence.intervals)
+    assert found is not None
+    return found
+
+
+@cache
+def window_and_calibration() -> tuple[Window, Calibration]:
+    """A window of noisy measurements, and a calibration that is off: no residual is zero."""
+    sequence = recorded(FLIGHT, 0)
+    (window,) = _windows(sequence, Evidence(sequence).camera_motion, np.zeros(3))
+    step = np.concatenate([OFF, [0.01, -0.02, 0.03, 0.1, -0.2, 0.3]])
+    return window, Calibration(sequence.rig, 0.0, np.zeros(6)).moved(step)
+
+
+def difference(residual: Callable[[float], Array], step: float = 1e-6) -> Array:
+    """The derivative of a residual by a number, at zero."""
+    return (residual(step) - residual(-step)) / (2.0 * step)
+
+
+@pytest.mark.parametrize("unknown", range(12))
+def test_sightings_change_with_the_calibration_as_their_jacobian_says(unknown: int) -> None:
+    window, calibration = window_and_calibration()
+    one = np.eye(COMMON)[unknown]
+    measured = difference(lambda step: predicted(window, calibration.moved(step * one)).uv_px)
+    np.testing.assert_allclose(predicted(window, calibration).d_camera[:, :, unknown], measured, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("unknown", range(6))
+def test_sightings_change_with_the_pose_and_the_point_as_their_jacobians_say(unknown: int) -> None:
+    window, calibration = window_and_calibration()
+    calibration = calibration._replace(late_s=0.0)  # the Jacobians leave out what its milliseconds change
+    here, none = predicted(window, calibration), np.zeros_like(window.points)
+
+    def posed(step: float) -> Array:
+        own = np.zeros((len(window.position), 9))
+        own[:, unknown] = step
+        return predicted(window.moved(np.append(own, np.zeros(3)), none), calibration).uv_px
+
+    np.testing.assert_allclose(here.d_pose[:, :, unknown], difference(posed), rtol=1e-5, atol=1e-4)
+    if unknown < 3:
+        along = difference(
+            lambda step: predicted(window._replace(points=window.points + step * np.eye(3)[unknown]), calibration).uv_px
+        )
+        np.testing.assert_allclose(here.d_point[:, :, unknown], along, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("unknown", range(27))
+def test_what_strides_lack_changes_as_their_jacobian_says(unknown: int) -> None:
+    window, calibration = window_and_calibration()
+    key = 3
+
+    def lacking(step: float) -> Array:
+        own, common = np.zeros(window.unknowns), np.zeros(COMMON)
+        if unknown < 18:
+            own[9 * key + unknown] = step
+        elif unknown < 21:
+            own[-3 + unknown - 18] = step
+        else:
+            common[12 + unknown - 21] = step
+        after = window.moved(own, np.zeros_like(window.points))
+        return -stride_equations(after, calibration.moved(common))[0][key]
+
+    jacobian = stride_equations(window, calibration)[1][key, :, unknown]
+    # A turn's Jacobian is that of a residual of zero; it is 0.02 rad here, and half of it is left out.
+    np.testing.assert_allclose(jacobian, difference(lacking), atol=0.02)
+
+
+def test_the_calibration_of_exact_measurements_is_found() -> None:
+    sound = recorded(noise_free(FLIGHT), 0)
+    rig = Calibration(sound.rig, 0.0, np.zeros(6)).moved(np.concatenate([OFF, np.zeros(6)])).rig
+    found = fitted(replace(faults.camera_clock(sound, -OFF[11]), rig=rig))
+    expected = -OFF.copy()
+    expected[5:8] = so3_exp(OFF[5:8]) @ expected[5:8]  # about the axes of the camera that is turned
+    expected[11] = OFF[11]
+    # Within a third of what noise of a pixel leaves; late by milliseconds counts to first order alone.
+    np.testing.assert_array_less(np.abs(found.value[:12] - expected), 0.34 * found.error[:12] + 1e-4)
+
+
+@pytest.mark.parametrize("scenario", [FLIGHT, FLIGHT_REALISTIC, DRIVE_IMU], ids=lambda scenario: scenario.name)
+def test_standard_errors_are_honest_where_the_errors_of_tracks_are_correlated(scenario: Scenario) -> None:
+    sigmas = np.concatenate(
+        [(f := fitted(recorded(scenario, seed))).value[:12] / f.error[:12] for seed in range(40, 46)]
+    )
+    # 72 of them; the errors are no less than those of a gyro that filters, so they are a little large.
+    assert 0.3 < np.mean(sigmas**2) < 1.4
+
+
+def test_windows_that_want_different_calibrations_widen_the_error() -> None:
+    sound = recorded(FLIGHT, 1, 16.0)
+    jumped = faults.jumped_image(sound, 15.0)
+    assert fitted(jumped).error[2] > 4.0 * fitted(sound).error[2]
+
+
+def sure(unknown: int, value: float) -> SelfCalibration:
+    """A calibration that differs from the given one in one thing, and is known well."""
+    return SelfCalibration(value * np.eye(COMMON)[unknown], 1e-12 * np.eye(COMMON))
+
+
+@pytest.mark.parametrize(
+    "unknown, limit, check",
+    [
+        (0, 0.012, "K"),
+        (1, 0.012, "K"),
+        (2, 2.0, "K"),
+        (3, 5.0, "K"),
+        (4, 0.015, "the baseline"),
+        (6, 0.006, "the rotation of T_imu_cam"),
+        (9, 0.015, "the translation of T_imu_cam"),
+        (11, 0.0008, "the clocks of the camera and the IMU"),
+    ],
+)
+def test_what_is_found_counts_beyond_what_sound_recordings_have(unknown: int, limit: float, check: str) -> None:
+    rig: StereoRig = recorded(FLIGHT, 0).rig
+    assert [one.check for one in wrong(sure(unknown, -1.01 * limit), rig)] == [check]
+    assert wrong(sure(unknown, 0.98 * limit), rig) == []
+
+
+def test_what_is_found_counts_beyond_four_standard_errors() -> None:
+    rig = recorded(FLIGHT, 0).rig
+    for sigmas, told in ((3.9, 0), (4.1, 1)):
+        found = SelfCalibration((2.0 + sigmas) * np.eye(COMMON)[2], np.eye(COMMON))
+        assert len(wrong(found, rig)) == told
+
+
+def test_a_translation_is_named_by_the_slip_that_explains_it() -> None:
+    rig = recorded(FLIGHT, 0).rig
+    given, cov = rig.T_imu_cam[:3, 3], 0.01**2 * np.eye(COMMON)
+    apart = replace(rig, T_imu_cam=se3(rig.T_imu_cam[:3, :3], 5.0 * given))
+    value = np.zeros(COMMON)
+    value[8:11] = -10.0 * given
+    (told,) = wrong(SelfCalibration(value, cov), apart)
+    assert "as if its sign were changed" in told.said
+    value[8:11] = -apart.T_imu_cam[:3, :3].T @ (5.0 * given) - 5.0 * given
+    (told,) = wrong(SelfCalibration(value, cov), apart)
+    assert "as if it were that of the inverse" in told.said
+    value[8:11] = -5.0 * given
+    (told,) = wrong(SelfCalibration(value, cov), apart)
+    assert "as if" not in told.said
+
+
+def test_a_clock_is_judged_by_all_that_tracks_and_imu_tell() -> None:
+    """From rotations alone these five sound seconds have an offset of 7 ms, beyond five standard errors."""
+    sound = simulate(replace(FLIGHT_REALISTIC, duration_s=5.0, varied=True), 501)
+    assert "time-offset" not in {finding.fault for finding in audit(sound).findings}
+
+
+def test_a_turned_camera_is_no_late_one() -> None:
+    """Rotations alone have it 57 +- 5 ms late."""
+    outcome = audit(faults.turned_camera(recorded(FLIGHT, 7, 6.0), 0.1, 7))
+    found = {finding.fault for finding in outcome.findings}
+    assert "miscalibration" in found
+    assert "time-offset" not in found
+
+
+def test_intrinsics_that_hardly_any_rotation_shows_are_not_decidable() -> None:
+    outcome = audit(recorded(DRIVE_IMU, 0, 5.0))
+    assert "would not show" in outcome.undecided["miscalibration"]
+    assert hidden(sure(0, 0.0)) is None

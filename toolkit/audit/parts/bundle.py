@@ -1,0 +1,295 @@
+"""One window of an adjustment of key frames and points beside an IMU, with the calibration unknown, linearised.
+
+Unknowns are the states of the key frames (9 each: turn on the right, position, velocity in the axes of the first), the
+gravity of the window (3), and the calibration that all windows share (18). Points are eliminated track by track, states
+and gravity after that, so that a window says what it knows of the calibration alone.
+Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
+al. (2017), as in `strides`.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.parts.strides import Strides
+from toolkit.geometry import Array, IntArray, se3, skew, so3_exp, so3_log
+from toolkit.models.stereo import project, projection_jacobian
+from toolkit.sequence import StereoRig
+
+STATE, GRAVITY, COMMON = 9, 3, 18
+# Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
+# in its own axes (rad), its position in the IMU (m), how late its stamps are (s); the biases of gyro and accelerometer.
+FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11
+GYRO_BIAS, _BIASES = slice(12, 15), slice(12, 18)
+CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
+LEAST_DEPTH_M = 0.1
+# Information that holds the first pose, and ridges far below any sighting's.
+_GAUGE, _RIDGE = 1e10, 1e-9
+
+
+class Calibration(NamedTuple):
+    """What all windows share: the rig, how much later than its stamps the camera saw (s), the biases (6,)."""
+
+    rig: StereoRig
+    late_s: float
+    bias: Array
+
+    def moved(self, step: Array) -> "Calibration":
+        """Return the calibration after a step (18,) of the unknowns."""
+        rig, scale = self.rig, np.exp(step[[0, 1, BASELINE]])
+        R_imu_cam = rig.T_imu_cam[:3, :3] @ so3_exp(step[TURN])
+        after = replace(
+            rig,
+            fx_px=float(rig.fx_px * scale[0]),
+            fy_px=float(rig.fy_px * scale[1]),
+            cx_px=float(rig.cx_px + step[2]),
+            cy_px=float(rig.cy_px + step[3]),
+            baseline_m=float(rig.baseline_m * scale[2]),
+            T_imu_cam=se3(R_imu_cam, rig.T_imu_cam[:3, 3] + step[LEVER]),
+        )
+        return Calibration(after, self.late_s + float(step[LATE]), self.bias + step[_BIASES])
+
+
+class Window(NamedTuple):
+    """A window of n key frames and T points, in the axes of the IMU at the first key frame.
+
+    Attitudes (n, 3, 3), positions, velocities and, in the IMU's own axes, rates of rotation (n, 3); gravity (3,), the
+    motion from key frame to key frame, and points (T, 3). N sightings (N, 3) px are sorted by track, with the key frame
+    (N,) and the track (N,) of each.
+    """
+
+    R_first_imu: Array
+    position: Array
+    velocity: Array
+    w_radps: Array
+    gravity: Array
+    strides: Strides
+    key: IntArray
+    track: IntArray
+    uv_px: Array
+    points: Array
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns are the window's own, without its points."""
+        return STATE * len(self.position) + GRAVITY
+
+    def moved(self, own: Array, points: Array) -> "Window":
+        """Return the window after steps of its own unknowns and of its points (T, 3)."""
+        state = own[:-GRAVITY].reshape(-1, STATE)
+        return self._replace(
+            R_first_imu=self.R_first_imu @ so3_exp(state[:, :3]),
+            position=self.position + state[:, 3:6],
+            velocity=self.velocity + state[:, 6:],
+            gravity=self.gravity + own[-GRAVITY:],
+            points=self.points + points,
+        )
+
+
+class Noise(NamedTuple):
+    """Densities of the gyro (rad/s/sqrt(Hz)) and the accelerometer (m/s^2/sqrt(Hz))."""
+
+    gyro: float
+    accel: float
+
+
+class Reduced(NamedTuple):
+    """What a window says of the calibration: information (18, 18), and gradients (B, 18) of parts that err alone.
+
+    The parts are the tracks, whose own errors may be correlated, and the strides of a second. ``back`` takes a step of
+    the calibration to the window's own.
+    """
+
+    information: Array
+    gradients: Array
+    back: "_Back"
+
+
+class _Back(NamedTuple):
+    """Own unknowns (U,) = own - per_common @ step; points (T, 3) likewise of what was eliminated with them."""
+
+    own: Array
+    per_common: Array
+    point_root: Array
+    point_cross: Array
+    point_rest: Array
+
+    def steps(self, common: Array) -> tuple[Array, Array]:
+        own = self.own - self.per_common @ common
+        rest = self.point_rest - self.point_cross @ np.append(own, common)
+        return own, (self.point_root.swapaxes(1, 2) @ rest[:, :, None])[..., 0]
+
+
+def moved(window: Window, reduced: Reduced, step: Array) -> Window:
+    """Return the window after a step (18,) of the calibration, and its own that belongs to it."""
+    return window.moved(*reduced.back.steps(step))
+
+
+def reduce(window: Window, calibration: Calibration, noise: Noise) -> Reduced:
+    """Linearise the window and eliminate its own unknowns and its points."""
+    tracks = _tracks(window, calibration)
+    own, by_stride = window.unknowns, _strides(window, calibration, noise)
+    information = tracks.information + by_stride.information
+    gradients = np.concatenate([tracks.gradients, by_stride.gradients])
+    gradient = gradients.sum(axis=0)
+    information[np.arange(6), np.arange(6)] += _GAUGE
+    information[np.arange(own), np.arange(own)] += _RIDGE
+    cross = information[:own, own:]
+    solved = np.linalg.solve(information[:own, :own], np.column_stack([cross, gradient[:own]]))
+    per_common = solved[:, :-1]
+    back = _Back(solved[:, -1], per_common, tracks.point_root, tracks.point_cross, tracks.point_rest)
+    return Reduced(
+        information[own:, own:] - cross.T @ per_common, gradients[:, own:] - gradients[:, :own] @ per_common, back
+    )
+
+
+class _Normal(NamedTuple):
+    information: Array
+    gradients: Array
+
+
+class _Tracks(NamedTuple):
+    """Information (D, D) and gradients (T, D) of the tracks, and what of their points was eliminated."""
+
+    information: Array
+    gradients: Array
+    point_root: Array
+    point_cross: Array
+    point_rest: Array
+
+
+class Predicted(NamedTuple):
+    """Predicted sightings (N, 3) px and their Jacobians by the pose (N, 3, 6), the camera (N, 3, 12), the point."""
+
+    uv_px: Array
+    d_pose: Array
+    d_camera: Array
+    d_point: Array
+
+
+def predicted(window: Window, calibration: Calibration) -> Predicted:
+    """Predict every sighting: the point in the IMU as it moves on for as long as the camera is late, and in the camera.
+
+    A pose moved by [phi, rho] on its right moves a point q in its axes by [q]x phi - rho. That a camera which is late
+    sees another point for another pose or velocity is left out of the Jacobians: milliseconds do not count there.
+    """
+    rig, key, track = calibration.rig, window.key, window.track
+    R_imu_first, R_cam_imu = window.R_first_imu[key].swapaxes(1, 2), rig.T_imu_cam[:3, :3].T
+    q = _applied(R_imu_first, window.points[track] - window.position[key])
+    turn_of_q = skew(q)
+    later = _applied(turn_of_q, window.w_radps[key] - calibration.bias[:3])
+    later -= _applied(R_imu_first, window.velocity[key])
+    q_cam = (q + calibration.late_s * later - rig.T_imu_cam[:3, 3]) @ R_cam_imu.T
+    q_cam[:, 2] = np.maximum(q_cam[:, 2], LEAST_DEPTH_M)
+    uv_px, d_cam = project(q_cam, rig), projection_jacobian(q_cam, rig)
+    d_imu = d_cam @ R_cam_imu
+    d_point = d_imu @ R_imu_first
+    d_intrinsics = np.zeros((len(key), 3, 5))
+    d_intrinsics[:, :2, 0], d_intrinsics[:, 2, 1] = uv_px[:, :2] - rig.cx_px, uv_px[:, 2] - rig.cy_px
+    d_intrinsics[:, :2, 2] = d_intrinsics[:, 2, 3] = 1.0
+    d_intrinsics[:, 1, 4] = -rig.fx_px * rig.baseline_m / q_cam[:, 2]
+    d_pose = np.concatenate([d_imu @ turn_of_q, -d_point], axis=2)
+    d_camera = np.concatenate([d_intrinsics, d_cam @ skew(q_cam), -d_imu, d_imu @ later[:, :, None]], axis=2)
+    return Predicted(uv_px, d_pose, d_camera, d_point)
+
+
+def _weighted(residual_px: Array, rig: StereoRig) -> Array:
+    """Return what residuals (N, 3) px are multiplied by (N, 3, 3): whitened, and with the root of Cauchy weights."""
+    chi2 = np.sum((residual_px @ rig.whitener.T) ** 2, axis=1)
+    scale2 = max(float(np.median(chi2)) / CHI2_3_MEDIAN, LEAST_SCALE2)
+    return np.asarray(rig.whitener / np.sqrt(scale2 + chi2 / CAUCHY_SIGMAS**2)[:, None, None])
+
+
+def _tracks(window: Window, calibration: Calibration) -> _Tracks:
+    """Return the tracks' normal equations in the window's own and the common unknowns, without the points."""
+    seen, key, track = predicted(window, calibration), window.key, window.track
+    weight = _weighted(window.uv_px - seen.uv_px, calibration.rig)
+    residual, d_point = _applied(weight, window.uv_px - seen.uv_px), weight @ seen.d_point
+    n, points, own = len(window.position), len(window.points), window.unknowns
+    first, camera = np.searchsorted(track, np.arange(points)), slice(own, own + 12)
+    d_both = weight @ np.concatenate([seen.d_pose, seen.d_camera], axis=2)
+    information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((points, own + COMMON))
+    for k in range(n):
+        rows, pose = d_both[key == k].reshape(-1, 18), slice(STATE * k, STATE * k + 6)
+        squared = rows.T @ rows
+        information[pose, pose], information[pose, camera] = squared[:6, :6], squared[:6, 6:]
+        information[camera, pose] = squared[6:, :6]
+        information[camera, camera] += squared[6:, 6:]
+    pulled = _applied(d_both.swapaxes(1, 2), residual)
+    states = gradients[:, : STATE * n].reshape(points, n, STATE)
+    states[track, key, :6] = pulled[:, :6]
+    gradients[:, : STATE * n], gradients[:, camera] = states.reshape(points, -1), np.add.reduceat(pulled[:, 6:], first)
+    to_point = d_point.swapaxes(1, 2)
+    of_point, cross = np.add.reduceat(to_point @ d_point, first), to_point @ d_both
+    point_cross = np.zeros((points, 3, own + COMMON))
+    by_state = np.zeros((points, 3, n, STATE))
+    by_state[track, :, key, :6] = cross[:, :, :6]
+    point_cross[:, :, : STATE * n] = by_state.reshape(points, 3, -1)
+    point_cross[:, :, camera] = np.add.reduceat(cross[:, :, 6:], first)
+    ridge = _RIDGE * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    root = np.linalg.inv(np.linalg.cholesky(of_point + ridge))
+    point_cross = root @ point_cross
+    rest = _applied(root, np.add.reduceat(_applied(to_point, residual), first))
+    flat = point_cross.reshape(3 * points, -1)
+    gradients -= _applied(point_cross.swapaxes(1, 2), rest)
+    return _Tracks(information - flat.T @ flat, gradients, root, point_cross, rest)
+
+
+def _strides(window: Window, calibration: Calibration, noise: Noise) -> _Normal:
+    """Return the normal equations of the IMU between the key frames, with gradients by parts of a second or more."""
+    residual, jacobian = stride_equations(window, calibration)
+    whitener = _stride_whitener(window.strides.dt_s, noise)
+    residual, jacobian = _applied(whitener, residual), whitener @ jacobian
+    strides, own = len(residual), window.unknowns
+    information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((strides, own + COMMON))
+    shared = np.append(np.arange(own - GRAVITY, own), own + np.arange(COMMON)[_BIASES])
+    for k in range(strides):
+        columns = np.append(STATE * k + np.arange(2 * STATE), shared)
+        information[np.ix_(columns, columns)] += jacobian[k].T @ jacobian[k]
+        gradients[k, columns] = jacobian[k].T @ residual[k]
+    elapsed_s = np.cumsum(window.strides.dt_s)
+    part = np.flatnonzero(np.diff((elapsed_s - elapsed_s[0]) // 1.0, prepend=-1.0))
+    return _Normal(information, np.add.reduceat(gradients, part))
+
+
+def stride_equations(window: Window, calibration: Calibration) -> tuple[Array, Array]:
+    """Return what the strides lack (m, 9), turn, velocity and position, and its change (m, 9, 27) by the unknowns.
+
+    These are the states at both ends, gravity and the biases.
+    """
+    strides = window.strides.biased(calibration.bias)
+    dt_s, one = strides.dt_s[:, None], np.eye(3)
+    R_first_a, R_first_b = window.R_first_imu[:-1], window.R_first_imu[1:]
+    R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
+    faster, moved = _applied(R_first_a, strides.faster), _applied(R_first_a, strides.moved)
+    turn = so3_log(strides.R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
+    velocity = window.velocity[1:] - window.velocity[:-1] - window.gravity * dt_s - faster
+    position = window.position[1:] - window.position[:-1] - window.velocity[:-1] * dt_s
+    position = position - 0.5 * window.gravity * dt_s**2 - moved
+    d = np.zeros((len(dt_s), 9, 27))
+    d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -strides.d_turn
+    d[:, 3:6, :3], d[:, 3:6, 6:9], d[:, 3:6, 15:18] = R_first_a @ skew(strides.faster), -one, one
+    d[:, 3:6, 18:21], d[:, 3:6, 21:] = -dt_s[:, :, None] * one, -R_first_a @ strides.d_faster
+    d[:, 6:, :3], d[:, 6:, 3:6], d[:, 6:, 12:15] = R_first_a @ skew(strides.moved), -one, one
+    d[:, 6:, 6:9], d[:, 6:, 18:21] = -dt_s[:, :, None] * one, -0.5 * dt_s[:, :, None] ** 2 * one
+    d[:, 6:, 21:] = -R_first_a @ strides.d_moved
+    return -np.concatenate([turn, velocity, position], axis=1), d
+
+
+def _stride_whitener(dt_s: Array, noise: Noise) -> Array:
+    """Return what makes the strides' errors (m, 9) independent of variance 1: white samples, integrated twice.
+
+    Of a position, what the velocity's error does not explain has the variance of the density times dt^3 / 12.
+    """
+    whitener, one = np.zeros((len(dt_s), 9, 9)), np.eye(3)
+    rest = (np.sqrt(12.0 / dt_s**3) / noise.accel)[:, None, None]
+    whitener[:, :3, :3] = (1.0 / np.sqrt(dt_s) / noise.gyro)[:, None, None] * one
+    whitener[:, 3:6, 3:6] = (1.0 / np.sqrt(dt_s) / noise.accel)[:, None, None] * one
+    whitener[:, 6:, 6:], whitener[:, 6:, 3:6] = rest * one, -0.5 * dt_s[:, None, None] * rest * one
+    return whitener
+
+
+def _applied(matrix: Array, vector: Array) -> Array:
+    """Return the products (N, i) of matrices (N, i, j) and vectors (N, j)."""
+    return np.asarray((matrix @ vector[:, :, None])[..., 0])

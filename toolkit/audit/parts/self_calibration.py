@@ -1,0 +1,199 @@
+"""The calibration by which tracks and an IMU fit together best: windows of key frames adjusted with it unknown.
+
+From frame to frame the noise of the tracks hides a focal length, a clock or a turn that is off by little; a point that
+is followed over a second, beside the integrated IMU, shows it. See `bundle` for the equations.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from toolkit.audit.parts.alignment import chained
+from toolkit.audit.parts.bundle import COMMON, GYRO_BIAS, Calibration, Noise, Reduced, Window, moved, reduce
+from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by
+from toolkit.audit.parts.robust import LEVEL
+from toolkit.audit.parts.strides import Strides, strides_between
+from toolkit.errors import DataError
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
+from toolkit.measured_motion import ImuNoise
+from toolkit.models.camera_motion import CameraMotion
+from toolkit.models.stereo import disparity_px, triangulate
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, is_left_only
+
+# Key frames are so far apart, in windows so long; of longer recordings so many windows are taken, spread evenly.
+STRIDE_S, WINDOW_S, MOST_WINDOWS, FEWEST_KEYS = 0.2, 4.0, 6, 4
+# Tracks that are used: the longest of those seen in so many key frames.
+FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, MOST_TRACKS, FEWEST_TRACKS = 3, 2.0, 200, 20
+MOST_ITERATIONS = 10
+# Settled is what changes by less than this share of its standard errors.
+SETTLED = 0.4
+# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, rad/s, m/s^2. What is beyond
+# them is no solution.
+OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 3, 3])
+# What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
+# ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
+GYRO_ERROR = 0.1
+
+
+class SelfCalibration(NamedTuple):
+    """What has to be added to the calibration's unknowns, or what its biases are (18,), and the covariance.
+
+    `bundle` has their order.
+    """
+
+    value: Array
+    cov: Array
+
+    @property
+    def error(self) -> Array:
+        """The standard errors (18,)."""
+        return np.sqrt(np.diag(self.cov))
+
+
+def self_calibration(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> SelfCalibration | None:
+    """Find the calibration of an IMU's recording.
+
+    None where no window has the tracks for it, or where none near the one that is given fits.
+    """
+    w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
+    windows = _windows(sequence, camera, w_bias)
+    if not windows:
+        return None
+    try:
+        value, settled, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), _noise(sequence))
+        cov = _cov(all_reduced)
+    except (np.linalg.LinAlgError, DataError):  # steps that lead nowhere: singular, or a rig that is none
+        return None
+    if not settled or (np.abs(value) > OFF_BY).any():
+        return None
+    value[GYRO_BIAS] += w_bias
+    return SelfCalibration(value, cov)
+
+
+def _adjusted(windows: list[Window], calibration: Calibration, noise: Noise) -> tuple[Array, bool, list[Reduced]]:
+    """Return the calibration's change (18,) by Gauss-Newton, whether it settled, and what it rests on."""
+    value = np.zeros(COMMON)
+    for _ in range(MOST_ITERATIONS):
+        all_reduced = [reduce(window, calibration, noise) for window in windows]
+        step = _step(all_reduced, value)
+        value = value + step
+        if (np.abs(step) < SETTLED * np.sqrt(np.diag(np.linalg.inv(_information(all_reduced))))).all():
+            return value, True, all_reduced
+        windows = [moved(window, reduced, step) for window, reduced in zip(windows, all_reduced, strict=True)]
+        calibration = calibration.moved(step)
+    return value, False, all_reduced
+
+
+def _noise(sequence: Sequence) -> Noise:
+    assert isinstance(sequence.noise, ImuNoise)
+    sample_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    return Noise(
+        float(np.hypot(sequence.noise.gyro_noise_density, GYRO_ERROR * sample_s)), sequence.noise.accel_noise_density
+    )
+
+
+def _step(all_reduced: list[Reduced], value: Array) -> Array:
+    """Return the step (18,) of the calibration that all windows want together, and the prior about zero."""
+    gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / OFF_BY**2
+    return np.asarray(np.linalg.solve(_information(all_reduced), gradient))
+
+
+def _information(all_reduced: list[Reduced]) -> Array:
+    return np.asarray(np.diag(OFF_BY**-2.0) + sum(reduced.information for reduced in all_reduced))
+
+
+def _cov(all_reduced: list[Reduced]) -> Array:
+    """Return the covariance (18, 18), robust to errors that stay the same along a track, for a second or in a window.
+
+    Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich. It is no
+    less than that of errors that are all independent, for few parts can look too calm; and windows, of which there are
+    two to six, count only where they scatter more than is chance.
+    """
+    inverse = np.linalg.inv(_information(all_reduced))
+    gradients = np.concatenate([reduced.gradients for reduced in all_reduced])
+    cov = inverse @ (gradients.T @ gradients + np.diag(OFF_BY**-2.0)) @ inverse
+    cov = cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))
+    by_window = np.array([reduced.gradients.sum(axis=0) for reduced in all_reduced]) @ inverse
+    dof = len(all_reduced) - 1
+    if dof == 0:
+        return np.asarray(cov)
+    scatter = np.sum((by_window - by_window.mean(axis=0)) ** 2, axis=0) * (dof + 1) / dof
+    beyond = scatter > np.diag(cov) * chdtri(dof, LEVEL) / dof
+    return np.asarray(cov + np.diag(np.where(beyond, np.maximum(scatter - np.diag(cov), 0.0), 0.0)))
+
+
+def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array) -> list[Window]:
+    """Return the windows whose camera motion is known and that have tracks enough."""
+    step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
+    stride = max(1, round(STRIDE_S / step_s))
+    keys = np.arange(0, sequence.frame_count, stride)
+    count = max(1, round(sequence.duration_s / WINDOW_S))
+    edges = np.linspace(0, keys.size - 1, count + 1).round().astype(int)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).round().astype(int)).tolist()
+    spans = [keys[edges[k] : edges[k + 1] + 1] for k in chosen]
+    T_before_after = moved_by(camera, sequence)
+    known = [span for span in spans if span.size >= FEWEST_KEYS and camera.known[span[0] : span[-1]].all()]
+    found = [_window(sequence, span, T_before_after[span[0] : span[-1]], w_bias) for span in known]
+    return [window for window in found if window is not None]
+
+
+def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: Array) -> Window | None:
+    """Return a window of frames (n,), begun where the camera's own motion puts them; None with too few tracks."""
+    sighting, key, track = _long_tracks(sequence, keys)
+    if track.size == 0 or track[-1] + 1 < FEWEST_TRACKS:
+        return None
+    T_imu_cam, uv_px = sequence.rig.T_imu_cam, sequence.observations.uv_px[sighting]
+    T_first_cam = T_imu_cam @ chained(T_before_after)[keys - keys[0]]
+    T_first_imu = T_first_cam @ se3_inverse(T_imu_cam)
+    strides = strides_between(sequence, sequence.frames_t_ns[keys], w_bias)
+    nearest_first = np.lexsort((-disparity_px(uv_px), track))
+    nearest = nearest_first[np.searchsorted(track, np.arange(track[-1] + 1))]
+    points = transform(T_first_cam[key[nearest]], triangulate(uv_px[nearest], sequence.rig))
+    velocity, gravity = _velocities(T_first_imu, strides)
+    w_radps = _rates(sequence, keys) - w_bias
+    position = T_first_imu[:, :3, 3]
+    return Window(T_first_imu[:, :3, :3], position, velocity, w_radps, gravity, strides, key, track, uv_px, points)
+
+
+def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the rows (N,) of the longest tracks' sightings in key frames, sorted by track, with key and track (N,)."""
+    seen = sequence.observations
+    begin, end = np.searchsorted(seen.frame, [keys[0], keys[-1] + 1])
+    key_of = np.full(keys[-1] - keys[0] + 1, -1)
+    key_of[keys - keys[0]] = np.arange(keys.size)
+    row = begin + np.flatnonzero((key_of[seen.frame[begin:end] - keys[0]] >= 0) & _usable(seen.uv_px[begin:end]))
+    _, track, sightings = np.unique(seen.track_id[row], return_inverse=True, return_counts=True)
+    longest = np.argsort(-sightings, kind="stable")[:MOST_TRACKS]
+    chosen = longest[sightings[longest] >= FEWEST_SIGHTINGS]
+    row = row[np.isin(track, chosen)]
+    row = row[np.argsort(seen.track_id[row], kind="stable")]
+    _, track = np.unique(seen.track_id[row], return_inverse=True)
+    return row, key_of[seen.frame[row] - keys[0]], track
+
+
+def _usable(uv_px: Array) -> BoolArray:
+    """Say which sightings (N, 3) were seen by both cameras and are near enough."""
+    both = ~is_left_only(uv_px)
+    both[both] = disparity_px(uv_px[both]) > LEAST_DISPARITY_PX
+    return np.asarray(both & np.isfinite(uv_px).all(axis=1))
+
+
+def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:
+    """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4), by linear least squares over the strides."""
+    n, dt_s = len(T_first_imu), strides.dt_s
+    R_first_a, position = T_first_imu[:-1, :3, :3], T_first_imu[:, :3, 3]
+    rows, jacobian = np.arange(n - 1), np.zeros((2, n - 1, n + 1))
+    jacobian[0, rows, rows], jacobian[0, :, n] = dt_s, 0.5 * dt_s**2
+    jacobian[1, rows, rows], jacobian[1, rows, rows + 1], jacobian[1, :, n] = -1.0, 1.0, -dt_s
+    by_force = (R_first_a @ np.stack([strides.moved, strides.faster])[..., None])[..., 0]
+    response = np.stack([np.diff(position, axis=0) - by_force[0], by_force[1]])
+    found = np.linalg.lstsq(jacobian.reshape(-1, n + 1), response.reshape(-1, 3))[0]
+    return found[:n], found[n]
+
+
+def _rates(sequence: Sequence, keys: IntArray) -> Array:
+    """Return the gyro's means (n, 3) rad/s over the two intervals around each of the frames (n,)."""
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
+    return np.asarray(0.5 * (mean[np.maximum(keys - 1, 0)] + mean[np.minimum(keys, len(mean) - 1)]))
