@@ -333,8 +333,7 @@ def extrinsic_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> S
 
 def inverted_extrinsic(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
     """Invert the extrinsic: IMU to camera written where camera to IMU is read. A dose of 0 leaves it."""
-    T_imu_cam = sequence.rig.T_imu_cam
-    return _with_rig(sequence, T_imu_cam=se3_inverse(T_imu_cam)) if dose else sequence
+    return _with_rig(sequence, T_imu_cam=se3_inverse(sequence.rig.T_imu_cam)) if dose else sequence
 
 
 def turned_camera(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
@@ -359,9 +358,6 @@ def truth_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Seque
     T_world_imu = se3(truth.T_world_imu[:, :3, :3], dose * truth.T_world_imu[:, :3, 3])
     v_world = None if truth.v_world is None else dose * truth.v_world
     return replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
-
-
-# What they share ----------------------------------------------------------------------------------------------------
 
 
 def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:
