@@ -13,8 +13,8 @@ The scenarios are dealt into two halves with other stretches and other pairs of 
 thresholds may be chosen, and `score`, which is not to be looked at while they are. `fresh`, `again`, `third`, `fourth`,
 `fifth`, `sixth`, `seventh` and `eighth` are draws of others yet, with one recording drawn for every fault. In `sixth`
 and `eighth` the faults meet other estimators, and in `seventh` those that have no innovations to be judged by, beside
-one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and two by two, as they meet
-faults, and what any of these comparisons says is a false alarm.
+one. A comparison is of the estimators that meet a fault. Those of a sound stretch are compared all together and two by
+two, as they meet faults, and what any of these comparisons says is a false alarm.
 
     python tests/benchmarks/status_power.py run score runs.jsonl     a line a run; goes on where it was stopped
     python tests/benchmarks/status_power.py table score runs.jsonl   power and false alarms; exit 1 beside the bar
