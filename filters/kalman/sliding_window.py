@@ -110,7 +110,8 @@ class SlidingWindowFilter:
         else:
             joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
         joint = self._joint
-        self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
+        if self._most_landmarks:
+            self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.

@@ -172,7 +172,7 @@ class TrackGate:
         passed = AcceptedTracks(
             tracks.sightings.select(accepted), tracks.points[accepted], weights[accepted], H, residuals
         )
-        mismatched = tracks.worst >= 0
+        mismatched = np.flatnonzero(tracks.worst >= 0)
         less = tracks.sightings.select(mismatched)
-        less.seen[np.arange(len(less.seen)), tracks.worst[mismatched]] = False
+        less.seen[np.arange(mismatched.size), tracks.worst[mismatched]] = False
         return passed, less
