@@ -7,7 +7,7 @@ track with bad luck: to leave out its worst sighting would choose the measuremen
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
-from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
@@ -129,12 +128,6 @@ def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray
     own = np.where(seen[..., None, None], own, np.eye(3))
     fall = (weighted * np.linalg.solve(own + 1e-12 * np.eye(3), weighted[..., None])[..., 0]).sum(axis=2)
     return np.asarray(np.argmax(np.where(seen, fall, -1.0), axis=1))
-
-
-def track_test(compilation: Compilation) -> TrackTest:
-    """Return what is to test tracks: compiled where that is asked for and possible, else the definition."""
-    compiled = compilation.module("filters.kalman.compiled_gate")
-    return tested if compiled is None else cast(TrackTest, compiled.tested)
 
 
 class TrackGate:

@@ -67,13 +67,15 @@ def invert(L: Array, n: int, W: Array) -> None:
 
 @compiled
 def multiply(A: Array, B: Array, out: Array) -> None:
-    """Put A (l, m) B (m, n) in ``out``."""
+    """Put A (l, m) B (m, n) in ``out``; what is zero in A takes no time."""
     for i in range(A.shape[0]):
         for c in range(B.shape[1]):
             out[i, c] = 0.0
         for k in range(A.shape[1]):
-            for c in range(B.shape[1]):
-                out[i, c] += A[i, k] * B[k, c]
+            factor = A[i, k]
+            if factor != 0.0:
+                for c in range(B.shape[1]):
+                    out[i, c] += factor * B[k, c]
 
 
 @compiled
