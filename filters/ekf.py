@@ -4,7 +4,7 @@ What it approximates: pose and landmarks are kept as if independent. A frame the
 landmark, and the filter is too sure of itself: its covariance does not grow with the distance driven.
 """
 
-from filters.kalman.decoupled import steps
+from filters.kalman.compiled import decoupled_steps
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
@@ -31,7 +31,7 @@ class DecoupledEkf(Filter):
         self._rig, self._outliers = setup.rig, setup.settings.outliers
         model = motion_model(setup.noise, setup.gravity_world)
         self._belief = model.initial_belief(setup.prior)
-        self._steps = steps(model, setup.noise, setup.compilation)
+        self._steps = decoupled_steps(model, setup.noise, setup.compilation)
         self._map = TrackedMap(setup.rig, self._steps.start)
 
     def step(self, packet: Packet) -> Estimate:

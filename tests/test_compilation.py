@@ -31,10 +31,10 @@ def module(tmp_path, monkeypatch):
 def test_without_numba_numpy_runs_unless_compiled_is_asked_for(monkeypatch):
     monkeypatch.setattr(compilation, "find_spec", lambda name: None)
     auto = Compilation("auto")
-    assert auto.module("filters.kalman.compiled_gate") is None
+    assert auto.module("filters.kalman.kernels.track_gate") is None
     assert (auto.ran, auto.log) == ("numpy", ())
     with pytest.raises(EstimatorError, match=r"needs numba.*\[fast\]"):
-        Compilation("compiled").module("filters.kalman.compiled_gate")
+        Compilation("compiled").module("filters.kalman.kernels.track_gate")
     with pytest.raises(EstimatorError, match="needs numba"):
         find("msckf").check_usable(Settings(arithmetic="compiled"))
 

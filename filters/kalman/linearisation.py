@@ -11,7 +11,7 @@ from typing import Protocol
 from filters.kalman.joint import JointBelief
 from toolkit.geometry import Array
 from toolkit.measured_motion import Motion
-from toolkit.models.motion import Increment, MotionModel
+from toolkit.models.motion import Increment
 from toolkit.models.state import Prediction
 
 
@@ -60,7 +60,14 @@ class AtFirstEstimates:
         return joint.first_points
 
 
-def propagate(joint: JointBelief, model: MotionModel, at: Linearisation, motion: Motion | None) -> None:
+class Integrator(Protocol):
+    """Integrates what was measured between two frames; every motion model does."""
+
+    def integrate(self, motion: Motion, bias: Array) -> Increment:
+        """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
+
+
+def propagate(joint: JointBelief, model: Integrator, at: Linearisation, motion: Motion | None) -> None:
     """Carry a joint belief over the motion between two frames, linearised as chosen; before the first there is none."""
     if motion is None:
         return

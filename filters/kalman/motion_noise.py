@@ -13,12 +13,11 @@ stays, to the bit, what it is without.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Self, cast
+from typing import Self
 
 import numpy as np
 from scipy.special import chdtri
 
-from toolkit.compilation import Compilation
 from toolkit.estimator import Setup
 from toolkit.measured_motion import with_noise_scaled
 from toolkit.models.corrections import CorrectionTest, correction_test
@@ -36,12 +35,6 @@ _LEAST_TOLD = 1.05
 
 # Tests what measurements made of a belief.
 Test = Callable[[Belief, Belief], CorrectionTest]
-
-
-def test_of_corrections(compilation: Compilation) -> Test:
-    """Return what is to test corrections: compiled where that is asked for and possible, else the definition."""
-    compiled = compilation.module("filters.kalman.compiled_correction_test")
-    return correction_test if compiled is None else cast(Test, compiled.correction_test)
 
 
 class MatchedNoise:

@@ -40,7 +40,9 @@ class TrackSightings(NamedTuple):
         return np.asarray(3 * self.seen.sum(axis=1) - self.left_only.sum(axis=1) - 3)
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
-        """Return some of the tracks."""
+        """Return some of the tracks, themselves where a mask has all."""
+        if rows.dtype == np.bool_ and rows.all():
+            return self
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":

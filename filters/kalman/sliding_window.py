@@ -14,33 +14,29 @@ approximated: a track that lives on after it was used starts anew at its age, an
 taken for drawn anew.
 """
 
-from collections.abc import Callable
-from typing import cast
-
 import numpy as np
 
-from filters.kalman import joint_landmarks, multiview, track_error_states
+from filters.kalman import compiled, joint_landmarks, multiview, track_error_states
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
-from filters.kalman.motion_noise import MatchedNoise, test_of_corrections
+from filters.kalman.motion_noise import MatchedNoise
 from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.online_output import LandmarkMemory
 from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCorrelation
 from filters.kalman.track_error_states import TrackErrorBelief
-from filters.kalman.track_gate import TrackGate, track_test
-from filters.kalman.tracks_in_view import TracksInView, steps
+from filters.kalman.track_gate import TrackGate
+from filters.kalman.tracks_in_view import TracksInView
 from toolkit.arrays import is_among, rows_of
-from toolkit.compilation import Compilation
 from toolkit.estimate import Estimate, Landmarks
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gap_bridge import gap_bridge_for
 from toolkit.models.gating import FEWEST_SIGHTINGS
 from toolkit.models.motion import motion_model
 from toolkit.models.state import Belief
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Packet, StereoFrame, StereoRig
+from toolkit.sequence import Packet, StereoFrame
 from toolkit.track_noise import TrackNoise
 
 
@@ -55,21 +51,23 @@ class SlidingWindowFilter:
         self, setup: Setup, linearisation: Linearisation, landmarks: int = 0, window_s: float | None = None
     ) -> None:
         self._rig, self._at = setup.rig, linearisation
-        self._outliers = setup.settings.outliers
-        self._motion = motion_model(setup.noise, setup.gravity_world)
+        self._outliers, model = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
+        self._motion = compiled.integrator(setup.noise, setup.gravity_world, setup.compilation)
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
         self._lag_ns, self._most_landmarks = round(window_s * NS_PER_S), landmarks
         self._clone_t_ns: IntArray = np.empty(0, dtype=np.int64)
-        self._joint = _joint_belief(self._motion.initial_belief(setup.prior), setup.rig.track_noise)
-        self._joint.exponentials = exponentials(setup.compilation)
+        self._joint = _joint_belief(model.initial_belief(setup.prior), setup.rig.track_noise)
+        self._joint.exponentials = compiled.exponentials(setup.compilation)
         self._tracks = WindowTracks()
-        self._track_test = track_test(setup.compilation)
-        self._in_view = TracksInView(linearisation, setup.rig, self._outliers, steps(setup.compilation))
+        self._track_test = compiled.track_test(setup.compilation)
+        self._in_view = TracksInView(
+            linearisation, setup.rig, self._outliers, compiled.steps_in_view(setup.compilation)
+        )
         self._memory = LandmarkMemory()
-        self._noise = MatchedNoise.of(setup, test_of_corrections(setup.compilation))
+        self._noise = MatchedNoise.of(setup, compiled.correction_test(setup.compilation))
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
-        self._learn = learning(setup.compilation)
+        self._learn = compiled.learning(setup.compilation)
         self._landmark_correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
@@ -110,7 +108,8 @@ class SlidingWindowFilter:
         else:
             joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
         joint = self._joint
-        self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
+        if self._most_landmarks:
+            self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
@@ -171,23 +170,6 @@ class SlidingWindowFilter:
             self._joint.forget_clones(which)
             self._tracks.drop_oldest(int(which.sum()))
             self._clone_t_ns = self._clone_t_ns[~which]
-
-
-Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
-
-
-def learning(compilation: Compilation) -> Learn:
-    """Return what has a correlation learn of tracks: compiled where that is asked for and possible, else itself."""
-    compiled = compilation.module("filters.kalman.compiled_residuals")
-    if compiled is None:
-        return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
-    return cast(Learn, compiled.learn)
-
-
-def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
-    """Return the exponential map of poses: compiled where that is asked for and possible, else NumPy's."""
-    compiled = compilation.module("filters.kalman.compiled_exponentials")
-    return se3_exp if compiled is None else cast(Callable[[Array], Array], compiled.exponentials)
 
 
 class WindowTracks:

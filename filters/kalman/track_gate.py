@@ -7,7 +7,7 @@ track with bad luck: to leave out its worst sighting would choose the measuremen
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
-from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mahalanobis_squared
 from toolkit.sequence import StereoRig
@@ -131,12 +130,6 @@ def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray
     return np.asarray(np.argmax(np.where(seen, fall, -1.0), axis=1))
 
 
-def track_test(compilation: Compilation) -> TrackTest:
-    """Return what is to test tracks: compiled where that is asked for and possible, else the definition."""
-    compiled = compilation.module("filters.kalman.compiled_gate")
-    return tested if compiled is None else cast(TrackTest, compiled.tested)
-
-
 class TrackGate:
     """Tests tracks against a joint belief, by NumPy or by what computes the same."""
 
@@ -172,7 +165,7 @@ class TrackGate:
         passed = AcceptedTracks(
             tracks.sightings.select(accepted), tracks.points[accepted], weights[accepted], H, residuals
         )
-        mismatched = tracks.worst >= 0
+        mismatched = np.flatnonzero(tracks.worst >= 0)
         less = tracks.sightings.select(mismatched)
-        less.seen[np.arange(len(less.seen)), tracks.worst[mismatched]] = False
+        less.seen[np.arange(mismatched.size), tracks.worst[mismatched]] = False
         return passed, less

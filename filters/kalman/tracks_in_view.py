@@ -32,7 +32,6 @@ from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import Window
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
-from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models import left_only
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_squared
@@ -151,12 +150,6 @@ class Steps(NamedTuple):
 
 
 NUMPY = Steps(followed, told)
-
-
-def steps(compilation: Compilation) -> Steps:
-    """Return what is to be done with tracks in view: compiled where that is asked for and possible, else as defined."""
-    compiled = compilation.module("filters.kalman.compiled_in_view")
-    return NUMPY if compiled is None else Steps(compiled.followed, compiled.told)
 
 
 class TracksInView:

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from filters.kalman import compiled as compiled_parts
+from toolkit.compilation import Compilation
 from toolkit.geometry import se3_exp
 from toolkit.models.corrections import correction_test
 from toolkit.models.imu import IMU_LAYOUT
@@ -15,9 +17,7 @@ from toolkit.models.twist import TWIST_LAYOUT
 @pytest.fixture(scope="module")
 def compiled():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    from filters.kalman import compiled_correction_test
-
-    return compiled_correction_test.correction_test
+    return compiled_parts.correction_test(Compilation("compiled"))
 
 
 def corrected(layout, seed, turn_rad):
@@ -45,8 +45,7 @@ def test_compiled_and_numpy_test_corrections_alike(compiled, layout, turn_rad):
 
 
 def test_compiled_and_numpy_make_the_same_motions_of_twists(compiled):
-    from filters.kalman.compiled_exponentials import exponentials
-
+    exponentials = compiled_parts.exponentials(Compilation("compiled"))
     twists = np.random.default_rng(2).normal(size=(40, 6)) * np.geomspace(1e-12, 3.0, 40)[:, None]
     assert exponentials(twists) == pytest.approx(se3_exp(twists), abs=1e-14)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters.kalman import correction, landmark_map
-from filters.kalman.decoupled import steps
+from filters.kalman.compiled import decoupled_steps
 from filters.kalman.gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap
 from toolkit.compilation import Compilation
@@ -27,7 +27,7 @@ NOISE = TwistNoise(np.array([0.1, 0.2, 0.3]), np.array([0.01, 0.02, 0.03]), np.a
 def compiled():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
 
-    return steps(TwistModel(NOISE), NOISE, Compilation("compiled"))
+    return decoupled_steps(TwistModel(NOISE), NOISE, Compilation("compiled"))
 
 
 def belief_of(layout, seed=3) -> Belief:
@@ -114,6 +114,6 @@ def test_compiled_and_numpy_predict_alike(compiled, turn_rate, scaled):
 
 def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
     for compilation in (Compilation(), Compilation("numpy")):
-        found = steps(TwistModel(NOISE), NOISE, compilation)
+        found = decoupled_steps(TwistModel(NOISE), NOISE, compilation)
         assert (found.correct, found.start) == (correction.corrected, landmark_map.started)
         assert compilation.ran == "numpy"

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from filters.kalman import compiled as compiled_parts
 from filters.kalman import track_gate, tracks_in_view
 from filters.kalman.gate import FrameGate
 from filters.kalman.linearisation import AtFirstEstimates
@@ -32,14 +33,13 @@ CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0
 @pytest.fixture(scope="module")
 def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    from filters.kalman import compiled_gate, compiled_in_view, compiled_residuals
-
-    return compiled_gate, compiled_in_view, compiled_residuals
+    asked = Compilation("compiled")
+    return compiled_parts.track_test(asked), compiled_parts.steps_in_view(asked), compiled_parts.learning(asked)
 
 
 @pytest.fixture(scope="module")
 def compiled(kernels):
-    return kernels[0].tested
+    return kernels[0]
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noi
     tracks = followed_in(rig, window)
     ours, theirs = (
         tell(tracks, RootedWindow.of(window), rig, FrameGate(probability, huber))
-        for tell in (tracks_in_view.told, kernels[1].told)
+        for tell in (tracks_in_view.told, kernels[1].tell)
     )
     assert ours.usable.tolist() == theirs.usable.tolist()
     assert 0 < ours.usable.sum() < TRACKS
@@ -119,7 +119,7 @@ def test_compiled_and_numpy_learn_the_same_correlation_of_residuals(kernels, fli
     points = nearest_view(sightings.uvs_px, sightings.seen, window.poses, rig)[0]
     ours, theirs = ResidualCorrelation(rig), ResidualCorrelation(rig)
     ours.learn(sightings, points, window.poses)
-    kernels[2].learn(theirs, sightings, points, window.poses, rig)
+    kernels[2](theirs, sightings, points, window.poses, rig)
     assert 0.0 < ours.correlation < 0.98
     assert theirs.correlation == pytest.approx(ours.correlation, rel=TOLERANCE)
     assert theirs.share == pytest.approx(ours.share, rel=TOLERANCE)
@@ -147,7 +147,7 @@ def test_compiled_and_numpy_follow_the_same_landmarks(kernels, flight):
     sightings.seen[35:37] = np.arange(WINDOW) == 4
     known = known._replace(clone_frames=np.arange(1, 1 + WINDOW)).select(np.arange(TRACKS) % 3 > 0)
     now = sightings.select(np.random.default_rng(8).permutation(TRACKS))
-    ours, theirs = (follow(known, now, joint, rig) for follow in (tracks_in_view.followed, kernels[1].followed))
+    ours, theirs = (follow(known, now, joint, rig) for follow in (tracks_in_view.followed, kernels[1].follow))
     assert 25 < len(ours.points) < TRACKS
     assert ours.sightings.track_ids.tolist() == theirs.sightings.track_ids.tolist()
     assert ours.points == pytest.approx(theirs.points, rel=TOLERANCE)
@@ -158,7 +158,7 @@ def test_compiled_and_numpy_follow_the_same_landmarks(kernels, flight):
 def test_nothing_is_told_by_no_track(kernels, flight):
     rig, window = flight
     none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
-    for tell in (tracks_in_view.told, kernels[1].told):
+    for tell in (tracks_in_view.told, kernels[1].tell):
         nothing = tell(none, RootedWindow.of(window), rig, FrameGate(0.95))
         assert len(nothing.weights) == len(nothing.usable) == 0
         assert not nothing.matrix.any() and not nothing.vector.any()
@@ -173,8 +173,8 @@ def test_no_track_is_no_row(compiled, flight):
 
 def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
     for compilation in (Compilation(), Compilation("numpy")):
-        assert track_gate.track_test(compilation) is track_gate.tested
-        assert tracks_in_view.steps(compilation) is tracks_in_view.NUMPY
+        assert compiled_parts.track_test(compilation) is track_gate.tested
+        assert compiled_parts.steps_in_view(compilation) is tracks_in_view.NUMPY
         assert compilation.ran == "numpy"
 
 

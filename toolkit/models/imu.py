@@ -23,7 +23,7 @@ IMU_LAYOUT = Layout(15, slice(6, 9), slice(9, 12), slice(12, 15))
 _VELOCITY = slice(6, 9)
 
 # GTSAM wants a position-integration noise of its own (m/s/sqrt(Hz)); this one is far below any accelerometer's.
-_INTEGRATION_DENSITY = 1e-6
+INTEGRATION_DENSITY = 1e-6
 
 Preintegration = gtsam.PreintegratedCombinedMeasurements
 
@@ -36,7 +36,7 @@ def preintegration_params(noise: ImuNoise, gravity_world: Array) -> gtsam.Preint
     params.setGyroscopeCovariance(eye * noise.gyro_noise_density**2)
     params.setBiasAccCovariance(eye * noise.accel_random_walk**2)
     params.setBiasOmegaCovariance(eye * noise.gyro_random_walk**2)
-    params.setIntegrationCovariance(eye * _INTEGRATION_DENSITY**2)
+    params.setIntegrationCovariance(eye * INTEGRATION_DENSITY**2)
     return params
 
 
@@ -87,6 +87,34 @@ def constant_bias(bias: Array) -> gtsam.imuBias.ConstantBias:
     return gtsam.imuBias.ConstantBias(bias[:3], bias[3:])
 
 
+def transition_over(dt_s: float, gravity_world: Array, start: Belief, end: Prediction) -> Array:
+    """Return the transition (15, 15) of an interval from the mean of ``start`` to that of ``end``.
+
+    The blocks of the biases stay as predicted; those of pose and velocity are the exact derivatives at both means
+    (Li & Mourikis 2013, section 4).
+    """
+    to_start = start.T_world_imu[:3, :3].T
+    turned_back = end.T_world_imu[:3, :3].T @ start.T_world_imu[:3, :3]
+    fallen = start.v_world * dt_s + 0.5 * gravity_world * dt_s**2
+    moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
+    accelerated = to_start @ (end.v_world - start.v_world - gravity_world * dt_s)
+    transition = end.transition.copy()
+    for block in (ROTATION, POSITION, _VELOCITY):
+        transition[block, block] = turned_back
+    transition[POSITION, ROTATION], transition[_VELOCITY, ROTATION] = -(
+        turned_back @ skew(np.array([moved, accelerated]))
+    )
+    transition[POSITION, _VELOCITY], transition[_VELOCITY, POSITION] = dt_s * turned_back, 0.0
+    return transition
+
+
+def mean_noise_scale(motion: ImuMotion) -> tuple[float, float]:
+    """Return how many times its stated standard deviation the white noise of accelerometer and gyro has on average."""
+    assert motion.noise_scale is not None
+    accel, gyro = np.sqrt(motion.dt_s @ motion.noise_scale**2 / motion.dt_s.sum()).tolist()
+    return accel, gyro
+
+
 @dataclass(frozen=True, eq=False)
 class ImuIncrement:
     """The preintegrated samples between two frames, their duration, and gravity (3,) m/s^2 in the world."""
@@ -100,25 +128,8 @@ class ImuIncrement:
         return predict(self.preintegration, start.T_world_imu, start.v_world, start.bias)
 
     def transition_between(self, start: Belief, end: Prediction) -> Array:
-        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``.
-
-        The blocks of the biases stay as predicted; those of pose and velocity are the exact derivatives at both means
-        (Li & Mourikis 2013, section 4).
-        """
-        dt_s = self.dt_s
-        to_start = start.T_world_imu[:3, :3].T
-        turned_back = end.T_world_imu[:3, :3].T @ start.T_world_imu[:3, :3]
-        fallen = start.v_world * dt_s + 0.5 * self.gravity_world * dt_s**2
-        moved = to_start @ (end.T_world_imu[:3, 3] - start.T_world_imu[:3, 3] - fallen)
-        accelerated = to_start @ (end.v_world - start.v_world - self.gravity_world * dt_s)
-        transition = end.transition.copy()
-        for block in (ROTATION, POSITION, _VELOCITY):
-            transition[block, block] = turned_back
-        transition[POSITION, ROTATION], transition[_VELOCITY, ROTATION] = -(
-            turned_back @ skew(np.array([moved, accelerated]))
-        )
-        transition[POSITION, _VELOCITY], transition[_VELOCITY, POSITION] = dt_s * turned_back, 0.0
-        return transition
+        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``."""
+        return transition_over(self.dt_s, self.gravity_world, start, end)
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
         """Return the preintegrated factor between two states."""
@@ -171,7 +182,7 @@ class ImuModel:
         """Return the parameters over an interval: a preintegration has one noise, its mean over a bridged piece."""
         if motion.noise_scale is None:
             return self._params
-        accel, gyro = np.sqrt(motion.dt_s @ motion.noise_scale**2 / motion.dt_s.sum()).tolist()
+        accel, gyro = mean_noise_scale(motion)
         scaled = replace(
             self._noise,
             accel_noise_density=accel * self._noise.accel_noise_density,

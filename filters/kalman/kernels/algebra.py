@@ -32,13 +32,21 @@ def solved_3(N: Array, f: int, damping: float, least: float) -> tuple[float, flo
 
 @compiled
 def cholesky(A: Array, n: int) -> None:
-    """Put the lower Cholesky factor of A (n, n) in the place of its lower triangle."""
-    for i in range(n):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            A[i, j] = total / A[j, j] if j < i else math.sqrt(total)
+    """Put the lower Cholesky factor of a symmetric A (n, n) in the place of A, and its transposed in the upper half.
+
+    Row by row of the upper half, whose elements can be taken several at a time where indices have no sign.
+    """
+    end = np.uint64(n)
+    for k in range(n):
+        A[k, k] = math.sqrt(A[k, k])
+        root = A[k, k]
+        for c in range(np.uint64(k + 1), end):
+            A[k, c] /= root
+        for i in range(np.uint64(k + 1), end):
+            factor = A[k, i]
+            A[i, k] = factor
+            for c in range(i, end):
+                A[i, c] -= factor * A[k, c]
 
 
 @compiled
@@ -59,13 +67,15 @@ def invert(L: Array, n: int, W: Array) -> None:
 
 @compiled
 def multiply(A: Array, B: Array, out: Array) -> None:
-    """Put A (l, m) B (m, n) in ``out``."""
+    """Put A (l, m) B (m, n) in ``out``; what is zero in A takes no time."""
     for i in range(A.shape[0]):
         for c in range(B.shape[1]):
             out[i, c] = 0.0
         for k in range(A.shape[1]):
-            for c in range(B.shape[1]):
-                out[i, c] += A[i, k] * B[k, c]
+            factor = A[i, k]
+            if factor != 0.0:
+                for c in range(B.shape[1]):
+                    out[i, c] += factor * B[k, c]
 
 
 @compiled
@@ -186,15 +196,17 @@ def reflect_both_sides(S: Array, V: Array, k: int, tau: float, n: int) -> None:
 
     With ``u = tau S v`` and ``w = u - (tau / 2) (v^T u) v`` it is ``S - v w^T - w v^T``.
     """
-    w, half = np.empty(n), 0.0
+    w, half = np.zeros(n), 0.0
+    for j in range(n):
+        factor = V[k, j]
+        for i in range(n):
+            w[i] += factor * S[j, i]
     for i in range(n):
-        total = 0.0
-        for j in range(n):
-            total += S[i, j] * V[k, j]
-        w[i] = tau * total
+        w[i] *= tau
         half += 0.5 * tau * V[k, i] * w[i]
     for i in range(n):
         w[i] -= half * V[k, i]
     for i in range(n):
+        own, turned = V[k, i], w[i]
         for j in range(n):
-            S[i, j] -= V[k, i] * w[j] + w[i] * V[k, j]
+            S[i, j] -= own * w[j] + turned * V[k, j]

@@ -111,7 +111,7 @@ def noise_roots(ages: IntArray, f: int, where: IntArray, variances: Array, roots
         white, walk, offset = variances[0, channel], variances[1, channel], variances[2, channel]
         for i in range(m):
             for j in range(i + 1):
-                one[i, j] = walk * min(ages[f, where[i]], ages[f, where[j]]) + offset
+                one[i, j] = one[j, i] = walk * min(ages[f, where[i]], ages[f, where[j]]) + offset
             one[i, i] += white
         cholesky(one, m)
         for i in range(m):

@@ -132,20 +132,23 @@ def triangulate(
 @compiled
 def carry_cov(where: IntArray, H_pose: Array, P: Array, S: Array) -> None:
     """Put ``H_x P H_x^T`` (3 m, 3 m) in S: of sightings i and j the block ``H_i P_ij H_j^T``."""
-    T = np.empty((3, 6))
+    T = np.empty((3, P.shape[1]))
     for i in range(where.size):
+        end = 6 * where[i] + 6
+        for a in range(3):
+            for c in range(end):
+                T[a, c] = 0.0
+            for b in range(6):
+                factor, row = H_pose[3 * i + a, b], 6 * where[i] + b
+                for c in range(end):
+                    T[a, c] += factor * P[row, c]
         for j in range(i + 1):
-            for a in range(3):
-                for b in range(6):
-                    total = 0.0
-                    for c in range(6):
-                        total += H_pose[3 * i + a, c] * P[6 * where[i] + c, 6 * where[j] + b]
-                    T[a, b] = total
+            at = np.uint64(6 * where[j])
             for a in range(3):
                 for b in range(3):
                     total = 0.0
-                    for c in range(6):
-                        total += T[a, c] * H_pose[3 * j + b, c]
+                    for c in range(np.uint64(6)):
+                        total += T[a, at + c] * H_pose[3 * j + b, c]
                     S[3 * i + a, 3 * j + b] = total
                     S[3 * j + b, 3 * i + a] = total
 
@@ -191,15 +194,15 @@ def nis_of(S: Array, n: int, residual: Array) -> float:
     for i in range(n):
         S[i, i] += 1.0
         for j in range(min(i, 3)):
-            S[i, j] = 0.0  # the first three rows are a factor by themselves
+            S[i, j] = S[j, i] = 0.0  # the first three rows are a factor by themselves
     cholesky(S, n)
     total = 0.0
     for i in range(3, n):
+        residual[i] /= S[i, i]
         value = residual[i]
-        for j in range(3, i):
-            value -= S[i, j] * residual[j]
-        residual[i] = value / S[i, i]
-        total += residual[i] * residual[i]
+        for j in range(i + 1, n):
+            residual[j] -= value * S[i, j]
+        total += value * value
     return total
 
 
@@ -227,16 +230,13 @@ def constraint_rows(where: IntArray, J: Array, dense: bool, V: Array, tau: Array
             for c in range(begin, end):
                 reached[a, c] += weight * J[i, c]
     for i in range(3, n):
-        row = first + i - 3
+        row, x, y, z = first + i - 3, V[0, i], V[1, i], V[2, i]
         for c in range(H.shape[1]):
             H[row, c] = 0.0
         for k in range(where.size):
-            for c in range(6):
-                own = J[i, 6 * k + c] if 3 * k <= i and (dense or i < 3 * k + 3) else 0.0
-                at = 6 * k + c
-                H[row, 6 * where[k] + c] = (
-                    own - V[0, i] * reached[0, at] - V[1, i] * reached[1, at] - V[2, i] * reached[2, at]
-                )
+            at, to = np.uint64(6 * k), np.uint64(6 * where[k])
+            for c in range(np.uint64(6)):
+                H[row, to + c] = J[i, at + c] - x * reached[0, at + c] - y * reached[1, at + c] - z * reached[2, at + c]
 
 
 @compiled

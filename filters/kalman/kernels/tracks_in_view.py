@@ -132,19 +132,22 @@ def add_normals(f: int, where: IntArray, rows: Arrays, n: int, dense: bool, sums
     A, J = rows
     N, B, D, d = sums
     add_products(A, 0, n, N, f)
-    for i in range(n):
-        begin = 0 if dense else i // 3
-        for k in range(begin, where.size if dense else begin + 1):
-            block, shift = (0, 6 * where[k]) if dense else (where[k], 0)
+    for i in range(0, n, 3):
+        begin, end = (0, where.size) if dense else (i // 3, i // 3 + 1)
+        for k in range(begin, end):
+            block, own, column = 0 if dense else where[k], 6 * (k - begin), 6 * where[k]
             for a in range(6):
-                value, column = J[i, 6 * (k - begin) + a], 6 * where[k] + a
-                d[column] += value * A[i, 3]
+                x, y, z = J[i, own + a], J[i + 1, own + a], J[i + 2, own + a]
+                d[column + a] = d[column + a] + x * A[i, 3] + y * A[i + 1, 3] + z * A[i + 2, 3]
                 for b in range(3):
-                    B[3 * f + b, column] += A[i, b] * value
+                    mine = 3 * f + b
+                    B[mine, column + a] += A[i, b] * x + A[i + 1, b] * y + A[i + 2, b] * z
+                row = column + a if dense else a
                 for j in range(begin, k + 1):
-                    for c in range(6):
-                        at = 6 * where[j] + c if dense else c
-                        D[block, shift + a, at] += value * J[i, 6 * (j - begin) + c]
+                    to, at = np.uint64(6 * where[j] if dense else 0), np.uint64(6 * (j - begin))
+                    for c in range(np.uint64(6)):
+                        more = D[block, row, to + c] + x * J[i, at + c] + y * J[i + 1, at + c]
+                        D[block, row, to + c] = more + z * J[i + 2, at + c]
 
 
 @compiled
@@ -203,7 +206,7 @@ def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array
     The others put the landmark at ``V (b + B x)``, of which the newest sees ``H_f V (b + B x)``. H (3, 6 W) gets its
     Jacobian to errors of unit covariance; S has ``[covariance, innovation]`` as ``solved_3`` takes them.
     """
-    T, at, last = np.empty((3, 3)), 0, N.shape[0] - 1
+    T, last = np.empty((3, 3)), N.shape[0] - 1
     for a in range(3):
         for c in range(6):
             N[last, c] = N[f, c]
@@ -214,13 +217,19 @@ def newest_innovation(f: int, N: Array, A: Array, JR: Array, BR: Array, H: Array
         for c in range(JR.shape[1]):
             H[a, c] = JR[3 * f + a, c] - x * BR[3 * f, c] - y * BR[3 * f + 1, c] - z * BR[3 * f + 2, c]
         S[0, 6 + a] = A[3 * f + a, 3] - x * N[f, 6] - y * N[f, 7] - z * N[f, 8]
+    at = 0
+    for a in range(3):
         for b in range(a + 1):
             S[0, at] = 1.0 if a == b else 0.0
             for d in range(3):
                 S[0, at] += T[a, d] * A[3 * f + b, d]
-            for c in range(JR.shape[1]):
-                S[0, at] += H[a, c] * H[b, c]
             at += 1
+    # Six sums side by side: one alone would wait for each of its products.
+    s0, s1, s2, s3, s4, s5 = S[0, 0], S[0, 1], S[0, 2], S[0, 3], S[0, 4], S[0, 5]
+    for c in range(JR.shape[1]):
+        x, y, z = H[0, c], H[1, c], H[2, c]
+        s0, s1, s2, s3, s4, s5 = s0 + x * x, s1 + y * x, s2 + y * y, s3 + z * x, s4 + z * y, s5 + z * z
+    S[0, 0], S[0, 1], S[0, 2], S[0, 3], S[0, 4], S[0, 5] = s0, s1, s2, s3, s4, s5
 
 
 @compiled

@@ -1,5 +1,6 @@
-"""The test of a correction compiled: ``toolkit.models.corrections`` of two beliefs of the same layout.
+"""What corrections are made of compiled: motions, what tracks leave of their residuals, and the test of a correction.
 
+In NumPy that is ``toolkit.geometry.se3_exp``, ``residual_correlation`` and ``toolkit.models.corrections``.
 Source of the eigenvalues: Golub & Van Loan, "Matrix Computations" (4th ed.), 8.3 (tridiagonal QR).
 """
 
@@ -8,17 +9,82 @@ import math
 import numpy as np
 from numba import types
 
-from filters.kalman.kernels.algebra import inverses, products, reflect_both_sides
-from filters.kalman.kernels.compiling import MATRIX, ROW, STACK, Arrays, compiled, kept, what_was_compiled
-from filters.kalman.kernels.rigid_motions import logarithm
-from toolkit.geometry import Array, IntArray
+from filters.kalman.kernels.algebra import inverses, products, reflect_both_sides, solved_3
+from filters.kalman.kernels.compiling import (
+    CAMERA,
+    MASK,
+    MATRIX,
+    ROW,
+    STACK,
+    Arrays,
+    compiled,
+    kept,
+    what_was_compiled,
+)
+from filters.kalman.kernels.rigid_motions import exponential, logarithm
+from filters.kalman.kernels.sightings import add_products, linearise, sighted
+from toolkit.geometry import Array, BoolArray, IntArray
 
+# (uL, uR, v) (F, W, 3) px and which were seen (F, W); points (F, 3); poses (W, 4, 4); camera; how many sightings a
+# track needs.
+RESIDUALS = (types.Tuple((STACK, MASK)), MATRIX, STACK, CAMERA, types.int64)
 # Pose (1, 4, 4), velocity m/s and bias (9,), and covariance (d, d), before and after; where velocity, accel bias and
 # gyro bias stand in the error (3,), -1 what it has not; the least share that is told.
 _STATE = types.Tuple((STACK, ROW, MATRIX))
-SIGNATURE = (_STATE, _STATE, types.int64[::1], types.float64)
+CORRECTION = (_STATE, _STATE, types.int64[::1], types.float64)
 # Two or three are what an eigenvalue takes.
 _MOST_STEPS = 30
+
+
+@kept((MATRIX,))
+def exponentials(twists: Array) -> Array:
+    """Return the motions (N, 4, 4) of twists (N, 6), [rotation, translation]."""
+    motions = np.empty((twists.shape[0], 4, 4))
+    for k in range(twists.shape[0]):
+        exponential(twists[k], motions[k : k + 1])
+    return motions
+
+
+@compiled
+def pairs_in(seen: BoolArray, fewest: int) -> int:
+    """Return how often tracks of so many sightings were seen from two poses in a row."""
+    count = 0
+    for f in range(seen.shape[0]):
+        if sighted(seen, f).size >= fewest:
+            for j in range(1, seen.shape[1]):
+                count += seen[f, j] and seen[f, j - 1]
+    return count
+
+
+@compiled
+def take_up(A: Array, n: int) -> None:
+    """Take from the residuals in the last column of A (n, 4) what a step of the landmark takes up."""
+    N = np.zeros((1, 10))
+    add_products(A, 0, n, N, 0)
+    x, y, z = solved_3(N, 0, 0.0, 0.0)
+    for i in range(n):
+        A[i, 3] -= A[i, 0] * x + A[i, 1] * y + A[i, 2] * z
+
+
+@kept(RESIDUALS)
+def successive_residuals(sightings: Arrays, points: Array, poses: Array, camera: Arrays, fewest: int) -> Arrays:
+    """Return whitened residuals (n, 3) that tracks leave, and those of the next poses (n, 3); see :data:`RESIDUALS`."""
+    uvs_px, seen = sightings
+    intrinsics, T_imu_cam, whitener, _, _ = camera
+    latest, T_cam_imu, most = inverses(poses), inverses(T_imu_cam), 3 * seen.shape[1]
+    H_pose, A, pairs, at = np.empty((most, 6)), np.empty((most, 4)), pairs_in(seen, fewest), 0
+    before, after = np.empty((pairs, 3)), np.empty((pairs, 3))
+    for f in range(seen.shape[0]):
+        where = sighted(seen, f)
+        if where.size >= fewest:
+            linearise(points, f, uvs_px, where, (latest, poses, latest), (intrinsics, T_cam_imu, whitener), (H_pose, A))
+            take_up(A, 3 * where.size)
+            for k in range(1, where.size):
+                if where[k] == where[k - 1] + 1:
+                    for i in range(3):
+                        before[at, i], after[at, i] = A[3 * k - 3 + i, 3], A[3 * k + i, 3]
+                    at += 1
+    return before, after
 
 
 @compiled
@@ -95,9 +161,9 @@ def diagonalise(A: Array, y: Array, eigenvalues: Array) -> None:
                 chase(eigenvalues, beside, y, first, last)
 
 
-@kept(SIGNATURE)
+@kept(CORRECTION)
 def test_correction(before: Arrays, after: Arrays, places: IntArray, least: float) -> Arrays:
-    """Return squared length and degrees of freedom of a correction; see :data:`SIGNATURE`.
+    """Return squared length and degrees of freedom of a correction; see :data:`CORRECTION`.
 
     The covariance taken away, its entries in units of the sigmas before, becomes diagonal, and the error is turned with
     its axes.
@@ -121,4 +187,4 @@ def test_correction(before: Arrays, after: Arrays, places: IntArray, least: floa
     return nis, dof
 
 
-COMPILED = what_was_compiled(test_correction, "the test of corrections was")
+COMPILED = what_was_compiled(test_correction, "what corrections are made of was")

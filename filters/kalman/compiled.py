@@ -1,0 +1,341 @@
+"""Which parts of the filters run compiled, and how that is chosen: NumPy defines each, a kernel computes the same.
+
+Each function here is asked for a part when a filter is built, with what was asked for in its run
+(:class:`toolkit.compilation.Compilation`): it returns the definition, or what passes the same arguments on to a kernel.
+Kernels are imported when they are asked for, never before, for only they import numba.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from filters.kalman import correction, landmark_map, multiview, track_gate, tracks_in_view, triangulation
+from filters.kalman.correction import FrameCorrection
+from filters.kalman.gate import FrameGate
+from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
+from filters.kalman.landmark_map import LandmarkMap
+from filters.kalman.linearisation import Integrator
+from filters.kalman.multiview import TrackSightings
+from filters.kalman.residual_correlation import FEWEST_SIGHTINGS as FEWEST_CORRELATED
+from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.kalman.track_gate import TestedTracks, TrackTest, Window
+from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow, Told
+from toolkit.compilation import Compilation
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
+from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise, TwistMotion, TwistNoise
+from toolkit.models import corrections, correlated_noise, left_only
+from toolkit.models.corrections import LEAST_TAKEN, CorrectionTest
+from toolkit.models.gating import (
+    FEWEST_SIGHTINGS,
+    LEAST_DEPTH_M,
+    LEAST_DISPARITY_PX,
+    MISMATCHED_TRACK_FACTOR,
+    huber_threshold,
+)
+from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
+from toolkit.models.motion import Increment, MotionModel, motion_model, predicted
+from toolkit.models.state import Belief, Layout, Prediction
+from toolkit.sequence import StereoRig, is_left_only
+from toolkit.track_noise import CHANNELS
+
+_GATE_RULES = np.array(
+    [
+        triangulation.ITERATIONS,
+        triangulation.FIRST_DAMPING,
+        triangulation.RELATIVE_DECREASE,
+        triangulation.ROUNDING,
+        LEAST_DISPARITY_PX,
+        LEAST_DEPTH_M,
+        multiview.REFINEMENTS,
+        MISMATCHED_TRACK_FACTOR,
+    ]
+)
+_EVEN_NOISE = np.empty((0, 2))
+_DOF = np.array([3, 2])
+
+
+def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
+    return compilation.module(f"filters.kalman.kernels.{name}")
+
+
+def track_test(compilation: Compilation) -> TrackTest:
+    """Return what tests tracks against a window: :func:`filters.kalman.track_gate.tested`."""
+    kernel = _kernel(compilation, "track_gate")
+    if kernel is None:
+        return track_gate.tested
+
+    def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
+        """Test tracks as the definition does, and by it where right images are missing."""
+        if sightings.left_only.any():
+            return track_gate.tested(sightings, window, rig, bounds)
+        points, reliable, nis, worst, ends, H, residuals = kernel.test_tracks(
+            _given((sightings.uvs_px, sightings.seen, sightings.ages)),
+            _given(window),
+            _camera(rig),
+            _GATE_RULES,
+            bounds,
+        )
+        rows = np.diff(ends, prepend=0)[reliable]
+        count = int(rows.sum())
+        return TestedTracks(
+            sightings.select(reliable),
+            points[:-1][reliable],
+            nis[reliable],
+            worst[reliable],
+            H[:count],
+            residuals[:count],
+            np.repeat(np.arange(len(rows)), rows),
+        )
+
+    return tested
+
+
+def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
+    """Return what finds the landmarks of tracks in view and says what they tell: those of ``tracks_in_view``."""
+    kernel = _kernel(compilation, "tracks_in_view")
+    if kernel is None:
+        return tracks_in_view.NUMPY
+
+    def followed(
+        known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig
+    ) -> FollowedTracks:
+        """Return tracks with their landmarks as the definition does, and by it where right images are missing."""
+        if sightings.left_only.any():
+            return tracks_in_view.followed(known, sightings, joint, rig)
+        before = _given((known.sightings.track_ids, known.clone_frames, known.points, known.weights))
+        now = _given((sightings.track_ids, joint.clone_frames, sightings.uvs_px, sightings.seen))
+        found, points, weights = kernel.follow(
+            before, now, np.ascontiguousarray(joint.clones), _camera(rig), FEWEST_SIGHTINGS, LEAST_DISPARITY_PX
+        )
+        return FollowedTracks(sightings, joint.clone_frames, points, weights).select(found)
+
+    def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Told:
+        """Gate the newest sightings as the definition does; the gate is asked for its bounds, it counts nothing."""
+        counted = tracks.counted
+        if counted.left_only.any():
+            return tracks_in_view.told(tracks, window, rig, gate)
+        arrays = _given((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
+        poses, root = _given((window.poses, window.poses_at)), window.root
+        threshold = np.inf if gate.huber is None else float(huber_threshold(3, gate.huber))
+        rules = np.array([LEAST_DEPTH_M, float(gate.bound(3)), threshold])
+        normals = kernel.normals_of_tracks(arrays, poses, _camera(rig), rules)
+        to_points, newest, vector = normals[3], normals[5], normals[7]
+        eliminated = times_root(to_points, root)
+        by_root = (root, newest @ root[-newest.shape[1] :], eliminated)
+        points, weights, in_front, taken, of_poses = kernel.told_by_newest(normals, by_root, rules)
+        matrix = without_products(transposed_root_times(root, of_poses), eliminated)
+        return Told(points, weights, in_front, matrix, root.T @ vector - eliminated.T @ taken)
+
+    return tracks_in_view.Steps(followed, told)
+
+
+# Has a correlation learn of the residuals of tracks, of points (F, 3) seen from poses (W, 4, 4).
+Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig], None]
+
+
+def learning(compilation: Compilation) -> Learn:
+    """Return what has a correlation learn of tracks: :meth:`ResidualCorrelation.learn`."""
+    kernel = _kernel(compilation, "corrections")
+    if kernel is None:
+        return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
+
+    def learn(
+        correlation: ResidualCorrelation, sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig
+    ) -> None:
+        """Take in tracks as the definition does, and by it where right images are missing."""
+        if not correlation.matches:
+            return
+        if sightings.left_only.any():
+            correlation.learn(sightings, points, poses)
+            return
+        arrays, (points, poses) = _given((sightings.uvs_px, sightings.seen)), _given((points, poses))
+        correlation.add(*kernel.successive_residuals(arrays, points, poses, _camera(rig), FEWEST_CORRELATED))
+
+    return learn
+
+
+def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
+    """Return what makes motions (N, 4, 4) of twists (N, 6): :func:`toolkit.geometry.se3_exp`."""
+    kernel = _kernel(compilation, "corrections")
+    if kernel is None:
+        return se3_exp
+    return lambda twists: kernel.exponentials(np.ascontiguousarray(twists))
+
+
+def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], CorrectionTest]:
+    """Return what tests what measurements made of a belief: :func:`toolkit.models.corrections.correction_test`."""
+    kernel = _kernel(compilation, "corrections")
+    if kernel is None:
+        return corrections.correction_test
+
+    def given(belief: Belief) -> tuple[Array, Array, Array]:
+        return _pose_of(belief), np.concatenate([belief.v_world, belief.bias]), np.ascontiguousarray(belief.cov)
+
+    def tested(before: Belief, after: Belief) -> CorrectionTest:
+        """Test a correction as the definition does."""
+        return CorrectionTest(*kernel.test_correction(given(before), given(after), _places(before.layout), LEAST_TAKEN))
+
+    return tested
+
+
+def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
+    """Return what integrates motion of some noise: a :class:`toolkit.models.motion.MotionModel`."""
+    model = motion_model(noise, gravity_world)
+    kernel = _kernel(compilation, "preintegration") if isinstance(noise, ImuNoise) else None
+    if kernel is None:
+        return model
+    assert isinstance(noise, ImuNoise)
+    densities = noise.accel_noise_density, noise.gyro_noise_density, noise.accel_random_walk, noise.gyro_random_walk
+    return _ImuIntegrator(model, kernel, np.square([*densities, INTEGRATION_DENSITY]), np.array(gravity_world))
+
+
+class _ImuIntegrator(NamedTuple):
+    """Integrates samples by the kernel as a model does by GTSAM; variances and gravity as the kernel takes them."""
+
+    model: MotionModel
+    kernel: ModuleType
+    variances: Array
+    gravity_world: Array
+
+    def integrate(self, motion: Motion, bias: Array) -> Increment:
+        """Return the samples between two frames, to be integrated about a bias (6,)."""
+        assert isinstance(motion, ImuMotion)
+        return _ImuIncrement(motion, bias, self)
+
+
+class _ImuIncrement(NamedTuple):
+    """The samples between two frames about a bias: integrated when a state is carried over them."""
+
+    motion: ImuMotion
+    bias: Array
+    by: _ImuIntegrator
+
+    def predict(self, start: Belief) -> Prediction:
+        """Carry a state over the interval."""
+        motion, variances = self.motion, self.by.variances
+        if motion.noise_scale is not None:
+            variances = np.concatenate([np.square(mean_noise_scale(motion)) * variances[:2], variances[2:]])
+        samples = np.array(motion.dt_s), np.array(motion.accel_mps2), np.array(motion.gyro_radps)
+        state = _pose_of(start), np.array(start.v_world), np.array(start.bias)
+        return Prediction(*self.by.kernel.predict(samples, variances, state, self.by.gravity_world))
+
+    def transition_between(self, start: Belief, end: Prediction) -> Array:
+        """Return the transition (15, 15) from the mean of ``start`` to that of ``end``."""
+        return transition_over(float(self.motion.dt_s.sum()), self.by.gravity_world, start, end)
+
+    def factors(self, k: int) -> Any:
+        """Return what ties state k - 1 to state k in a graph: GTSAM's."""
+        return self.by.model.integrate(self.motion, self.bias).factors(k)
+
+
+class DecoupledSteps(NamedTuple):
+    """What carries a belief over a motion, corrects it and N landmarks by sightings (N, 3) px, and starts landmarks."""
+
+    predict: Callable[[Belief, Motion], Belief]
+    correct: Callable[[Belief, LandmarkMap, Array, StereoRig, FrameGate], FrameCorrection]
+    start: Callable[[Array, Array, StereoRig], tuple[Array, Array]]
+
+
+def decoupled_steps(model: MotionModel, noise: MotionNoise, compilation: Compilation) -> DecoupledSteps:
+    """Return the steps of the decoupled filter, whose motion has a model of some noise.
+
+    They are ``motion.predicted``, ``correction.corrected`` and ``landmark_map.started``; other motion than twists is
+    left to the model.
+    """
+    kernel = _kernel(compilation, "decoupled")
+    twists = _kernel(compilation, "twists") if isinstance(noise, TwistNoise) and kernel is not None else None
+    if kernel is None:
+        return DecoupledSteps(_predicted_by(model), correction.corrected, landmark_map.started)
+
+    def corrected(
+        belief: Belief, landmarks: LandmarkMap, uvs_px: Array, rig: StereoRig, gate: FrameGate
+    ) -> FrameCorrection:
+        """Correct the pose by the landmarks, then the landmarks by the pose, as the definition does."""
+        missing = is_left_only(uvs_px)
+        measured = np.where(np.isnan(uvs_px), 0.0, uvs_px) if missing.any() else uvs_px
+        moved_by, step, cov, points, covs, nis, accepted = kernel.correct(
+            (landmarks.points, landmarks.covs, measured[:, None], missing),
+            (_pose_of(belief), np.array(belief.cov, order="C")),
+            _camera_with_left(rig),
+            _sighting_rules(gate.probability, gate.huber),
+        )
+        gate.count(nis, left_only.degrees_of_freedom(uvs_px), accepted)
+        moved = belief.displaced(moved_by, step[0])
+        belief = Belief(moved.layout, moved.T_world_imu, moved.v_world, moved.bias, cov)
+        return FrameCorrection(belief, LandmarkMap(landmarks.track_ids, points, covs))
+
+    def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, Array]:
+        """Return where stereo sees N landmarks and how well, as the definition does."""
+        points, covs = kernel.start(uvs_px, np.array(T_world_imu[None], order="C"), _camera_with_left(rig))
+        return points, covs
+
+    predict = _predicted_by(model) if twists is None else _predicted_along_twists(noise, twists)
+    return DecoupledSteps(predict, corrected, started)
+
+
+def _predicted_by(model: MotionModel) -> Callable[[Belief, Motion], Belief]:
+    return lambda belief, motion: predicted(belief, model, motion)
+
+
+def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[[Belief, Motion], Belief]:
+    """Return what carries the belief of pose and gyro bias over twists of some noise."""
+    assert isinstance(noise, TwistNoise)
+    densities = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density, noise.gyro_random_walk]) ** 2
+
+    def along_twists(belief: Belief, motion: Motion) -> Belief:
+        assert isinstance(motion, TwistMotion)
+        scale = _EVEN_NOISE if motion.noise_scale is None else np.array(motion.noise_scale)
+        twists = np.array(motion.dt_s), np.array(motion.w_radps), np.array(motion.v_mps), scale
+        state = _pose_of(belief), np.array(belief.bias[3:]), np.array(belief.cov, order="C")
+        T_world_imu, cov = kernel.predict(twists, densities, state)
+        return Belief(belief.layout, T_world_imu[0], belief.v_world, belief.bias, cov)
+
+    return along_twists
+
+
+def _given(arrays: Iterable[Array | BoolArray | IntArray]) -> tuple[Any, ...]:
+    """Return arrays as kernels take them."""
+    return tuple(np.ascontiguousarray(array) for array in arrays)
+
+
+def _pose_of(belief: Belief) -> Array:
+    """Return the pose (1, 4, 4) as kernels take it."""
+    return np.array(belief.T_world_imu[None], order="C")
+
+
+def _places(layout: Layout) -> IntArray:
+    """Return where velocity, accel bias and gyro bias stand, -1 for what the layout has not."""
+    blocks = (layout.velocity, layout.accel_bias, layout.gyro_bias)
+    return np.array([-1 if block is None else block.start for block in blocks])
+
+
+def _intrinsics(rig: StereoRig) -> tuple[Array, Array]:
+    return np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.baseline_m]), np.array(rig.T_imu_cam[None])
+
+
+@lru_cache(maxsize=4)
+def _camera(rig: StereoRig) -> tuple[Array, ...]:
+    """Return a rig as the kernels of the windowed filters take it."""
+    none = np.empty((0, 3))
+    variances, channels = none, none
+    if rig.track_noise is not None:
+        noise = rig.track_noise
+        white = np.maximum(noise.white_px, correlated_noise.LEAST_WHITE_PX)
+        variances, channels = np.square([white, noise.walk_px, noise.offset_px]), np.array(CHANNELS)
+    return *_intrinsics(rig), np.array(rig.whitener, order="C"), variances, channels
+
+
+@lru_cache(maxsize=4)
+def _camera_with_left(rig: StereoRig) -> tuple[Array, ...]:
+    """Return a rig as the kernels of the decoupled filter take it."""
+    return *_intrinsics(rig), np.stack([rig.cov_uv_px2, left_only.left_noise_px2(rig)])
+
+
+@lru_cache(maxsize=4)
+def _sighting_rules(probability: float | None, huber: float | None) -> Array:
+    """Return bound and threshold (2, 2) of sightings by both images and by the left alone."""
+    thresholds = np.full(2, np.inf) if huber is None else huber_threshold(_DOF, huber)
+    return np.column_stack([FrameGate(probability).bound(_DOF), thresholds])
