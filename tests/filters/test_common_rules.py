@@ -17,7 +17,7 @@ USING_TRACKS = [entry.name for entry in ladder() if entry.name != "dead-reckonin
 
 @pytest.fixture(scope="module")
 def realistic() -> Sequence:
-    return simulate(replace(SCENARIOS["drive-realistic"], duration_s=4.0), 3)
+    return simulate(replace(SCENARIOS["drive-realistic"], duration_s=2.0), 3)
 
 
 def poses(name: str, sequence: Sequence, noise: Noise) -> Array:
