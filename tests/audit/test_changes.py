@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.audit.fault import Evidence
+from toolkit.audit.clock_change import _of_rotations, check
+from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s, camera_offset
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -74,6 +75,32 @@ def test_a_camera_clock_that_is_set_on_the_way_is_told(scenario: str) -> None:
     found = re.search(r"part by (-?\d+) \+- (\d+) ms", said)
     assert found is not None
     assert float(found[1]) == pytest.approx(-80.0, abs=3.0 * float(found[2]))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "duration_s", "seed"),
+    [("drive-imu", 9.0, 501), ("drive-imu", 9.0, 705), ("flight-realistic", 5.0, 511)],
+)
+def test_clocks_that_keep_pace_do_not_part_by_what_rotations_of_half_a_recording_err(
+    scenario: str, duration_s: float, seed: int
+) -> None:
+    evidence = Evidence(simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=True), seed))
+    assert evidence.intervals is not None
+    by_rotations = _of_rotations(evidence, evidence.intervals)
+    assert by_rotations is not None
+    assert abs(by_rotations.value) > 5.0 * by_rotations.error + 0.005
+    assert check(evidence) is None
+
+
+@pytest.mark.parametrize("duration_s", [5.0, 8.0])
+def test_a_camera_clock_that_is_set_by_little_is_told_within_its_error(duration_s: float) -> None:
+    flight = simulate(replace(SCENARIOS["flight-realistic"], duration_s=duration_s), 102)
+    symptom = check(Evidence(faults.camera_clock_step(flight, 0.025)))
+    assert isinstance(symptom, Symptom)
+    found = re.search(r"part by (-?\d+) \+- (\d+) ms", symptom.detail)
+    assert found is not None
+    # Printed to a millisecond.
+    assert float(found[1]) == pytest.approx(-25.0, abs=3.0 * float(found[2]) + 0.5)
 
 
 def test_a_camera_clock_that_drifts_is_told() -> None:

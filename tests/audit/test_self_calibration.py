@@ -9,15 +9,15 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
-from toolkit.audit.parts.bundle import COMMON, Calibration, Window, predicted, stride_equations
+from toolkit.audit.parts.bundle import CHANGE, COMMON, Calibration, Window, predicted, stride_equations
 from toolkit.audit.parts.calibration_limits import hidden, wrong
-from toolkit.audit.parts.self_calibration import SelfCalibration, _windows, self_calibration
+from toolkit.audit.parts.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Sequence, StereoRig
 from toolkit.simulation import DRIVE_IMU, FLIGHT, FLIGHT_REALISTIC, Scenario, faults, noise_free, simulate
 
 # Shares of fx and fy, px of cx and cy, a share of the baseline, rad, m, s: by what the rig is off below.
-OFF = np.array([0.03, -0.02, 8.0, -5.0, 0.04, 0.02, -0.01, 0.03, 0.05, -0.04, 0.03, 0.004])
+OFF = np.array([0.03, -0.02, 8.0, -5.0, 0.04, 0.02, -0.01, 0.03, 0.05, -0.04, 0.03, 0.004, 0.0])
 
 
 @cache
@@ -38,8 +38,8 @@ def window_and_calibration() -> tuple[Window, Calibration]:
     """A window of noisy measurements, and a calibration that is off: no residual is zero."""
     sequence = recorded(FLIGHT, 0)
     (window,) = _windows(sequence, Evidence(sequence).camera_motion, np.zeros(3))
-    step = np.concatenate([OFF, [0.01, -0.02, 0.03, 0.1, -0.2, 0.3]])
-    return window, Calibration(sequence.rig, 0.0, np.zeros(6)).moved(step)
+    step = np.concatenate([OFF[:12], [0.007, 0.01, -0.02, 0.03, 0.1, -0.2, 0.3]])
+    return window._replace(later=0.5), Calibration(sequence.rig, 0.0, np.zeros(6)).moved(step)
 
 
 def difference(residual: Callable[[float], Array], step: float = 1e-6) -> Array:
@@ -47,7 +47,7 @@ def difference(residual: Callable[[float], Array], step: float = 1e-6) -> Array:
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
-@pytest.mark.parametrize("unknown", range(12))
+@pytest.mark.parametrize("unknown", range(13))
 def test_sightings_change_with_the_calibration_as_their_jacobian_says(unknown: int) -> None:
     window, calibration = window_and_calibration()
     one = np.eye(COMMON)[unknown]
@@ -58,7 +58,7 @@ def test_sightings_change_with_the_calibration_as_their_jacobian_says(unknown: i
 @pytest.mark.parametrize("unknown", range(6))
 def test_sightings_change_with_the_pose_and_the_point_as_their_jacobians_say(unknown: int) -> None:
     window, calibration = window_and_calibration()
-    calibration = calibration._replace(late_s=0.0)  # the Jacobians leave out what its milliseconds change
+    calibration = calibration._replace(late_s=0.0, change_s=0.0)  # the Jacobians leave out what its milliseconds change
     here, none = predicted(window, calibration), np.zeros_like(window.points)
 
     def posed(step: float) -> Array:
@@ -86,7 +86,7 @@ def test_what_strides_lack_changes_as_their_jacobian_says(unknown: int) -> None:
         elif unknown < 21:
             own[-3 + unknown - 18] = step
         else:
-            common[12 + unknown - 21] = step
+            common[13 + unknown - 21] = step
         after = window.moved(own, np.zeros_like(window.points))
         return -stride_equations(after, calibration.moved(common))[0][key]
 
@@ -103,7 +103,7 @@ def test_the_calibration_of_exact_measurements_is_found() -> None:
     expected[5:8] = so3_exp(OFF[5:8]) @ expected[5:8]  # about the axes of the camera that is turned
     expected[11] = OFF[11]
     # Within a third of what noise of a pixel leaves; late by milliseconds counts to first order alone.
-    np.testing.assert_array_less(np.abs(found.value[:12] - expected), 0.34 * found.error[:12] + 1e-4)
+    np.testing.assert_array_less(np.abs(found.value[:13] - expected), 0.34 * found.error[:13] + 1e-4)
 
 
 @pytest.mark.parametrize("scenario", [FLIGHT, FLIGHT_REALISTIC, DRIVE_IMU], ids=lambda scenario: scenario.name)
@@ -121,9 +121,16 @@ def test_windows_that_want_different_calibrations_widen_the_error() -> None:
     assert fitted(jumped).error[2] > 4.0 * fitted(sound).error[2]
 
 
+def test_one_window_says_nothing_of_a_change_of_the_clock() -> None:
+    found = fitted(recorded(FLIGHT, 0))
+    assert found.windows == 1
+    assert found.value[CHANGE] == pytest.approx(0.0, abs=1e-9)
+    assert found.error[CHANGE] == pytest.approx(OFF_BY[CHANGE], rel=1e-3)
+
+
 def sure(unknown: int, value: float) -> SelfCalibration:
     """A calibration that differs from the given one in one thing, and is known well."""
-    return SelfCalibration(value * np.eye(COMMON)[unknown], 1e-12 * np.eye(COMMON))
+    return SelfCalibration(value * np.eye(COMMON)[unknown], 1e-12 * np.eye(COMMON), 1)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +155,7 @@ def test_what_is_found_counts_beyond_what_sound_recordings_have(unknown: int, li
 def test_what_is_found_counts_beyond_four_standard_errors() -> None:
     rig = recorded(FLIGHT, 0).rig
     for sigmas, told in ((3.9, 0), (4.1, 1)):
-        found = SelfCalibration((2.0 + sigmas) * np.eye(COMMON)[2], np.eye(COMMON))
+        found = SelfCalibration((2.0 + sigmas) * np.eye(COMMON)[2], np.eye(COMMON), 1)
         assert len(wrong(found, rig)) == told
 
 
@@ -158,13 +165,13 @@ def test_a_translation_is_named_by_the_slip_that_explains_it() -> None:
     apart = replace(rig, T_imu_cam=se3(rig.T_imu_cam[:3, :3], 5.0 * given))
     value = np.zeros(COMMON)
     value[8:11] = -10.0 * given
-    (told,) = wrong(SelfCalibration(value, cov), apart)
+    (told,) = wrong(SelfCalibration(value, cov, 1), apart)
     assert "as if its sign were changed" in told.said
     value[8:11] = -apart.T_imu_cam[:3, :3].T @ (5.0 * given) - 5.0 * given
-    (told,) = wrong(SelfCalibration(value, cov), apart)
+    (told,) = wrong(SelfCalibration(value, cov, 1), apart)
     assert "as if it were that of the inverse" in told.said
     value[8:11] = -5.0 * given
-    (told,) = wrong(SelfCalibration(value, cov), apart)
+    (told,) = wrong(SelfCalibration(value, cov, 1), apart)
     assert "as if" not in told.said
 
 

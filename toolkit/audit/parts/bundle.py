@@ -1,7 +1,7 @@
 """One window of an adjustment of key frames and points beside an IMU, with the calibration unknown, linearised.
 
 Unknowns are the states of the key frames (9 each: turn on the right, position, velocity in the axes of the first), the
-gravity of the window (3), and the calibration that all windows share (18). Points are eliminated track by track, states
+gravity of the window (3), and the calibration that all windows share (19). Points are eliminated track by track, states
 and gravity after that, so that a window says what it knows of the calibration alone.
 Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
 al. (2017), as in `strides`.
@@ -17,11 +17,12 @@ from toolkit.geometry import Array, IntArray, se3, skew, so3_exp, so3_log
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
-STATE, GRAVITY, COMMON = 9, 3, 18
+STATE, GRAVITY, COMMON = 9, 3, 19
 # Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
-# in its own axes (rad), its position in the IMU (m), how late its stamps are (s); the biases of gyro and accelerometer.
-FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11
-GYRO_BIAS, _BIASES = slice(12, 15), slice(12, 18)
+# in its own axes (rad), its position in the IMU (m), how much later than its stamps it saw (s), and by how much more so
+# in the second half of the recording than in the first (s); the biases of gyro and accelerometer.
+FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE, CHANGE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11, 12
+GYRO_BIAS, _CAMERA, _BIASES = slice(13, 16), 13, slice(13, 19)
 CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
 LEAST_DEPTH_M = 0.1
 # Information that holds the first pose, and ridges far below any sighting's.
@@ -29,14 +30,18 @@ _GAUGE, _RIDGE = 1e10, 1e-9
 
 
 class Calibration(NamedTuple):
-    """What all windows share: the rig, how much later than its stamps the camera saw (s), the biases (6,)."""
+    """What all windows share: the rig, how much later than its stamps the camera saw (s), the biases (6,).
+
+    ``change_s`` is by how much later in the second half of the recording than in the first.
+    """
 
     rig: StereoRig
     late_s: float
     bias: Array
+    change_s: float = 0.0
 
     def moved(self, step: Array) -> "Calibration":
-        """Return the calibration after a step (18,) of the unknowns."""
+        """Return the calibration after a step (19,) of the unknowns."""
         rig, scale = self.rig, np.exp(step[[0, 1, BASELINE]])
         R_imu_cam = rig.T_imu_cam[:3, :3] @ so3_exp(step[TURN])
         after = replace(
@@ -48,7 +53,8 @@ class Calibration(NamedTuple):
             baseline_m=float(rig.baseline_m * scale[2]),
             T_imu_cam=se3(R_imu_cam, rig.T_imu_cam[:3, 3] + step[LEVER]),
         )
-        return Calibration(after, self.late_s + float(step[LATE]), self.bias + step[_BIASES])
+        late_s, change_s = self.late_s + float(step[LATE]), self.change_s + float(step[CHANGE])
+        return Calibration(after, late_s, self.bias + step[_BIASES], change_s)
 
 
 class Window(NamedTuple):
@@ -56,7 +62,8 @@ class Window(NamedTuple):
 
     Attitudes (n, 3, 3), positions, velocities and, in the IMU's own axes, rates of rotation (n, 3); gravity (3,), the
     motion from key frame to key frame, and points (T, 3). N sightings (N, 3) px are sorted by track, with the key frame
-    (N,) and the track (N,) of each.
+    (N,) and the track (N,) of each. ``later`` is the share of the
+    window that lies in the second half of the recording, less a half.
     """
 
     R_first_imu: Array
@@ -64,6 +71,7 @@ class Window(NamedTuple):
     velocity: Array
     w_radps: Array
     gravity: Array
+    later: float
     strides: Strides
     key: IntArray
     track: IntArray
@@ -95,7 +103,7 @@ class Noise(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """What a window says of the calibration: information (18, 18), and gradients (B, 18) of parts that err alone.
+    """What a window says of the calibration: information (19, 19), and gradients (B, 19) of parts that err alone.
 
     The parts are the tracks, whose own errors may be correlated, and the strides of a second. ``back`` takes a step of
     the calibration to the window's own.
@@ -122,7 +130,7 @@ class _Back(NamedTuple):
 
 
 def moved(window: Window, reduced: Reduced, step: Array) -> Window:
-    """Return the window after a step (18,) of the calibration, and its own that belongs to it."""
+    """Return the window after a step (19,) of the calibration, and its own that belongs to it."""
     return window.moved(*reduced.back.steps(step))
 
 
@@ -160,7 +168,7 @@ class _Tracks(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Predicted sightings (N, 3) px and their Jacobians by the pose (N, 3, 6), the camera (N, 3, 12), the point."""
+    """Predicted sightings (N, 3) px and their Jacobians by the pose (N, 3, 6), the camera (N, 3, 13), the point."""
 
     uv_px: Array
     d_pose: Array
@@ -180,7 +188,9 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
     turn_of_q = skew(q)
     later = _applied(turn_of_q, window.w_radps[key] - calibration.bias[:3])
     later -= _applied(R_imu_first, window.velocity[key])
-    q_cam = (q + calibration.late_s * later - rig.T_imu_cam[:3, 3]) @ R_cam_imu.T
+    q_cam = (
+        q + (calibration.late_s + window.later * calibration.change_s) * later - rig.T_imu_cam[:3, 3]
+    ) @ R_cam_imu.T
     q_cam[:, 2] = np.maximum(q_cam[:, 2], LEAST_DEPTH_M)
     uv_px, d_cam = project(q_cam, rig), projection_jacobian(q_cam, rig)
     d_imu = d_cam @ R_cam_imu
@@ -190,7 +200,8 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
     d_intrinsics[:, :2, 2] = d_intrinsics[:, 2, 3] = 1.0
     d_intrinsics[:, 1, 4] = -rig.fx_px * rig.baseline_m / q_cam[:, 2]
     d_pose = np.concatenate([d_imu @ turn_of_q, -d_point], axis=2)
-    d_camera = np.concatenate([d_intrinsics, d_cam @ skew(q_cam), -d_imu, d_imu @ later[:, :, None]], axis=2)
+    clock = later[:, :, None] * np.array([1.0, window.later])
+    d_camera = np.concatenate([d_intrinsics, d_cam @ skew(q_cam), -d_imu, d_imu @ clock], axis=2)
     return Predicted(uv_px, d_pose, d_camera, d_point)
 
 
@@ -207,11 +218,11 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     weight = _weighted(window.uv_px - seen.uv_px, calibration.rig)
     residual, d_point = _applied(weight, window.uv_px - seen.uv_px), weight @ seen.d_point
     n, points, own = len(window.position), len(window.points), window.unknowns
-    first, camera = np.searchsorted(track, np.arange(points)), slice(own, own + 12)
+    first, camera = np.searchsorted(track, np.arange(points)), slice(own, own + _CAMERA)
     d_both = weight @ np.concatenate([seen.d_pose, seen.d_camera], axis=2)
     information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((points, own + COMMON))
     for k in range(n):
-        rows, pose = d_both[key == k].reshape(-1, 18), slice(STATE * k, STATE * k + 6)
+        rows, pose = d_both[key == k].reshape(-1, 6 + _CAMERA), slice(STATE * k, STATE * k + 6)
         squared = rows.T @ rows
         information[pose, pose], information[pose, camera] = squared[:6, :6], squared[:6, 6:]
         information[camera, pose] = squared[6:, :6]

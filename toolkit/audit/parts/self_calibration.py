@@ -22,43 +22,47 @@ from toolkit.models.stereo import disparity_px, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, is_left_only
 
-# Key frames are so far apart, in windows so long; of longer recordings so many windows are taken, spread evenly.
+# Key frames are so far apart, in windows about so long: one, or an even number, of which none has a clock that is set
+# halfway within. Of longer recordings so many windows are taken, spread evenly.
 STRIDE_S, WINDOW_S, MOST_WINDOWS, FEWEST_KEYS = 0.2, 4.0, 6, 4
 # Tracks that are used: the longest of those seen in so many key frames.
 FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, MOST_TRACKS, FEWEST_TRACKS = 3, 2.0, 200, 20
 MOST_ITERATIONS = 10
 # Settled is what changes by less than this share of its standard errors.
 SETTLED = 0.4
-# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, rad/s, m/s^2. What is beyond
+# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2. What is beyond
 # them is no solution.
-OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 3, 3])
+OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 1, 3, 3])
 # What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
 # ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
 GYRO_ERROR = 0.1
 
 
 class SelfCalibration(NamedTuple):
-    """What has to be added to the calibration's unknowns, or what its biases are (18,), and the covariance.
+    """What has to be added to the calibration's unknowns, or what its biases are (19,), and the covariance.
 
-    `bundle` has their order.
+    `bundle` has their order. They rest on so many ``windows``; one says nothing of a change of the clock.
     """
 
     value: Array
     cov: Array
+    windows: int
 
     @property
     def error(self) -> Array:
-        """The standard errors (18,)."""
+        """The standard errors (19,)."""
         return np.sqrt(np.diag(self.cov))
 
 
-def self_calibration(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> SelfCalibration | None:
+def self_calibration(
+    sequence: Sequence, camera: CameraMotion, intervals: Intervals, fewest_windows: int = 1
+) -> SelfCalibration | None:
     """Find the calibration of an IMU's recording.
 
     None where no window has the tracks for it, or where none near the one that is given fits.
     """
     w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
-    windows = _windows(sequence, camera, w_bias)
+    windows = _windows(sequence, camera, w_bias, fewest_windows)
     if not windows:
         return None
     try:
@@ -69,11 +73,11 @@ def self_calibration(sequence: Sequence, camera: CameraMotion, intervals: Interv
     if not settled or (np.abs(value) > OFF_BY).any():
         return None
     value[GYRO_BIAS] += w_bias
-    return SelfCalibration(value, cov)
+    return SelfCalibration(value, cov, len(windows))
 
 
 def _adjusted(windows: list[Window], calibration: Calibration, noise: Noise) -> tuple[Array, bool, list[Reduced]]:
-    """Return the calibration's change (18,) by Gauss-Newton, whether it settled, and what it rests on."""
+    """Return the calibration's change (19,) by Gauss-Newton, whether it settled, and what it rests on."""
     value = np.zeros(COMMON)
     for _ in range(MOST_ITERATIONS):
         all_reduced = [reduce(window, calibration, noise) for window in windows]
@@ -95,7 +99,7 @@ def _noise(sequence: Sequence) -> Noise:
 
 
 def _step(all_reduced: list[Reduced], value: Array) -> Array:
-    """Return the step (18,) of the calibration that all windows want together, and the prior about zero."""
+    """Return the step (19,) of the calibration that all windows want together, and the prior about zero."""
     gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / OFF_BY**2
     return np.asarray(np.linalg.solve(_information(all_reduced), gradient))
 
@@ -105,7 +109,7 @@ def _information(all_reduced: list[Reduced]) -> Array:
 
 
 def _cov(all_reduced: list[Reduced]) -> Array:
-    """Return the covariance (18, 18), robust to errors that stay the same along a track, for a second or in a window.
+    """Return the covariance (19, 19), robust to errors that stay the same along a track, for a second or in a window.
 
     Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich. It is no
     less than that of errors that are all independent, for few parts can look too calm; and windows, of which there are
@@ -124,12 +128,13 @@ def _cov(all_reduced: list[Reduced]) -> Array:
     return np.asarray(cov + np.diag(np.where(beyond, np.maximum(scatter - np.diag(cov), 0.0), 0.0)))
 
 
-def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array) -> list[Window]:
+def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[Window]:
     """Return the windows whose camera motion is known and that have tracks enough."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     stride = max(1, round(STRIDE_S / step_s))
     keys = np.arange(0, sequence.frame_count, stride)
-    count = max(1, round(sequence.duration_s / WINDOW_S))
+    whole = round(sequence.duration_s / WINDOW_S)
+    count = max(fewest, whole - whole % 2, 1)
     edges = np.linspace(0, keys.size - 1, count + 1).round().astype(int)
     chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).round().astype(int)).tolist()
     spans = [keys[edges[k] : edges[k + 1] + 1] for k in chosen]
@@ -153,8 +158,10 @@ def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: A
     points = transform(T_first_cam[key[nearest]], triangulate(uv_px[nearest], sequence.rig))
     velocity, gravity = _velocities(T_first_imu, strides)
     w_radps = _rates(sequence, keys) - w_bias
-    position = T_first_imu[:, :3, 3]
-    return Window(T_first_imu[:, :3, :3], position, velocity, w_radps, gravity, strides, key, track, uv_px, points)
+    position, later = T_first_imu[:, :3, 3], float(np.mean(keys[1:] > sequence.frame_count // 2)) - 0.5
+    return Window(
+        T_first_imu[:, :3, :3], position, velocity, w_radps, gravity, later, strides, key, track, uv_px, points
+    )
 
 
 def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
