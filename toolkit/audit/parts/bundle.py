@@ -62,8 +62,8 @@ class Window(NamedTuple):
 
     Attitudes (n, 3, 3), positions, velocities and, in the IMU's own axes, rates of rotation (n, 3); gravity (3,), the
     motion from key frame to key frame, and points (T, 3). N sightings (N, 3) px are sorted by track, with the key frame
-    (N,) and the track (N,) of each. ``later`` is the share of the
-    window that lies in the second half of the recording, less a half.
+    (N,) and the track (N,) of each. ``later`` is the share of the window that lies in the second half of the recording,
+    less a half.
     """
 
     R_first_imu: Array
@@ -188,9 +188,8 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
     turn_of_q = skew(q)
     later = _applied(turn_of_q, window.w_radps[key] - calibration.bias[:3])
     later -= _applied(R_imu_first, window.velocity[key])
-    q_cam = (
-        q + (calibration.late_s + window.later * calibration.change_s) * later - rig.T_imu_cam[:3, 3]
-    ) @ R_cam_imu.T
+    late_s = calibration.late_s + window.later * calibration.change_s
+    q_cam = (q + late_s * later - rig.T_imu_cam[:3, 3]) @ R_cam_imu.T
     q_cam[:, 2] = np.maximum(q_cam[:, 2], LEAST_DEPTH_M)
     uv_px, d_cam = project(q_cam, rig), projection_jacobian(q_cam, rig)
     d_imu = d_cam @ R_cam_imu

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.intervals import STEP_S, interval_means
+from toolkit.audit.parts.intervals import interval_means, subdivided
 from toolkit.geometry import Array, IntArray, so3_exp, so3_log
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -44,10 +44,8 @@ class Strides(NamedTuple):
 
 def strides_between(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> Strides:
     """Integrate an IMU's samples, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
-    count = len(t_ns) - 1
-    parts = max(1, int(np.ceil(np.median(np.diff(t_ns)) / NS_PER_S / STEP_S)))
-    since_ns = np.interp(np.arange(count * parts + 1), np.arange(count + 1) * parts, t_ns - t_ns[0])
-    part_t_ns = t_ns[0] + since_ns.round().astype(np.int64)
+    part_t_ns, frame_at = subdivided(t_ns)
+    count, parts = len(t_ns) - 1, int(frame_at[1])
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, part_t_ns).reshape(count, parts, 6)
     h_s = (np.diff(part_t_ns) / NS_PER_S).reshape(count, parts, 1)
     gyro_first = np.eye(6)[[3, 4, 5, 0, 1, 2]]
