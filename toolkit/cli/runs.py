@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from toolkit.report.differences import Differences
     from toolkit.report.export import BundleRecord
 
-_NAME = "report.html"
+_PAGE = "report.html"
 # Repeated from toolkit.datasets.trajectories.FORMATS (a test compares them), which would cost the help half a second.
 FORMATS = ("tum", "kitti", "euroc", "openvins")
 _MOST_PACKAGES = 12
@@ -28,7 +28,7 @@ def _report_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"the page (default: {_NAME} in the run directory; ./{_NAME} for several)",
+        help=f"the page (default: {_PAGE} in the run directory; ./{_PAGE} for several)",
     )
 
 
@@ -48,7 +48,7 @@ def report(options: argparse.Namespace) -> int:
 
     target = options.out
     if target is None:
-        target = options.runs[0] / _NAME if len(options.runs) == 1 else Path(_NAME)
+        target = options.runs[0] / _PAGE if len(options.runs) == 1 else Path(_PAGE)
     write_html(options.runs, target)
     print(printable(f"report: {target}"))
     return 0
