@@ -185,17 +185,18 @@ def test_a_malformed_line_is_named(tmp_path: Path, rows: Array, message: str, as
         (b"\xff\xfe\x00\x80", "not a text file"),
     ],
 )
-def test_a_file_that_is_no_tum_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+def test_a_file_that_is_no_tum_file_is_refused(
+    tmp_path: Path, content: bytes, message: str, assert_refused: Refused
+) -> None:
     path = tmp_path / "truth.tum"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=message):
-        load_truth(path)
+    assert_refused(lambda: load_truth(path), path, message)
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent.tum", tmp_path):
-        with pytest.raises(DataError, match="cannot be read"):
-            load_truth(path)
+@pytest.mark.parametrize("name", ["absent.tum", ""], ids=["a missing file", "a folder"])
+def test_what_cannot_be_read_is_refused(tmp_path: Path, name: str, assert_refused: Refused) -> None:
+    path = tmp_path / name
+    assert_refused(lambda: load_truth(path), path, "cannot be read")
 
 
 @pytest.mark.parametrize(

@@ -179,31 +179,14 @@ def with_track_errors(scenario: Scenario, noise: TrackNoise, seed: int) -> Seque
     return replace(sequence, observations=observations, rig=replace(sequence.rig, track_noise=noise))
 
 
-def batch_of(scenario: Scenario, sequence: Sequence, seed: int) -> BatchAtTruth:
-    """Return the batch at the truth of a recording :func:`with_track_errors` made, of all its tracks."""
-    exact = recorded(scenario, 0.0, seed)
-    return BatchAtTruth(replace(exact, sequence=sequence), exact.track_ids)
-
-
-def error_at(sequence: Sequence, estimate: Estimate) -> Array:
-    """Return the error (d,) of an estimate at a frame of a sequence, in the order of its covariance."""
-    none = np.empty(0, dtype=np.int64)
-    return Recording(sequence, none, np.empty((0, 3))).error_of(
-        estimate, int(np.searchsorted(sequence.frames_t_ns, estimate.t_ns))
-    )
-
-
 @pytest.fixture(scope="session")
 def oracle() -> SimpleNamespace:
     """Return the tools of this file: what is not a fixture cannot be imported from here."""
     return SimpleNamespace(
         recorded=recorded,
         batch=BatchAtTruth,
-        first_belief=first_belief,
         assert_covariances_agree=assert_covariances_agree,
         with_track_errors=with_track_errors,
-        batch_of=batch_of,
-        error_at=error_at,
     )
 
 

@@ -69,12 +69,14 @@ def test_what_leaves_the_window_is_neither_counted_twice_nor_forgotten(scenario,
     What has left stays linearised where it was, and the chain forgets (0.02 / 0.9)^2 of an offset at every step.
     """
     sequence = oracle.with_track_errors(scenario, NOISE, 5)
-    best, cov = oracle.batch_of(scenario, sequence, 5).state(sequence.frame_count - 1)
+    last = sequence.frame_count - 1
+    truth = replace(oracle.recorded(scenario, 0.0, 5), sequence=sequence)
+    best, cov = oracle.batch(truth, truth.track_ids).state(last)
     for seen, efficient in ((sequence, True), (replace(sequence, rig=replace(sequence.rig, track_noise=None)), False)):
         estimator = FixedLag(setup_of(seen), 0.3)
         newest = [estimator.step(packet) for packet in seen.packets()][-1]
         claimed = np.trace(np.linalg.solve(cov, newest.cov)) / len(cov)
-        beyond = oracle.error_at(sequence, newest) - best
+        beyond = truth.error_of(newest, last) - best
         excess = beyond @ np.linalg.solve(cov, beyond) / len(cov)
         assert ((abs(claimed - 1.0) < 0.03) and excess < 0.05) == efficient, (claimed, excess)
 

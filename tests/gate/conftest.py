@@ -97,7 +97,6 @@ def gate() -> SimpleNamespace:
         as_measured=as_measured,
         another=as_another_trajectory,
         edited=edited,
-        estimators=ESTIMATORS,
         judged=judged,
         planted=planted,
         seeds=SEEDS,

@@ -10,17 +10,7 @@ from toolkit.datasets import simulated
 from toolkit.geometry import Array, se3_inverse, se3_log
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import check_runnable
-from toolkit.simulation import (
-    DRIVE,
-    DRIVE_IMU,
-    DRIVE_REALISTIC,
-    FLIGHT,
-    FLIGHT_REALISTIC,
-    SCENARIOS,
-    Scenario,
-    noise_free,
-    simulate,
-)
+from toolkit.simulation import DRIVE, DRIVE_IMU, DRIVE_REALISTIC, FLIGHT, SCENARIOS, Scenario, noise_free, simulate
 from toolkit.track_noise import CHANNELS
 
 every_scenario = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
@@ -159,7 +149,9 @@ def test_the_built_in_recordings_have_names_and_take_a_seed() -> None:
         assert "seed 3" in sequence.provenance.source
 
 
-@pytest.mark.parametrize("scenario", [DRIVE_REALISTIC, FLIGHT_REALISTIC], ids=lambda scenario: scenario.name)
+@pytest.mark.parametrize(
+    "scenario", [s for s in SCENARIOS.values() if s.track_noise is not None], ids=lambda scenario: scenario.name
+)
 def test_errors_of_realistic_tracks_are_those_stated(scenario: Scenario) -> None:
     short = replace(scenario, duration_s=8.0, slip_share=0.0)
     exact, noisy = (simulate(each, 3).observations for each in (noise_free(short), short))
