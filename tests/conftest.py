@@ -1,6 +1,8 @@
 """What tests of several packages share: the way to the real recordings, and one line that runs an estimator."""
 
+import fcntl
 import gc
+import json
 import os
 import re
 import signal
@@ -11,6 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -104,6 +107,28 @@ def real() -> Callable[[str], Path]:
         return path
 
     return find_recording
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[], Any]], Any]:
+    """Return a function that makes something by its name, or reads what another worker of these tests has made.
+
+    It is kept as JSON in the directory of this session; who comes while it is made waits.
+    """
+    own = tmp_path_factory.getbasetemp()
+    folder = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+
+    def read_or_make(name: str, make: Callable[[], Any]) -> Any:
+        with (folder / f"{name}.json").open("a+", encoding="utf-8") as kept:
+            fcntl.flock(kept, fcntl.LOCK_EX)
+            kept.seek(0)
+            if text := kept.read():
+                return json.loads(text)
+            made = make()
+            json.dump(made, kept)
+            return made
+
+    return read_or_make
 
 
 @pytest.fixture(scope="session")

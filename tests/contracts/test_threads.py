@@ -3,6 +3,8 @@
 The number of threads is settled when the numeric libraries are loaded, so each number has a process of its own.
 """
 
+from collections.abc import Callable
+
 import pytest
 
 from toolkit.estimator import discover
@@ -10,8 +12,8 @@ from toolkit.verify.threads import UNAVAILABLE, digests_at
 
 
 @pytest.fixture(scope="module")
-def digests() -> list[dict[str, str]]:
-    return [digests_at(threads, tuple(discover())) for threads in (1, 2)]
+def digests(made_once: Callable[[str, Callable[[], list[dict[str, str]]]], list[dict[str, str]]]):
+    return made_once("digests", lambda: [digests_at(threads, tuple(discover())) for threads in (1, 2)])
 
 
 @pytest.mark.parametrize("scenario", ["drive", "flight"])
