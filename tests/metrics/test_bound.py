@@ -20,7 +20,7 @@ SHORT = {
 KEYS = [metric.key for metric in metrics_called(["bound"])]
 
 
-@pytest.fixture(params=SHORT)
+@pytest.fixture(scope="module", params=SHORT)
 def sequence(request):
     return simulate(SHORT[request.param], 3)
 
