@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import msgspec
@@ -91,6 +92,7 @@ def _recording(sequence: Sequence) -> Recording:
     )
 
 
+@cache
 def _git_revision() -> str | None:
     """Return the commit the toolkit is checked out at, ``-dirty`` where it was edited, or None.
 
