@@ -20,6 +20,22 @@ NOTEBOOKS = ROOT / "notebooks"
 SOURCES = sorted(NOTEBOOKS.glob("[0-9][0-9]_*.py"))
 MOST_BYTES = 300_000
 
+# Notebooks compare a recording several times, and each time it is loaded and audited anew: here that is done once.
+AUDITED_ONCE = """
+def audited_once():
+    from dataclasses import replace
+    from functools import cache
+    from toolkit.experiment import recording
+    from toolkit.settings import DEFAULTS
+
+    # All that neither loading nor auditing looks at is left at its default.
+    unread = {"start": "measurements", "noise": DEFAULTS.noise, "tracks": DEFAULTS.tracks, "card": False}
+    audited = cache(recording.audited_recording)
+    recording.audited_recording = lambda asked, progress=None: audited(replace(asked, **unread))
+
+audited_once()
+"""
+
 each = pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
 
 
@@ -103,8 +119,14 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
     variables = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "VISLAM_DATA": str(tmp_path_factory.mktemp("no"))}
     with _one_processor():
         manager.start_kernel(cwd=str(NOTEBOOKS), env={**os.environ, **variables})
+    run(AUDITED_ONCE, manager)
     yield manager
     manager.shutdown_kernel(now=True)
+
+
+def run(cell: str, kernel: KernelManager) -> None:
+    """Run a cell in a kernel; raises nbclient's CellExecutionError where it fails."""
+    NotebookClient(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell)]), km=kernel).execute()
 
 
 @contextmanager
@@ -124,8 +146,7 @@ def _one_processor() -> Iterator[None]:
 
 @each
 def test_it_runs_where_no_real_recording_is(source: Path, execution: ModuleType, kernel: KernelManager) -> None:
-    forget = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("%reset -f")])
-    NotebookClient(forget, km=kernel).execute()
+    run("%reset -f", kernel)
     executed = execution.execute(source, kernel)  # raises where a cell fails
     said = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
     assert "the real" not in said
