@@ -6,30 +6,18 @@ Needs no ground truth, and overfitting does not lower it: the points come from t
 from toolkit.geometry import Array
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS
-from toolkit.metrics._shared.residuals import pixel_scores
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics._shared.residuals import pixel_metrics, pixel_scores
+from toolkit.metrics._shared.scores import Scores, Unavailable
 
 ORDER = 60
-METRICS = (
-    Metric(
-        "heldout_reproj_median_px",
-        "median leave-one-view-out reprojection error of the one track in ten no estimator is given (px)",
-        "px",
-        ("held-", "out"),
-        name="reproj held-out",
-        table="always",
-        over_seeds=True,
-        gate_name="held-out reprojection",
-        in_contract=True,
-    ),
-    Metric(
-        "heldout_reproj_rmse_px",
-        "RMSE of the same, each observation's error capped at 100 px (px)",
-        "px",
-        ("held-out", "RMSE"),
-        name="reproj held-out RMSE",
-        in_contract=True,
-    ),
+METRICS = pixel_metrics(
+    "heldout_reproj",
+    "leave-one-view-out reprojection error of the one track in ten no estimator is given",
+    "held-out",
+    ("held-", "out"),
+    table="always",
+    over_seeds=True,
+    gate_name="held-out reprojection",
 )
 
 

@@ -5,27 +5,13 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
 from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.residuals import pixel_scores, reprojection_errors_px
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics._shared.residuals import pixel_metrics, pixel_scores, reprojection_errors_px
+from toolkit.metrics._shared.scores import Scores, Unavailable
 from toolkit.models import stereo
 
 ORDER = 50
-METRICS = (
-    Metric(
-        "reproj_median_px",
-        "median reprojection error of the estimator's own landmarks, in-sample (px)",
-        "px",
-        ("reproj", "own"),
-        in_contract=True,
-    ),
-    Metric(
-        "reproj_rmse_px",
-        "RMSE of the same, each observation's error capped at 100 px (px)",
-        "px",
-        ("own", "RMSE"),
-        name="reproj own RMSE",
-        in_contract=True,
-    ),
+METRICS = pixel_metrics(
+    "reproj", "reprojection error of the estimator's own landmarks, in-sample", "own", ("reproj", "own")
 )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
 from toolkit.metrics._shared.association import Matched
-from toolkit.metrics._shared.scores import Scores, Unavailable
+from toolkit.metrics._shared.scores import InTable, Metric, Scores, Unavailable
 from toolkit.sequence import is_left_only
 
 # An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or
@@ -47,6 +47,36 @@ def reprojection_errors_px(uv_predicted_px: Array, uv_measured_px: Array, in_fro
     means_px2 = np.where(is_left_only(uv_measured_px), squares_px2[:, [0, 2]].mean(axis=1), squares_px2.mean(axis=1))
     errors_px = np.sqrt(means_px2)
     return np.where(in_front & (errors_px < CAP_PX), errors_px, CAP_PX)
+
+
+def pixel_metrics(
+    prefix: str,
+    error: str,
+    whose: str,
+    heading: tuple[str, str],
+    *,
+    table: InTable = "on request",
+    over_seeds: bool = False,
+    gate_name: str = "",
+) -> tuple[Metric, Metric]:
+    """Declare PREFIX_median_px and PREFIX_rmse_px of an error (N,) px, which :func:`pixel_scores` scores.
+
+    ``whose`` tells it from other reprojection errors in a word; the rest is how the median is shown (:class:`Metric`).
+    """
+    median = Metric(
+        f"{prefix}_median_px",
+        f"median {error} (px)",
+        "px",
+        heading,
+        name=f"reproj {whose}",
+        table=table,
+        over_seeds=over_seeds,
+        in_contract=True,
+        gate_name=gate_name,
+    )
+    capped = f"RMSE of the same, each observation's error capped at {CAP_PX:g} px (px)"
+    name = f"reproj {whose} RMSE"
+    return median, Metric(f"{prefix}_rmse_px", capped, "px", (whose, "RMSE"), name=name, in_contract=True)
 
 
 def pixel_scores(prefix: str, errors_px: Array, observation_count: int, why_left_out: str) -> Scores:
