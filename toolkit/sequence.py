@@ -349,6 +349,8 @@ def check_runnable(sequence: Sequence) -> None:
     samples, sightings = np.isfinite(motion.values).all(axis=1), is_measured(sequence.observations.uv_px)
     for what, sound in (("motion sample", samples), ("observation", sightings)):
         bad = np.flatnonzero(~sound)
+        if bad.size and bad.size == sound.size:
+            raise DataError(f"{name}: none of its {bad.size} {what}s is finite: look at who wrote them")
         if bad.size:
             raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]

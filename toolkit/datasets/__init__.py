@@ -9,6 +9,7 @@ Read ``course_npz`` first, then the others; parts they share are in ``io``, form
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import islice
@@ -32,6 +33,8 @@ from toolkit.settings import DEFAULTS, Frontend, Tracks
 _SHOWN = 8
 # And so many are compared with what was asked for: a folder of images has a hundred thousand.
 _COMPARED = 1000
+
+_ADDRESS = re.compile(r"\w+://")
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -252,6 +255,8 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
 
 
 def _check_readable(path: Path, source: str) -> None:
+    if not source:
+        raise DataError(f"a SEQUENCE has no name: give a path, or one of {', '.join(built_in_names())}")
     try:
         if path.is_dir():
             next(path.iterdir(), None)
@@ -267,6 +272,8 @@ def _check_readable(path: Path, source: str) -> None:
 
 def _nearest_source(path: Path, source: str) -> str:
     """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
+    if _ADDRESS.match(source):
+        return "; it is an address: download it and name the file"
     if path.parent != Path():
         if not path.parent.is_dir():
             return f"; there is no folder {path.parent}"
@@ -280,5 +287,5 @@ def _nearest_source(path: Path, source: str) -> str:
 
 
 def _some(names: list[str]) -> str:
-    shown = sorted(names)[:_SHOWN]
+    shown = sorted(names, key=lambda name: (name.startswith("."), name))[:_SHOWN]
     return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"

@@ -60,7 +60,7 @@ def load(path: Path) -> Sequence:
         sequence = _sequence(text, arrays)
     except KeyError as error:
         raise DataError(f"{text_file.parent}: {error.args[0]} is missing; save the recording again") from error
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
         raise DataError(f"{text_file.parent}: a field does not fit ({error}); save the recording again") from error
     except DataError as error:
         raise DataError(f"{text_file.parent}: {error}") from error
