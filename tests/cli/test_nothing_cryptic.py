@@ -170,3 +170,18 @@ def test_a_name_too_long_for_the_system_is_no_run_directory(
     (Path("run") / "metrics.json").write_text("{}")
     assert vislam(words[0], "n" * 300, *words[1:]) == status
     assert "is not a directory; give a run directory" in (told := one_line()) or "or name a run directory" in told
+
+
+@pytest.mark.parametrize("source", ["drive", str(RECORDING)])
+def test_topics_of_what_is_no_bag_are_not_passed_over(vislam: Vislam, one_line: OneLine, source: str) -> None:
+    words = ("compare", source, "--topics", "left=/cam0", "--estimators", "dead-reckoning", "--out", "run")
+    assert vislam(*words) == 3
+    assert "it has no topics, a bag has; leave --topics out" in one_line()
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize("source", ["drive", "kitti00", str(RECORDING)])
+def test_images_of_what_has_none_are_not_passed_over(vislam: Vislam, one_line: OneLine, source: str) -> None:
+    words = ("compare", source, "--tracks", "images", "--estimators", "dead-reckoning", "--out", "run")
+    assert vislam(*words) == 3
+    assert "has tracks and no images; leave --tracks images out" in one_line()

@@ -2,8 +2,9 @@
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
-:class:`DrawnFromASeed`, and one that has tracks made of images is :class:`HasImages`. It imports nothing heavy at its
-top, because all modules are imported to recognise a path.
+:class:`DrawnFromASeed`, one that has tracks made of images is :class:`HasImages`, one of named topics is
+:class:`HasTopics`.
+It imports nothing heavy at its top, because all modules are imported to recognise a path.
 Read ``course_npz`` first, then the others; parts they share are in ``io``, formats of trajectories in ``trajectories``.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
@@ -88,6 +89,13 @@ class HasImages(Protocol):
 
 
 @runtime_checkable
+class HasTopics(Protocol):
+    """A format whose recordings are of named topics; ``frontend.topics`` says which of them is what."""
+
+    HAS_TOPICS: bool
+
+
+@runtime_checkable
 class BuiltIns(Protocol):
     """A module whose sequences need no path: name -> maker, which takes a seed (real data ignore it)."""
 
@@ -163,9 +171,11 @@ def load_sequence(
     it, or it cannot be read.
     """
     if source in built_ins():
+        check_built_in(source, frontend)
         return built_ins()[source](seed)
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
+    _check_topics(source, reader, frontend)
     # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
     with np.errstate(all="ignore"):
         if _of_images(reader, path, frontend):
@@ -176,6 +186,19 @@ def load_sequence(
             sequence = reader.load(path)
         check_stated(sequence)
     return sequence
+
+
+def check_built_in(source: str, frontend: Frontend) -> None:
+    """Raise DataError where images or topics of a built-in sequence are asked for: it has neither."""
+    _check_topics(source, None, frontend)
+    if frontend.tracks == "images":
+        raise DataError(f"{source}: a built-in sequence has tracks and no images; leave --tracks images out")
+
+
+def _check_topics(source: str, reader: RecordingFormat | None, frontend: Frontend) -> None:
+    """Raise DataError where topics are named of what has none."""
+    if frontend.topics is not None and not isinstance(reader, HasTopics):
+        raise DataError(f"{source}: it has no topics, a bag has; leave --topics out, or compare it by itself")
 
 
 def _of_images(reader: RecordingFormat, path: Path, frontend: Frontend) -> TypeGuard[HasImages]:
@@ -196,6 +219,7 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
     reader = None if source in built_ins() else _reader_of(path, source)
     if not isinstance(reader, HasImages):
         raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
+    _check_topics(source, reader, frontend)
     return reader.images_of(path, frontend)
 
 
@@ -272,7 +296,7 @@ def _check_readable(path: Path, source: str) -> None:
 
 def _nearest_source(path: Path, source: str) -> str:
     """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
-    if _ADDRESS.match(source):
+    if _ADDRESS.match(str(source)):
         return "; it is an address: download it and name the file"
     if path.parent != Path():
         if not path.parent.is_dir():

@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.audit import Audit, Finding, audit
 from toolkit.audit.parts.subsets import keep_frames
-from toolkit.datasets import load_sequence
+from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
@@ -187,6 +187,7 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
     if isinstance(source, Sequence):
         sequence = source
     elif source in SCENARIOS:
+        check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
         if recording.duration_s is not None:
             scenario = replace(scenario, duration_s=recording.duration_s)
