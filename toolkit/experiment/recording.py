@@ -19,7 +19,7 @@ from toolkit.linear_algebra import on_one_thread
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Prior, Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, in_words
@@ -185,7 +185,9 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
         name = source.name if isinstance(source, Sequence) else source
         raise SettingsError(f"{name}: vary=world draws a simulated world ({', '.join(SCENARIOS)}); this is none")
     if isinstance(source, Sequence):
-        sequence = source
+        sequence, wrong = source, why_not_sightings(source)
+        if wrong:
+            raise DataError(f"{source.name}: {wrong}; mend the sequence (Observations.sorted sorts)")
     elif source in SCENARIOS:
         check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
