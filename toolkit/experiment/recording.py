@@ -223,7 +223,22 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
         )
     provenance = sequence.provenance
     told = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
-    return replace(keep_frames(sequence, kept), provenance=told)
+    taken = replace(keep_frames(sequence, kept), provenance=told)
+    return taken if part.every == 1 else _with_truth_at_frames(taken)
+
+
+def _with_truth_at_frames(sequence: Sequence) -> Sequence:
+    """Return a sequence that lacks frames with the truth at those it has, where it has one at each of them.
+
+    Between frames so far apart an estimate would be interpolated to be scored, and err by that.
+    """
+    truth = sequence.truth
+    if truth is None or not np.isin(sequence.frames_t_ns, truth.t_ns).all():
+        return sequence
+    at = np.isin(truth.t_ns, sequence.frames_t_ns)
+    v_world, bias = (None if known is None else known[at] for known in (truth.v_world, truth.bias))
+    thinned = replace(truth, t_ns=truth.t_ns[at], T_world_imu=truth.T_world_imu[at], v_world=v_world, bias=bias)
+    return replace(sequence, truth=thinned)
 
 
 def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
