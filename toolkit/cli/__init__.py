@@ -153,7 +153,7 @@ def _unexpected(error: Exception) -> int:
     if os.environ.get(_WITH_TRACEBACK, "0") not in ("", "0"):
         traceback.print_exc()
     behind = _means_behind(error)
-    if isinstance(error, OSError) and error.errno in _NOT_WRITTEN and _is_output_lost():
+    if isinstance(error, OSError) and error.filename is None and error.errno in _NOT_WRITTEN:
         _give_up_output()
         return _ended_with(
             f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status
@@ -201,15 +201,6 @@ def _memory_limit() -> int | None:
         return None
     limit = getrlimit(RLIMIT_AS)[0]
     return None if limit == RLIM_INFINITY else limit
-
-
-def _is_output_lost() -> bool:
-    """Say whether standard output still holds what cannot be written: a failed write leaves it there."""
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError):
-        return True
-    return False
 
 
 def _interrupted() -> int:
