@@ -16,12 +16,13 @@ import toolkit
 from toolkit.api import Result
 from toolkit.audit import faults
 from toolkit.datasets import load_sequence
-from toolkit.errors import VislamError
+from toolkit.errors import DataError, VislamError
 from toolkit.estimator import LADDER, Estimator, Setup, defaults, find
-from toolkit.experiment import Comparison
+from toolkit.experiment import Comparison, Plan
 from toolkit.metrics import describe
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.table import comparison_table
+from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
 
 pytestmark = pytest.mark.usefixtures("audited_once")
@@ -237,6 +238,14 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"to_s": float("nan")}, "from 0 s to nan s"),
         ({"settings": "window"}, "settings is a str"),
         ({"estimators": []}, "nothing is to be compared"),
+        ({"estimators": [3]}, "estimators has a int, expected names"),
+        ({"estimators": 3}, "estimators has a int, expected names"),
+        ({"estimators": {"mine": find("ekf").load()}}, "functions build\\(setup\\) go by name into own"),
+        ({"own": [find("ekf").load()]}, "own is a list; give a dict, by name"),
+        ({"trajectories": "est.tum"}, "trajectories is a str; give a dict, by name"),
+        ({"max_frames": 2.5}, "max_frames is 2.5, expected a whole number"),
+        ({"source": None}, "source is a NoneType; give one recording"),
+        ({"source": ["drive", "flight"]}, "source is a list; give one recording"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_before_anything_runs(
@@ -244,7 +253,32 @@ def test_what_cannot_be_compared_is_refused_before_anything_runs(
 ) -> None:
     monkeypatch.setattr(toolkit.api, "run_plan", None)
     with pytest.raises(SettingsError, match=why):
-        toolkit.compare("drive", **{"estimators": "ekf", **asked})
+        toolkit.compare(**{"source": "drive", "estimators": "ekf", **asked})
+
+
+def test_numbers_of_numpy_are_settings_like_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans: list[Plan] = []
+    monkeypatch.setattr(toolkit.api, "run_plan", lambda plan, *_: plans.append(plan) or (None,))
+    toolkit.compare("drive", "ekf", seeds=np.int64(2), settings={"window": {"lag_s": np.float64(3.0)}})
+    assert (plans[0].settings.seeds, plans[0].settings.window.lag_s) == (2, 3.0)
+
+
+def _with(**columns: np.ndarray) -> Sequence:
+    drive = load_sequence(str(RECORDING)).truncated(FRAMES)
+    return replace(drive, observations=replace(drive.observations, **columns))
+
+
+def test_a_sequence_whose_observations_are_not_of_its_frames_is_refused() -> None:
+    seen = _with().observations
+    for columns, why in (
+        ({"uv_px": seen.uv_px[:-1]}, "the observations' columns differ in length"),
+        ({"frame": seen.frame[::-1]}, "the observations are not sorted by frame"),
+        ({"frame": seen.frame + FRAMES}, f"observation 0 is of frame {FRAMES}, there are {FRAMES}"),
+    ):
+        with pytest.raises(DataError, match=f"drive_small: {why}"):
+            toolkit.compare(_with(**columns), "dead-reckoning", workers=1)
+    with pytest.raises(DataError, match="it has no -3 frames"):
+        _with().truncated(-3)
 
 
 def test_a_result_is_saved_as_a_run_directory(tmp_path: Path, over: Result, unrendered: None) -> None:

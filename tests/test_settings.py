@@ -20,7 +20,7 @@ def test_every_setting_is_described_with_its_default() -> None:
     assert described.keys() == keys | (values.keys() - sections.keys() - {"estimators"})
     assert all(one.meaning for one in described.values())
     meaning = described["window.lag_s"].meaning
-    assert described["window.lag_s"] == ("window.lag_s", "s", "2 with an IMU, else 0.6", "> 0, <= 3600", meaning)
+    assert described["window.lag_s"] == ("window.lag_s", "s", "2 with an IMU, else 0.6", ">= 0.001, <= 3600", meaning)
 
 
 def test_what_is_written_reads_back_as_the_same_settings() -> None:
@@ -35,11 +35,11 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
     [
         ({"window": {"lag": 3}}, "there is no setting window.lag; did you mean window.lag_s?"),
         ({"nois": {}}, "there is no setting nois; did you mean noise?"),
-        ({"window": {"lag_s": -1}}, "window.lag_s: expected number > 0"),
+        ({"window": {"lag_s": -1}}, "window.lag_s: expected number >= 0.001"),
         ({"window": {"lag_s": math.nan}}, "window.lag_s"),
         ({"window": 3}, "window: expected object, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
-        ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or null, got string"),
+        ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or none, got string"),
     ],
 )
 def test_a_wrong_setting_is_refused_in_one_line_that_names_it(given: dict[str, object], complaint: str) -> None:

@@ -10,11 +10,14 @@
     result.metrics["batch", "final"]      # every metric of one line of the table
 """
 
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from toolkit.errors import VislamError, did_you_mean
 from toolkit.estimate import Output, Run
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
 
     from toolkit.report.figures import FigureChoice, FigureFormat
 
+Named = TypeVar("Named")
 Source = str | Path | Sequence
 Names = str | Iterable[str]
 
@@ -72,14 +76,14 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     """
     unnamed = () if own else defaults()
     plan = Plan(
-        sources=(source if isinstance(source, Sequence) else str(source),),
-        estimators=unnamed if estimators is None else _names(estimators),
-        own=own or {},
+        sources=(_source(source),),
+        estimators=unnamed if estimators is None else _names("estimators", estimators),
+        own=_by_name("own", own),
         settings=_with_seeds(settings, seed, seeds),
         truth=None if truth is None else Path(truth),
-        trajectories={name: Path(file) for name, file in (trajectories or {}).items()},
-        keep=frozenset(_names(keep)),
-        max_frames=max_frames,
+        trajectories={name: Path(file) for name, file in _by_name("trajectories", trajectories).items()},
+        keep=frozenset(_names("keep", keep)),
+        max_frames=None if max_frames is None else _whole("max_frames", max_frames),
         part=Part(from_s, to_s, every),
         workers=workers,
         scheduler=scheduler,
@@ -92,11 +96,47 @@ def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds:
         raise SettingsError(f"settings is a {type(settings).__name__}; give nested values, as {{'seeds': 3}}")
     values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
     given = {"first_seed": seed, "seeds": seeds}
-    return settings_of(values | {key: value for key, value in given.items() if value is not None}, "settings")
+    return settings_of(_plain(values | {key: value for key, value in given.items() if value is not None}), "settings")
 
 
-def _names(given: Names) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested values with Python's numbers in the place of NumPy's."""
+    return {
+        key: _plain(value) if isinstance(value, Mapping) else value.item() if isinstance(value, np.generic) else value
+        for key, value in values.items()
+    }
+
+
+def _source(given: Source) -> str | Sequence:
+    if isinstance(given, str | Path | Sequence):
+        return given if isinstance(given, Sequence) else str(given)
+    raise SettingsError(f"source is a {type(given).__name__}; give one recording: a path, a built-in name, a Sequence")
+
+
+def _names(what: str, given: Names) -> tuple[str, ...]:
+    if isinstance(given, str):
+        return (given,)
+    functions = isinstance(given, Mapping) and any(map(callable, given.values()))
+    listed = isinstance(given, Iterable) and not functions
+    names: tuple[Any, ...] = tuple(given) if listed else (given,)
+    strange = [type(one).__name__ for one in names if not isinstance(one, str)]
+    if strange:
+        otherwise = "; functions build(setup) go by name into own" if what == "estimators" else ""
+        raise SettingsError(f"{what} has a {strange[0]}, expected names{otherwise}")
+    return names
+
+
+def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named]:
+    if given is None or isinstance(given, Mapping):
+        return given or {}
+    raise SettingsError(f"{what} is a {type(given).__name__}; give a dict, by name")
+
+
+def _whole(what: str, given: int) -> int:
+    try:
+        return operator.index(given)
+    except TypeError as error:
+        raise SettingsError(f"{what} is {given!r}, expected a whole number") from error
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -3,9 +3,12 @@
 A message says what is wrong, where (file, field, row) and what to do, in one line.
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import ClassVar
+
+_LONG_WORD, _SHOWN = re.compile(r"\S{300,}"), 60
 
 
 class VislamError(Exception):
@@ -32,6 +35,12 @@ class EstimatorError(VislamError):
     exit_status = 5
 
 
+class SystemLimitError(VislamError):
+    """Something the system does not give: processes, open files, room for what they share."""
+
+    exit_status = 71
+
+
 def printable(text: str) -> str:
     """Return a text as one line in which nothing acts on a terminal or splits a table.
 
@@ -40,6 +49,12 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def one_line(message: str) -> str:
+    """Return a message as one printable line; of a word longer than a file's name may be, only both ends."""
+    line = printable(" ".join(message.split()))
+    return _LONG_WORD.sub(lambda word: f"{word[0][:_SHOWN]}...{word[0][-_SHOWN:]}", line)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

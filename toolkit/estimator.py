@@ -10,7 +10,7 @@ rules below it treats otherwise than estimators do that say nothing: True where 
 """
 
 import ast
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, cast
 
@@ -163,6 +163,14 @@ def defaults() -> tuple[str, ...]:
     """Return the names of the estimators that are compared where none is named, from the lowest rung up."""
     chosen = [(entry.rung() or 0, name) for name, entry in discover().items() if entry.is_default()]
     return tuple(name for _, name in sorted(chosen))
+
+
+def check_options(settings: Settings, own: Collection[str] = ()) -> None:
+    """Raise EstimatorError where an option is set for an estimator that there is not: none found, nor one's ``own``."""
+    known = {*discover(), *own} if settings.estimators else set()
+    for name in settings.estimators:
+        if name not in known:
+            raise EstimatorError(f"an option is set for {name}, and {no_such('estimator', name, sorted(known))}")
 
 
 def find_all(names: Iterable[str]) -> dict[str, EstimatorEntry]:

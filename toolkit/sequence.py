@@ -305,6 +305,8 @@ class Sequence:
 
     def truncated(self, max_frames: int) -> Self:
         """Return the first frames of the sequence only; the motion samples stay whole."""
+        if max_frames < 0:
+            raise DataError(f"{self.name}: it has no {max_frames} frames; give the number of those to keep")
         if max_frames >= self.frame_count:
             return self
         kept = self.observations.select(self.observations.frame < max_frames)
@@ -349,11 +351,26 @@ def check_runnable(sequence: Sequence) -> None:
     samples, sightings = np.isfinite(motion.values).all(axis=1), is_measured(sequence.observations.uv_px)
     for what, sound in (("motion sample", samples), ("observation", sightings)):
         bad = np.flatnonzero(~sound)
+        if bad.size and bad.size == sound.size:
+            raise DataError(f"{name}: none of its {bad.size} {what}s is finite: look at who wrote them")
         if bad.size:
             raise DataError(f"{name}: {what} {bad[0]} is not finite ({bad.size} such rows); drop it from the recording")
     first, last = sequence.frames_t_ns[[0, -1]]
     if motion.t_ns.size == 0 or motion.t_ns[0] > first or motion.t_ns[-1] < last:
         raise DataError(f"{name}: the motion samples do not span the frames; cut the frames to the motion's time")
+
+
+def why_not_sightings(sequence: Sequence) -> str:
+    """Return what keeps the observations from being sightings of the sequence's frames; empty where nothing does."""
+    seen = sequence.observations
+    if not len(seen) == seen.track_id.size == len(seen.uv_px):
+        return "the observations' columns differ in length"
+    if (np.diff(seen.frame) < 0).any():
+        return "the observations are not sorted by frame"
+    outside = np.flatnonzero((seen.frame < 0) | (seen.frame >= sequence.frame_count))
+    if outside.size:
+        return f"observation {outside[0]} is of frame {seen.frame[outside[0]]}, there are {sequence.frame_count}"
+    return ""
 
 
 def check_stated(sequence: Sequence) -> None:

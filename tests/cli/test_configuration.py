@@ -106,6 +106,8 @@ def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam
         (("--set", "window.lag_s=soon"), "window.lag_s"),
         (("--set", "window.lag_s"), "--set takes KEY=VALUE"),
         (("--set", "window.most_states=1"), "window.most_states"),
+        (("--window", "1e-9"), "window.lag_s: expected number >= 0.001"),
+        (("--config", "sound.toml", "--set", "window.lag=3"), "sound.toml or the command line: there is no setting"),
         (("--config", "wrong.toml"), "wrong.toml: there is no setting outliers.gate; did you mean"),
         (("--config", "asked.toml"), "asked.toml: there is no compare.estimator; did you mean estimators?"),
         (("--config", "typed.toml"), "typed.toml: compare.max_frames: expected integer >= 2"),
@@ -123,6 +125,7 @@ def test_a_setting_that_does_not_exist_is_2_in_one_line_before_anything_runs(
     Path("asked.toml").write_text('[compare]\nestimator = ["ekf"]\n')
     Path("typed.toml").write_text("[compare]\nmax_frames = 1\n")
     Path("broken.toml").write_text("window = [")
+    Path("sound.toml").write_text("seeds = 1")
     Path("other.json").write_text("{}")
     assert vislam("compare", "drive", "--estimators", "dead-reckoning", *words, "--out", "run") == 2
     assert why in one_line()

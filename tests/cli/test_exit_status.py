@@ -1,6 +1,7 @@
 """Every kind of trouble has its exit status and one line on stderr, and leaves nothing half-written."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +15,8 @@ from typing import IO
 import pytest
 
 from toolkit import runner
+from toolkit.experiment import workers
+from toolkit.linear_algebra import THREAD_VARIABLES
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]
@@ -141,6 +144,54 @@ def test_an_output_on_a_full_disk_is_4_in_one_line(words: tuple[str, ...]) -> No
 def test_closed_streams_are_no_trouble() -> None:
     program = f"exec {sys.executable} -m toolkit.cli list >&- 2>&-"
     assert subprocess.run(["sh", "-c", program], check=False, timeout=PATIENCE_S).returncode == 0
+
+
+@pytest.mark.parametrize("closed", ["2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_no_trouble_to_processes_either(closed: str, tmp_path: Path) -> None:
+    words = "compare drive --estimators dead-reckoning,mapping --max-frames 4 --workers 2 --figures none --out run"
+    program = f"exec {sys.executable} -m toolkit.cli {words} {closed}"
+    assert subprocess.run(["sh", "-c", program], cwd=tmp_path, check=False, timeout=PATIENCE_S).returncode == 0
+
+
+def test_a_directory_that_is_gone_is_told(vislam: Vislam, one_line: OneLine) -> None:
+    Path("gone").mkdir()
+    os.chdir("gone")
+    Path("../gone").rmdir()
+    assert vislam(*QUICK) == 71
+    assert "the current directory is no longer there; change to another one" in one_line()
+
+
+def test_a_full_shared_memory_is_not_taken_for_a_full_output(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "_executor", _raiser(OSError(28, "No space left on device")))
+    assert vislam(*QUICK[:-1], "2", "--out", "run") == 71
+    told = one_line()
+    assert "no worker process can be started (No space left on device)" in told
+    assert "/dev/shm" in told
+    assert "--workers 1" in told
+
+
+@pytest.mark.parametrize("kilobytes", [150_000, 200_000, 260_000])
+def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once(kilobytes: int) -> None:
+    program = f"ulimit -v {kilobytes}; exec {sys.executable} -m toolkit.cli list"
+    environment = {name: value for name, value in os.environ.items() if name not in THREAD_VARIABLES}
+    how = {"capture_output": True, "text": True, "env": environment, "timeout": PATIENCE_S}
+    told = subprocess.run(["sh", "-c", program], check=False, **how)
+    assert told.returncode == 71
+    assert "MB (ulimit -v), and NumPy, SciPy and GTSAM alone take 307 MB" in told.stderr
+    assert told.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("limit", "status"), [(2**40, 71), (-1, 70)])
+def test_an_interpreter_that_fails_within_a_limit_of_memory_lacks_it(
+    vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, limit: int, status: int
+) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: (limit, -1))
+    monkeypatch.setattr(runner, "run", _raiser(SystemError("returned NULL without setting an exception")))
+    assert vislam(*QUICK, "--out", "run") == status
+    assert ("the memory does not suffice" in one_line()) == (status == 71)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])

@@ -106,6 +106,8 @@ def test_names_too_long_are_refused_before_anything_runs(
         (("check-data", "flihgt"), "did you mean flight?"),
         (("simulate", "drive_imu", "--out", "d"), "did you mean drive-imu?"),
         (("compare", "drive", "--set", "window.lag=3"), "did you mean window.lag_s?"),
+        (("compare", "drive", "--set", "estimators.ekff.gain=1"), "did you mean ekf?"),
+        (("compare", "drive", "--max", "10"), "did you mean --max-frames?"),
     ],
 )
 def test_a_misspelt_name_gets_the_nearest_one(
@@ -113,6 +115,29 @@ def test_a_misspelt_name_gets_the_nearest_one(
 ) -> None:
     assert vislam(*words) in (2, 3, 5)
     assert hint in one_line()
+
+
+@pytest.mark.parametrize(
+    ("source", "told"),
+    [
+        ("", "a SEQUENCE has no name: give a path, or one of"),
+        ("https://example.org/03.npz", "it is an address: download it and name the file"),
+    ],
+)
+def test_what_names_no_file_is_told_from_one_that_is_missing(
+    vislam: Vislam, one_line: OneLine, source: str, told: str
+) -> None:
+    assert vislam("compare", source, "--estimators", "dead-reckoning") == 3
+    assert told in one_line()
+
+
+@pytest.mark.parametrize("words", [("diff", "n" * 5000, "run"), ("compare", "drive", "--workers", "n" * 5000)])
+def test_of_a_word_of_thousands_of_letters_both_ends_are_told(
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...]
+) -> None:
+    assert vislam(*words) in (2, 3)
+    assert "nnn...nnn" in (told := one_line())
+    assert len(told) < 300
 
 
 def test_a_path_in_bytes_that_are_no_text_is_read_and_told(vislam: Vislam, capfd: pytest.CaptureFixture[str]) -> None:
@@ -145,3 +170,18 @@ def test_a_name_too_long_for_the_system_is_no_run_directory(
     (Path("run") / "metrics.json").write_text("{}")
     assert vislam(words[0], "n" * 300, *words[1:]) == status
     assert "is not a directory; give a run directory" in (told := one_line()) or "or name a run directory" in told
+
+
+@pytest.mark.parametrize("source", ["drive", str(RECORDING)])
+def test_topics_of_what_is_no_bag_are_not_passed_over(vislam: Vislam, one_line: OneLine, source: str) -> None:
+    words = ("compare", source, "--topics", "left=/cam0", "--estimators", "dead-reckoning", "--out", "run")
+    assert vislam(*words) == 3
+    assert "it has no topics, a bag has; leave --topics out" in one_line()
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize("source", ["drive", "kitti00", str(RECORDING)])
+def test_images_of_what_has_none_are_not_passed_over(vislam: Vislam, one_line: OneLine, source: str) -> None:
+    words = ("compare", source, "--tracks", "images", "--estimators", "dead-reckoning", "--out", "run")
+    assert vislam(*words) == 3
+    assert "has tracks and no images; leave --tracks images out" in one_line()

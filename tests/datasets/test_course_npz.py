@@ -195,6 +195,9 @@ MALFORMED: list[tuple[str, Callable[[Course], Any], str]] = [
     ("nanoseconds", spoil("time_stamps", 1.3e18 + 1e8 * np.arange(5)), "look like nanoseconds: divide by 1e9"),
     ("no baseline", spoil("b", np.array(0.0)), "b is 0, expected a positive"),
     ("NaN calibration", spoil("K", np.full((3, 3), np.nan)), "K is not finite"),
+    ("NaN baseline", spoil("b", np.array(np.nan)), "b is nan, expected a finite number"),
+    ("two baselines", spoil("b", np.array([0.5, 0.5])), "b has 2 values, expected one finite number"),
+    ("misspelt", lambda a: a.update(Feature=a.pop("features")), r"missing features \(rename Feature\?\)"),
     ("no rotation", spoil("imu_T_cam", 2.0 * np.eye(4)), "imu_T_cam is not a rotation"),
 ]
 

@@ -176,7 +176,7 @@ def test_a_wrong_table_is_named_with_its_column(
         (4, 1, "1.5", "line 5: track_id is 1.5, expected a whole number"),
         (6, 2, "", "line 7: uL is empty, expected a number"),
         (3, 0, "never", "line 4: t_ns is never, expected a whole number"),
-        (3, 0, "1" * 30, "line 4: t_ns is 1+, expected a whole number"),
+        (3, 0, "1" * 30, "line 4: t_ns is 1+, expected a whole number of at most 9223372036854775807"),
     ],
 )
 def test_a_wrong_cell_is_named_with_its_line(
@@ -197,6 +197,9 @@ def test_a_wrong_cell_is_named_with_its_line(
         ("baseline_m", "baseline", "there is no baseline; did you mean baseline_m"),
         ("accel_noise_density", "acc_noise_density", "there is no noise.acc_noise_density; did you mean"),
         ("fx_px = ", "fx_px = -", "fx_px is -.*, expected a positive number"),
+        ("fx_px = ", "f_px = ", "there is no f_px; did you mean fx_px"),
+        ("fx_px = ", f"fx_px = 1{400 * '0'} #", "fx_px is inf, expected a finite number"),
+        ("T_imu_cam = [[", "T_imu_cam = [[{}], [", "T_imu_cam holds text, expected real numbers"),
         ("cy_px = ", "cy_px = '", "is not TOML"),
         ("T_imu_cam = [[", "T_imu_cam = [[7.0, ", "T_imu_cam"),
         ("T_imu_cam = [[", "T_imu_cam = [[1, 2, 3, 4], [", "T_imu_cam"),
@@ -248,6 +251,11 @@ def test_a_folder_with_a_table_missing_is_told_which(tmp_path: Path) -> None:
     (folder / "imu.csv").unlink()
     with pytest.raises(DataError, match=r"missing imu\.csv or twist\.csv"):
         toolkit.load_sequence(str(folder))
+
+
+def test_a_folder_named_by_a_dot_has_its_own_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(written(recorded("imu"), tmp_path / "own"))
+    assert toolkit.load_sequence(".").name == "own"
 
 
 def test_what_is_saved_says_it_is_of_own_tables(tmp_path: Path) -> None:

@@ -223,6 +223,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "rig without baseline": (edit_text(lambda t: t["rig"].pop("baseline_m")), "baseline_m"),
     "rig is a word": (edit_text(lambda t: t.update(rig="stereo")), "does not fit"),
     "focal length is a word": (edit_text(lambda t: t["rig"].update(fx_px="wide")), "wide"),
+    "focal length beyond any": (edit_text(lambda t: t["rig"].update(fx_px=10**400)), "does not fit"),
     "focal length is null": (edit_text(lambda t: t["rig"].update(fx_px=None)), "does not fit"),
     "extrinsic is 3x3": (edit_text(lambda t: t["rig"].update(T_imu_cam=np.eye(3).tolist())), "T_imu_cam"),
     "ragged extrinsic": (edit_text(lambda t: t["rig"].update(T_imu_cam=[[1.0], [0.0, 1.0]])), "does not fit"),

@@ -157,6 +157,7 @@ def bad_text(scene, kind: str) -> str:
         "empty": "",
         "words": "hello world\n",
         "cut off": text[:-20],
+        "one pose": "\n".join([line for line in text.splitlines() if not line.startswith("#")][:1]) + "\n",
     }
     return texts[kind]
 
@@ -174,6 +175,7 @@ def bad_text(scene, kind: str) -> str:
         ("empty", "the file holds no poses"),
         ("words", "no format that is known"),
         ("cut off", "columns"),
+        ("one pose", "bad.tum: it has one pose, and errors are of two and more"),
     ],
 )
 def test_a_bad_file_is_told_in_one_line_and_beside_a_good_one_counted(scene, vislam, capsys, kind, told) -> None:

@@ -133,6 +133,22 @@ def test_the_motion_between_thinned_frames_is_whole() -> None:
         np.testing.assert_array_equal(both.v_mps, np.concatenate([one.v_mps, two.v_mps]))
 
 
+def test_the_truth_of_thinned_frames_is_at_those_that_stay_and_its_own_where_it_has_other_stamps() -> None:
+    whole = load_sequence("flight").truncated(21)
+    every = Recording(whole, part=Part(every=5))
+    thinned, truth = prepare(every).sequence, whole.truth
+    assert truth is not None
+    assert thinned.truth is not None
+    np.testing.assert_array_equal(thinned.truth.t_ns, thinned.frames_t_ns)
+    np.testing.assert_array_equal(thinned.truth.T_world_imu, truth.T_world_imu[:21:5])
+    np.testing.assert_array_equal(thinned.truth.v_world, truth.v_world[:21:5])
+    elsewhere = replace(whole, truth=replace(truth, t_ns=truth.t_ns + 2_000_000))
+    for asked in (replace(every, source=elsewhere), Recording(whole)):
+        kept = prepare(asked).sequence.truth
+        assert kept is not None
+        assert kept.t_ns.size == truth.t_ns.size
+
+
 def test_a_part_without_two_frames_is_refused_with_what_there_is() -> None:
     whole = load_sequence("drive").truncated(20)
     with pytest.raises(DataError, match=r"drive: from 5 s to the end it has 0 frame\(s\).* it has 20 in 1.9 s"):

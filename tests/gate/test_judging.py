@@ -269,6 +269,7 @@ def test_other_arithmetic_than_the_baselines_is_noted_where_both_sides_say_their
     now = with_series(compiled, "two", arithmetic="numpy")
     (told,) = (note for note in gate.judged(written, [now, recorded[1]]).notes if "NumPy" in note)
     assert told.startswith("flight: two ran compiled for the baseline and runs in NumPy here")
+    assert not gate.judged(written, [now, recorded[1]], speed=False).notes
     for before, after in ((written, compiled), (baseline, now)):
         assert not gate.judged(before, [after, recorded[1]]).notes
 

@@ -142,6 +142,8 @@ def test_another_truth_is_not_compared_with(vislam, capsys):
     assert "another truth than the baseline's" in " ".join(capsys.readouterr().out.split())
     Path("truth").rename("moved")
     assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "its truth is not at truth/lap.tum, where the baseline had it; name another place with --truth" in told
     assert failures(vislam, "--truth", "moved") == []
 
 
@@ -165,6 +167,19 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
         (("check", "--trajectories", "results", "--baseline", "spoilt.json"), 3, "bounds.ate_yaw_m is not among"),
         (("check", "--trajectories", "results", "--baseline", "truth/lap.tum"), 3, "cannot be read as JSON"),
         (("check", "--baseline", "base.json", "--truth", "truth"), 2, "--truth goes with --trajectories"),
+        (("check", "--trajectories", "results", "--baseline", "estimators.json"), 3, "leave --trajectories out"),
+        (("check", "--baseline", "base.json"), 3, "is a baseline of trajectories; check it with --trajectories DIR"),
+        (("check", "--baseline", "empty"), 3, "empty: it holds no baseline (*.json); make the baseline with"),
+        (
+            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "lop=truth/lap.tum"),
+            3,
+            "--truth names the truth of lop: no sequence is called lop (did you mean lap?)",
+        ),
+        (
+            ("check", "--trajectories", "results", "--baseline", "base.json", "--junit", "same", "--json", "./same"),
+            2,
+            "--junit and --json are files of their own",
+        ),
         (("baseline", "--trajectories", "results"), 3, "lap: no truth is given; name it with --truth"),
         (("baseline", "--trajectories", "results", "--truth", "results"), 3, "maze: results has 5 truths for it"),
         (("baseline", "drive", "--trajectories", "results"), 2, "--trajectories takes no SEQUENCE"),
@@ -176,6 +191,7 @@ def test_trouble_is_told_in_one_line(vislam, capsys, words, status, told):
     spoilt = json.loads(Path("base.json").read_text())
     spoilt["bounds"]["ate_yaw_m"] = 5.0
     Path("spoilt.json").write_text(json.dumps(spoilt))
+    Path("estimators.json").write_text('{"schema": "vislam.baseline/1"}')
     assert vislam(*words) == status
     said = capsys.readouterr().err
     assert said.count("\n") == 1

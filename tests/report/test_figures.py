@@ -117,6 +117,7 @@ def test_the_bound_is_drawn_where_it_was_asked_for(comparison_of: ComparisonOf, 
     (drawn,) = against_bound.draw(asked)
     position = drawn.figure.axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
+    assert "thin: stated" in [text.get_text() for text in drawn.figure.legends[0].get_texts()]
     # Dead reckoning knows less than the bound's measurements tell, so it errs beyond it; both begin with the prior.
     assert lines["dead-reckoning both"][-1] > position.get_ylim()[0]
     assert lines["bound causal"][0] == pytest.approx(np.sqrt(np.trace(sequence.prior.cov[3:6, 3:6])), rel=1e-6)

@@ -248,11 +248,11 @@ def test_a_directory_in_the_way_is_refused(run_directory: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("name", "text", "told"),
     [
-        ("report.json", None, "earlier version"),
+        ("report.json", None, "has no report.json: an earlier version wrote it, or that was removed; repeat it"),
         ("manifest.json", None, "missing"),
         ("metrics.json", "{", "cannot be read"),
         ("metrics.json", "{}", "has not the schema vislam.metrics/1"),
-        ("trajectories/late_final.tum", None, "late_final.tum"),
+        ("trajectories/late_final.tum", None, "late_final.tum is missing; repeat the comparison"),
         ("trajectories/late_final.tum", "1 2 3\n", "columns"),
         ("landmarks/late.csv", "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
     ],

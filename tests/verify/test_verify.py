@@ -1,6 +1,7 @@
 """``vislam verify`` names what is wrong with a newcomer's estimator, and what is right about a sound one."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -197,7 +198,10 @@ def test_a_covariance_with_units_far_apart_is_sound() -> None:
         ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported (SyntaxError"),
         ("mine.py", "import nothing_of_the_kind\n", "No module named 'nothing_of_the_kind'"),
         ("mine.py", "x = 1\n", "mine.py: it defines no function build(setup)"),
+        ("mine.py", "import sys\nsys.exit(3)\n", "mine.py: it cannot be imported (SystemExit: 3)"),
+        ("mine.py", "\0", "mine.py: it cannot be imported (SyntaxError"),
         ("ekff", None, "no estimator is called ekff (did you mean ekf?)"),
+        (".", None, "no estimator is called ."),
     ],
 )
 def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path, monkeypatch, capsys, word, text, told) -> None:
@@ -208,6 +212,13 @@ def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path, monkeypatch, capsys
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert told in said
+
+
+def test_a_pipe_is_no_estimators_file_and_is_not_waited_for(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("mine.py")
+    assert main(["verify", "mine.py"]) == 5
+    assert "mine.py: cannot be read: it is a pipe" in capsys.readouterr().err
 
 
 def test_an_answer_of_another_kind_is_named() -> None:

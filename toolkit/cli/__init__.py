@@ -2,6 +2,7 @@
 
 import errno
 import io
+import logging
 import os
 import signal
 import sys
@@ -15,7 +16,7 @@ from types import FrameType
 
 from toolkit.cli import compare, completion, evaluate, gate, parts, recordings, runs
 from toolkit.cli.arguments import Parser, ShowVersion, epilog
-from toolkit.errors import OutputError, VislamError, printable
+from toolkit.errors import OutputError, SystemLimitError, VislamError, one_line
 
 # A defect and a lack of the system's means, as sysexits.h numbers them.
 _DEFECT, _SYSTEM = 70, 71
@@ -30,6 +31,8 @@ _PATIENCE_S = 10.0
 _NOT_WRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF)
 # What the system refuses for lack of it, whatever a library makes of that: open files, memory, processes.
 _TOO_FEW = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN)
+# With one thread of OpenBLAS nothing but vislam evaluate runs within less (ulimit -v, gtsam 4.3.0, scipy 1.17, Linux).
+_LEAST_MEMORY = 300_000 * 1024
 _WITH_TRACEBACK = "VISLAM_TRACEBACK"
 # In the order of the help: what one does every day, then once in a while.
 _COMMANDS = (
@@ -83,6 +86,8 @@ def _run(given: list[str]) -> int:
     try:
         options = parser().parse_args(given)
         options.command_line = ["vislam", *given]
+        _check_current_directory()
+        _check_memory()
         status: int = options.command(options)
     except SystemExit:  # argparse leaves this way, after a help text too
         sys.stdout.flush()
@@ -92,14 +97,55 @@ def _run(given: list[str]) -> int:
     return status
 
 
+def _check_current_directory() -> None:
+    """Raise SystemLimitError where the current directory was removed: no relative path and no process can be had."""
+    try:
+        os.getcwd()  # noqa: PTH109
+    except FileNotFoundError as error:
+        raise SystemLimitError("the current directory is no longer there; change to another one") from error
+
+
+def _check_memory() -> None:
+    """Raise SystemLimitError where the memory allowed does not even hold the libraries.
+
+    OpenBLAS would end the process by itself, or wait forever and for no signal. Its threads take memory of their own:
+    where there is a limit it has one.
+    """
+    limit = _memory_limit()
+    if limit is None:
+        return
+    if limit < _LEAST_MEMORY:
+        raise SystemLimitError(
+            f"the memory is limited to {limit / 1e6:.0f} MB (ulimit -v), and NumPy, SciPy and GTSAM alone take "
+            f"{_LEAST_MEMORY / 1e6:.0f} MB of addresses; allow more"
+        )
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def _prepare_streams() -> None:
     """Have characters that the terminal's encoding lacks written as escapes, and text without a reader be lost."""
+    for number in range(3):
+        _open_where_closed(number)
+    # Lest it tell in several lines, and in every process, that there is no place for its cache of fonts.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def _open_where_closed(number: int) -> None:
+    """Have a standard stream that the caller closed lead nowhere, lest a file opened later take its number."""
+    try:
+        os.fstat(number)
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        if nowhere != number:
+            os.dup2(nowhere, number)
+            os.close(nowhere)
+        os.set_inheritable(number, True)  # a process started here has the three streams, too
 
 
 def _unexpected(error: Exception) -> int:
@@ -112,18 +158,22 @@ def _unexpected(error: Exception) -> int:
         return _ended_with(
             f"the standard output cannot be written ({error.strerror or error})", OutputError.exit_status
         )
-    if isinstance(behind, MemoryError):
-        return _ended_with("the memory does not suffice; use fewer --workers, or a part of the recording", _SYSTEM)
-    if isinstance(behind, OSError):
-        return _ended_with(f"the system refuses to go on: {behind}", _SYSTEM)
-    if isinstance(behind, ImportError):
-        what_to_do = "allow more memory, or install it again"
-        return _ended_with(f"a library cannot be loaded ({behind}); {what_to_do}", _SYSTEM)
+    if behind is not None:
+        return _ended_with(_refused(behind), _SYSTEM)
     if isinstance(error, UnicodeError):
         return _ended_with(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
     return _ended_with(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
+
+
+def _refused(behind: BaseException) -> str:
+    """Return what of the system's means is missing, and what to do."""
+    if isinstance(behind, MemoryError):
+        return "the memory does not suffice; use fewer --workers, or a part of the recording"
+    if isinstance(behind, ImportError):
+        return f"a library cannot be loaded ({behind}); allow more memory, or install it again"
+    return f"the system refuses to go on: {behind}"
 
 
 def _means_behind(error: BaseException | None) -> BaseException | None:
@@ -135,10 +185,22 @@ def _means_behind(error: BaseException | None) -> BaseException | None:
         return error
     while error is not None:
         compiled = isinstance(error, ImportError) and str(error.path).endswith(tuple(EXTENSION_SUFFIXES))
+        if isinstance(error, SystemError) and _memory_limit() is not None:
+            return MemoryError()  # the interpreter makes the one of the other
         if compiled or isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno in _TOO_FEW):
             return error
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return None
+
+
+def _memory_limit() -> int | None:
+    """Return how many bytes of addresses the caller allows, None without a limit."""
+    try:
+        from resource import RLIM_INFINITY, RLIMIT_AS, getrlimit
+    except ImportError:
+        return None
+    limit = getrlimit(RLIMIT_AS)[0]
+    return None if limit == RLIM_INFINITY else limit
 
 
 def _interrupted() -> int:
@@ -162,7 +224,7 @@ def _give_up_output() -> None:
 
 def _ended_with(message: str, status: int) -> int:
     with suppress(OSError):
-        print(f"vislam: error: {printable(' '.join(message.split()))}", file=sys.stderr)
+        print(f"vislam: error: {one_line(message)}", file=sys.stderr)
     return status
 
 

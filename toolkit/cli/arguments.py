@@ -10,7 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
-from toolkit.errors import VislamError, did_you_mean, no_such, printable
+from toolkit.errors import VislamError, did_you_mean, no_such, one_line
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -76,7 +76,9 @@ class Parser(argparse.ArgumentParser):
     def _why_left(self, word: str, given: list[str]) -> str:
         if word.startswith("-"):
             option = word.partition("=")[0]
-            return f"there is no option {option}{did_you_mean(option, self._option_string_actions)}"
+            known = list(self._option_string_actions)
+            begun = next((name for name in known if name.startswith(option)), "")
+            return f"there is no option {option}{f'; did you mean {begun}?' if begun else did_you_mean(option, known)}"
         options = [i for i in range(given.index(word)) if given[i] in self._option_string_actions]
         if not options or self._option_string_actions[given[options[-1]]].type is not names:
             return f"unexpected argument {word}"
@@ -86,7 +88,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Leave with status 2 and one line on stderr."""
-        self.exit(2, f"vislam: error: {printable(message)} (see {self.prog} --help)\n")
+        self.exit(2, f"vislam: error: {one_line(message)} (see {self.prog} --help)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         """Print a help text, and not as argparse does, which keeps a full disk to itself."""

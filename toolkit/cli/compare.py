@@ -192,8 +192,8 @@ def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None
     """
     for directory, store in stores.items():
         if store.unusable:
-            what = f"{store.unusable} outcomes of other data or another version are there and not used"
-            print(f"vislam: {printable(str(directory))}: {what}", file=sys.stderr)
+            what = f"{store.unusable} outcomes of other data, noise or repairs, or of another version"
+            print(f"vislam: {printable(str(directory))}: {what}, are there and not used", file=sys.stderr)
     try:
         yield
     except KeyboardInterrupt:
@@ -231,7 +231,9 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     from toolkit.settings import with_assignments
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
-    place = "the command line" if options.config is None else str(options.config)
+    assignments = assignments_asked(options)
+    places = ([] if options.config is None else [str(options.config)]) + (["the command line"] if assignments else [])
+    place = " or ".join(places) or "the command line"
     given = {
         "sequences": options.sequences or None,
         "estimators": options.estimators,
@@ -244,7 +246,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     }
     named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds, "vary": options.vary}
     request = {**request, **{key: value for key, value in given.items() if value is not None}}
-    settings = with_assignments(settings, assignments_asked(options))
+    settings = with_assignments(settings, assignments)
     settings |= {key: value for key, value in named.items() if value is not None}
     switches = () if options.columns == ("all",) else requests_of(options.columns)
     settings = with_assignments(settings, [f"metrics.{switch}=true" for switch in switches])

@@ -271,6 +271,8 @@ def check(options: argparse.Namespace) -> int:
     from toolkit.report.prose import width_of_output
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
+    if len({path.resolve() for path in files.values()}) < len(files):
+        raise UsageError(f"{' and '.join(f'--{name}' for name in files)} are files of their own; give each its name")
     for path in files.values():
         check_writable(path)
     checked = _check_of_estimators(options) if options.trajectories is None else _check_of_trajectories(options)
@@ -307,19 +309,23 @@ def _check_of_trajectories(options: argparse.Namespace) -> Check:
 
     if options.speed_against:
         raise UsageError("--speed-against times estimators; with --trajectories nothing runs")
-    baseline, given = load_trajectory_baseline(options.baseline), _runs_given(options.trajectories, options.truth)
+    baseline = load_trajectory_baseline(options.baseline)
+    given = _runs_given(options.trajectories, options.truth, baseline.sequences)
     return check_trajectories(baseline, str(options.baseline), given, accept_better=options.accept_better)
 
 
-def _runs_given(place: Path, truths: Iterable[str]) -> GivenRuns:
+def _runs_given(place: Path, truths: Iterable[str], known: Iterable[str] = ()) -> GivenRuns:
     """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
 
-    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none.
+    Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none, or
+    a truth of a sequence that neither the folder has nor is ``known``.
     """
     from toolkit.gate.trajectory_check import FolderOfRuns
 
     if place.is_dir() or place.suffix != ".json":
-        return FolderOfRuns(place, _truths_given(truths))
+        folder = FolderOfRuns(place, _truths_given(truths))
+        folder.truths.check_known({*folder.sequences, *known})
+        return folder
     from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
 
     if list(truths):

@@ -2,13 +2,15 @@
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
-:class:`DrawnFromASeed`, and one that has tracks made of images is :class:`HasImages`. It imports nothing heavy at its
-top, because all modules are imported to recognise a path.
+:class:`DrawnFromASeed`, one that has tracks made of images is :class:`HasImages`, one of named topics is
+:class:`HasTopics`.
+It imports nothing heavy at its top, because all modules are imported to recognise a path.
 Read ``course_npz`` first, then the others; parts they share are in ``io``, formats of trajectories in ``trajectories``.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.datasets``.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import islice
@@ -32,6 +34,8 @@ from toolkit.settings import DEFAULTS, Frontend, Tracks
 _SHOWN = 8
 # And so many are compared with what was asked for: a folder of images has a hundred thousand.
 _COMPARED = 1000
+
+_ADDRESS = re.compile(r"\w+://")
 
 ENTRY_POINT_GROUP = "toolkit.datasets"
 Maker = Callable[[int], Sequence]
@@ -82,6 +86,13 @@ class HasImages(Protocol):
 
     def images_of(self, path: Path, frontend: Frontend) -> ImageRecording:
         """Return the image pairs that tracks are made of and their cameras; raise DataError where there are none."""
+
+
+@runtime_checkable
+class HasTopics(Protocol):
+    """A format whose recordings are of named topics; ``frontend.topics`` says which of them is what."""
+
+    HAS_TOPICS: bool
 
 
 @runtime_checkable
@@ -160,9 +171,11 @@ def load_sequence(
     it, or it cannot be read.
     """
     if source in built_ins():
+        check_built_in(source, frontend)
         return built_ins()[source](seed)
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
+    _check_topics(source, reader, frontend)
     # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
     with np.errstate(all="ignore"):
         if _of_images(reader, path, frontend):
@@ -173,6 +186,19 @@ def load_sequence(
             sequence = reader.load(path)
         check_stated(sequence)
     return sequence
+
+
+def check_built_in(source: str, frontend: Frontend) -> None:
+    """Raise DataError where images or topics of a built-in sequence are asked for: it has neither."""
+    _check_topics(source, None, frontend)
+    if frontend.tracks == "images":
+        raise DataError(f"{source}: a built-in sequence has tracks and no images; leave --tracks images out")
+
+
+def _check_topics(source: str, reader: RecordingFormat | None, frontend: Frontend) -> None:
+    """Raise DataError where topics are named of what has none."""
+    if frontend.topics is not None and not isinstance(reader, HasTopics):
+        raise DataError(f"{source}: it has no topics, a bag has; leave --topics out, or compare it by itself")
 
 
 def _of_images(reader: RecordingFormat, path: Path, frontend: Frontend) -> TypeGuard[HasImages]:
@@ -193,6 +219,7 @@ def load_images(source: str, frontend: Frontend = DEFAULTS.frontend) -> ImageRec
     reader = None if source in built_ins() else _reader_of(path, source)
     if not isinstance(reader, HasImages):
         raise DataError(f"{source}: holds no images; name a folder as EuRoC's or KITTI's")
+    _check_topics(source, reader, frontend)
     return reader.images_of(path, frontend)
 
 
@@ -252,6 +279,8 @@ def _reader_of(path: Path, source: str) -> RecordingFormat:
 
 
 def _check_readable(path: Path, source: str) -> None:
+    if not source:
+        raise DataError(f"a SEQUENCE has no name: give a path, or one of {', '.join(built_in_names())}")
     try:
         if path.is_dir():
             next(path.iterdir(), None)
@@ -267,6 +296,8 @@ def _check_readable(path: Path, source: str) -> None:
 
 def _nearest_source(path: Path, source: str) -> str:
     """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
+    if _ADDRESS.match(str(source)):
+        return "; it is an address: download it and name the file"
     if path.parent != Path():
         if not path.parent.is_dir():
             return f"; there is no folder {path.parent}"
@@ -280,5 +311,5 @@ def _nearest_source(path: Path, source: str) -> str:
 
 
 def _some(names: list[str]) -> str:
-    shown = sorted(names)[:_SHOWN]
+    shown = sorted(names, key=lambda name: (name.startswith("."), name))[:_SHOWN]
     return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"

@@ -11,7 +11,7 @@ import numpy as np
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, array_names, opened
 from toolkit.datasets.io.sparse import corners_of, sightings
-from toolkit.errors import DataError
+from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
@@ -47,6 +47,7 @@ def load(path: Path) -> Sequence:
         fields.require(*_REQUIRED)
         t_ns = stamps_ns(path, "time_stamps", fields.vector("time_stamps"))
         check_frame_count(path, t_ns.size)
+        _check_features_named(path, archive.keys)
         seen, has_features = _sightings(path, archive, t_ns.size), "features" in archive.keys
     v_mps = fields.array("linear_velocity", 3, t_ns.size).T
     w_radps = fields.array(fields.first_of("angular_velocity", "rotational_velocity"), 3, t_ns.size).T
@@ -63,6 +64,16 @@ def load(path: Path) -> Sequence:
         motion=TwistSamples(t_ns, v_mps, w_radps),
         provenance=Provenance("course-npz", str(path), facts),
     )
+
+
+def _check_features_named(path: Path, keys: list[str]) -> None:
+    """Raise DataError where features are missing and an array is there whose name is a misspelt one.
+
+    A recording without features is one of odometry alone, and nobody may take theirs for that by an oversight.
+    """
+    close = "" if "features" in keys else nearest("features", set(keys) - _NAMES)
+    if close:
+        raise DataError(f"{path}: missing features (rename {close}?); without image features leave {close} out")
 
 
 def _rig(fields: Fields) -> StereoRig:

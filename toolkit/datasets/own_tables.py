@@ -63,7 +63,8 @@ def load(path: Path) -> Sequence:
         missing = _FILES[0] if tracks is None else " or ".join(_FILES[1])
         raise DataError(f"{path}: {'missing' if tracks is None or not motions else 'both of'} {missing}")
     truth = path / _FILES[3]
-    return read(path.name, tracks, motions[0], path / _FILES[2], truth if is_regular(truth) else None).sequence
+    name = path.name or path.resolve().name  # of a folder named . as well
+    return read(name, tracks, motions[0], path / _FILES[2], truth if is_regular(truth) else None).sequence
 
 
 def save(
@@ -181,7 +182,10 @@ def _calibration(rig: Table) -> tuple[Path, Mapping[str, Any]]:
 def _check_known(place: Path, prefix: str, given: Mapping[str, Any], known: tuple[str, ...]) -> None:
     for key in given:
         if key not in known:
-            raise DataError(f"{place}: there is no {prefix}{key}{did_you_mean(str(key), known)}; remove or rename it")
+            # Rather a name that is not there yet: f_px stands for a missing fx_px, beside fy_px.
+            missing = [name for name in known if name not in given]
+            near = did_you_mean(str(key), missing) or did_you_mean(str(key), known)
+            raise DataError(f"{place}: there is no {prefix}{key}{near}; remove or rename it")
 
 
 def _fields(place: Path, values: Mapping[str, Any]) -> Fields:
@@ -189,9 +193,13 @@ def _fields(place: Path, values: Mapping[str, Any]) -> Fields:
 
 
 def _array(value: Any) -> Any:
+    """Return what a key of the calibration holds as an array; a whole number beyond any integer's as the infinite."""
     try:
-        return np.asarray(value)
-    except ValueError:  # rows of different lengths
+        array = np.asarray(value)
+        return array.astype(np.float64) if array.dtype == object else array
+    except OverflowError:
+        return np.asarray(np.inf)
+    except (TypeError, ValueError):  # rows of different lengths, values that are no numbers
         return np.asarray(str(value))
 
 

@@ -29,7 +29,7 @@ from toolkit.measured_motion import (
     TwistSamples,
 )
 from toolkit.resampling import ImuPairing, Pairing
-from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth
+from toolkit.sequence import Observations, Prior, Provenance, Sequence, StereoRig, Truth, why_not_sightings
 from toolkit.track_noise import TrackNoise
 
 SCHEMA = "vislam.recording/1"
@@ -60,7 +60,7 @@ def load(path: Path) -> Sequence:
         sequence = _sequence(text, arrays)
     except KeyError as error:
         raise DataError(f"{text_file.parent}: {error.args[0]} is missing; save the recording again") from error
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
         raise DataError(f"{text_file.parent}: a field does not fit ({error}); save the recording again") from error
     except DataError as error:
         raise DataError(f"{text_file.parent}: {error}") from error
@@ -261,14 +261,6 @@ def _check_whole(sequence: Sequence, text: Text, file: Path) -> None:
         raise DataError(
             f"{file}: counts are {text.get('counts')}, {_ARRAYS} holds {_counts(sequence)}; copy both files again"
         )
-    observations = sequence.observations
-    if not len(observations) == observations.track_id.size == len(observations.uv_px):
-        raise DataError(f"{file.parent / _ARRAYS}: the observations' columns differ in length; copy it again")
-    if (np.diff(observations.frame) < 0).any():
-        raise DataError(f"{file.parent / _ARRAYS}: the observations are not sorted by frame; save the recording again")
-    outside = np.flatnonzero((observations.frame < 0) | (observations.frame >= sequence.frame_count))
-    if outside.size:
-        raise DataError(
-            f"{file.parent / _ARRAYS}: observation {outside[0]} is of frame {observations.frame[outside[0]]}, "
-            f"there are {sequence.frame_count}; save the recording again"
-        )
+    wrong = why_not_sightings(sequence)
+    if wrong:
+        raise DataError(f"{file.parent / _ARRAYS}: {wrong}; copy it again, or save the recording again")

@@ -195,6 +195,9 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
 
 def _matched(estimate: Poses, truth: TruthFile, max_dt_s: float | None) -> Matched:
     matched = matched_poses(estimate, truth.stamped) if max_dt_s is None else nearest_poses(estimate, truth, max_dt_s)
+    alone = next((file.path for file in (estimate, truth.stamped) if file.t_ns.size < 2), None)
+    if alone is not None:
+        raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
             f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "

@@ -13,7 +13,7 @@ from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.poses import PosesFile
 from toolkit.errors import DataError
 from toolkit.estimate import Run
-from toolkit.estimator import LADDER, Build, EstimatorEntry, find_all
+from toolkit.estimator import LADDER, Build, EstimatorEntry, check_options, find_all
 from toolkit.experiment.cluster import Cluster
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, Store
@@ -129,6 +129,7 @@ def prepared_cases(plan: Plan, workers: Pool, progress_for: ProgressFor = silent
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a recording, a truth or a
     trajectory that cannot, or for a recording without a seed that is to be repeated over seeds.
     """
+    check_options(plan.settings, plan.own)
     for entry in find_all(plan.estimators).values():
         entry.check_usable(plan.settings)
     files = {name: read_poses(path) for name, path in plan.trajectories.items()}

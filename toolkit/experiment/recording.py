@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.audit import Audit, Finding, audit
 from toolkit.audit.parts.subsets import keep_frames
-from toolkit.datasets import load_sequence
+from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
@@ -19,7 +19,7 @@ from toolkit.linear_algebra import on_one_thread
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Prior, Sequence
+from toolkit.sequence import Prior, Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, in_words
@@ -185,8 +185,11 @@ def _loaded(recording: Recording, progress: Progress) -> Sequence:
         name = source.name if isinstance(source, Sequence) else source
         raise SettingsError(f"{name}: vary=world draws a simulated world ({', '.join(SCENARIOS)}); this is none")
     if isinstance(source, Sequence):
-        sequence = source
+        sequence, wrong = source, why_not_sightings(source)
+        if wrong:
+            raise DataError(f"{source.name}: {wrong}; mend the sequence (Observations.sorted sorts)")
     elif source in SCENARIOS:
+        check_built_in(source, recording.frontend)
         scenario = replace(SCENARIOS[source], varied=recording.vary == "world")
         if recording.duration_s is not None:
             scenario = replace(scenario, duration_s=recording.duration_s)
@@ -220,7 +223,22 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
         )
     provenance = sequence.provenance
     told = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
-    return replace(keep_frames(sequence, kept), provenance=told)
+    taken = replace(keep_frames(sequence, kept), provenance=told)
+    return taken if part.every == 1 else _with_truth_at_frames(taken)
+
+
+def _with_truth_at_frames(sequence: Sequence) -> Sequence:
+    """Return a sequence that lacks frames with the truth at those it has, where it has one at each of them.
+
+    Between frames so far apart an estimate would be interpolated to be scored, and err by that.
+    """
+    truth = sequence.truth
+    if truth is None or not np.isin(sequence.frames_t_ns, truth.t_ns).all():
+        return sequence
+    at = np.isin(truth.t_ns, sequence.frames_t_ns)
+    v_world, bias = (None if known is None else known[at] for known in (truth.v_world, truth.bias))
+    thinned = replace(truth, t_ns=truth.t_ns[at], T_world_imu=truth.T_world_imu[at], v_world=v_world, bias=bias)
+    return replace(sequence, truth=thinned)
 
 
 def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:

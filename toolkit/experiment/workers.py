@@ -28,6 +28,7 @@ import numpy as np
 from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
+from toolkit.errors import SystemLimitError
 from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress
 
@@ -55,10 +56,13 @@ class WorkerProcess:
         self._executor: ProcessPoolExecutor | None = None
 
     def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
-        """Have the process do some work after what it has to do already; where it dies, BrokenProcessPool is raised."""
-        # Started with the first process, Python's own tracker would let interrupts through to it again.
-        resource_tracker.ensure_running()
-        with _interrupts_held_back():
+        """Have the process do some work after what it has to do already; where it dies, BrokenProcessPool is raised.
+
+        Raises SystemLimitError where the system lets no process be started.
+        """
+        with _interrupts_held_back(), _refusals_told():
+            # Started with the first process, Python's own tracker would let interrupts through to it again.
+            resource_tracker.ensure_running()
             if self._executor is None:
                 self._executor = _executor()
             try:
@@ -115,6 +119,19 @@ def _interrupts_held_back() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _refusals_told() -> Iterator[None]:
+    """Raise SystemLimitError for what the system refuses to a new process: it needs files, and room in /dev/shm."""
+    try:
+        yield
+    except (OSError, ImportError) as error:  # the latter where the system has no semaphores at all
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        remedy = "one worker does without them: --workers 1"
+        raise SystemLimitError(
+            f"no worker process can be started ({why}): they need processes, open files and room in /dev/shm; {remedy}"
+        ) from error
 
 
 @dataclass(frozen=True)

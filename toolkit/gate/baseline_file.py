@@ -126,7 +126,12 @@ def load_baseline(path: Path) -> Baseline:
     """
     if path.is_dir():
         return _of_these_releases(path)
-    return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+    try:
+        return from_document(documents.read(path, BaselineRecord, remedy=_REMEDY, error=BaselineError))
+    except BaselineError as error:
+        if "'vislam.trajectory-baseline/" not in str(error):
+            raise
+        raise BaselineError(f"{path} is a baseline of trajectories; check it with --trajectories DIR") from error
 
 
 def _of_these_releases(folder: Path) -> Baseline:
@@ -135,6 +140,8 @@ def _of_these_releases(folder: Path) -> Baseline:
     if len(fitting) == 1:
         return next(iter(fitting.values()))
     here = ", ".join(f"{name} {release}" for name, release in installed_releases().items())
+    if not known:
+        raise BaselineError(f"{folder}: it holds no baseline (*.json); {_REMEDY}")
     if not fitting:
         raise BaselineError(f"{folder}: none of {len(known)} baselines is for {here}; make one with vislam baseline")
     raise BaselineError(f"{folder}: {', '.join(path.name for path in fitting)} are all for {here}; name one of them")

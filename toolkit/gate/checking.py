@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from toolkit.estimator import find_all
+from toolkit.estimator import check_options, find_all
 from toolkit.experiment.recording import prepare
 from toolkit.gate.baseline import DEFAULT_BOUNDS, Baseline, Case, Measured, installed_releases
 from toolkit.gate.interleaved import compare_speed
@@ -48,6 +48,7 @@ def new_baseline(
     Raises EstimatorError for an estimator that is unknown or cannot be used, DataError for a sequence that cannot be
     had; both before the first run.
     """
+    check_options(settings)
     for case in cases:
         for entry in find_all(case.estimators).values():
             entry.check_usable(settings)

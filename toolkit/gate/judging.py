@@ -79,9 +79,9 @@ def judge_case(
             why = now.absent.get(estimator, "it was not run")
             judged.verdicts.append(_missing(case, estimator, "", "estimator", why))
         else:
-            judged.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
             _judge_series(case, estimator, was, now.runs[estimator], judged, bounds, terms)
             if terms.speed:
+                judged.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
                 judged.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
     return judged
 

@@ -83,7 +83,13 @@ class TrajectoryBaseline:
 
 def load_trajectory_baseline(path: Path) -> TrajectoryBaseline:
     """Read the file; raises BaselineError where there is none, or it is not one."""
-    record = documents.read(path, TrajectoryBaselineRecord, remedy=_REMEDY, error=BaselineError)
+    try:
+        record = documents.read(path, TrajectoryBaselineRecord, remedy=_REMEDY, error=BaselineError)
+    except BaselineError as error:
+        if "'vislam.baseline/" not in str(error):
+            raise
+        why = "is a baseline of estimators, which are run to check it; leave --trajectories out"
+        raise BaselineError(f"{path} {why}") from error
     return TrajectoryBaseline(
         {one.sequence: ScoredSequence(one.truth, one.truth_hash, one.files, one.scores) for one in record.sequences},
         Scoring(record.align, record.gap_s),

@@ -1,7 +1,7 @@
 """Hold a folder of trajectories against a baseline, or make the baseline of one."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from toolkit.errors import DataError, printable
+from toolkit.errors import DataError, no_such, printable
 from toolkit.gate.baseline import Criterion, Values
 from toolkit.gate.judging import judge_recorded
 from toolkit.gate.measuring import place_of
@@ -28,6 +28,13 @@ class Truths:
 
     folder: Path | None = None
     files: Mapping[str, Path] | None = None
+
+    def check_known(self, sequences: Iterable[str]) -> None:
+        """Raise DataError where a truth is named for none of the sequences, as for a misspelt one."""
+        known = sorted(sequences)
+        for name in self.files or {}:
+            if name not in known:
+                raise DataError(f"--truth names the truth of {name}: {no_such('sequence', name, known)}")
 
     def of(self, sequence: str) -> Path:
         """Return the truth's file; raises DataError where there is none."""
@@ -74,6 +81,8 @@ class FolderOfRuns:
             raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files if before else ())}")
         given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
         path = self.truths.of(sequence) if before is None or given else place_of(before.truth) or Path(before.truth)
+        if not given and not path.is_file():
+            raise DataError(f"its truth is not at {path}, where the baseline had it; name another place with --truth")
         truth = read_stamped(path)
         names = tuple(str(file.relative_to(self.folder)) for file in files)
         if before is not None and truth.digest != before.truth_hash:

@@ -48,7 +48,7 @@ _LEAST_LEFT = 0.02
 _SIGMAS, _LEAST_S = 5.0, 1e-3
 _REMARK = (
     "with its stamps shifted by {:.1f} +- {:.1f} ms its positions fit the truth's to {:.3g} m in place of {:.3g} m: "
-    "two clocks, or a truth whose positions are stamped early or late"
+    "two clocks, a truth whose positions are stamped early or late, or a drift that goes with the velocity"
 )
 
 

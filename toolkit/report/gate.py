@@ -126,7 +126,7 @@ def note_lines(check: Check) -> Iterator[str]:
             "baseline makes it the answer to come"
         )
     releases = ", ".join(f"{name} {release}" for name, release in check.releases.items())
-    yield "; ".join(filter(None, (releases, f"{check.seconds:.0f} s")))
+    yield "; ".join(filter(None, (releases, f"took {check.seconds:.0f} s")))
 
 
 def gate_text(check: Check, width: Width = WIDTH) -> str:

@@ -78,7 +78,7 @@ def read_run(directory: Path) -> RunFiles | SeedsFiles:
     manifest = read_manifest(directory / MANIFEST)
     if not (directory / REPORT).is_file():
         again = f"repeat it: {manifest.command}" if manifest.command else "repeat the comparison"
-        raise DataError(f"{directory} was written by an earlier version and has no {REPORT}; {again}")
+        raise DataError(f"{directory} has no {REPORT}: an earlier version wrote it, or that was removed; {again}")
     return _over_seeds(directory, manifest) if (directory / SEEDS).is_file() else _one_seed(directory, manifest)
 
 
@@ -128,6 +128,8 @@ def _landmarks(path: Path) -> Array:
 
 def _numbers(path: Path, columns: int, delimiter: str | None, header_lines: int = 0) -> Array:
     """Read a table (N, columns); it may have no rows, for a run that diverged may leave no finite pose."""
+    if not path.exists():
+        raise DataError(f"{path} is missing; repeat the comparison")
     content = read_input(path)
     try:
         with warnings.catch_warnings():

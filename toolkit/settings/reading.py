@@ -31,7 +31,9 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
     try:
         return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {in_words(error, values, Settings)}") from error
+        # In TOML and on the command line no value is called none.
+        what = in_words(error, values, Settings).replace(" or null", " or none")
+        raise SettingsError(f"{place}: {what}") from error
 
 
 def _with_none(given: Mapping[str, Any], record: type[Struct]) -> dict[str, Any]:

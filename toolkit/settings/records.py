@@ -96,7 +96,7 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[
             float,
             Meta(
-                gt=0.0,
+                ge=1e-3,
                 le=3600.0,
                 description="window of the windowed filters and smoothers",
                 extra={"unit": "s", "none": f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}"},

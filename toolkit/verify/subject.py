@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +11,11 @@ from types import ModuleType
 from typing import cast
 
 from toolkit.discovery import shown_name
-from toolkit.errors import EstimatorError, no_such, printable
+from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimator import Build, discover
+from toolkit.inputs import open_input
+
+_MODULE = re.compile(r"\w+(\.\w+)+")
 
 
 @dataclass(frozen=True)
@@ -30,13 +34,17 @@ def subject_of(word: str) -> Subject:
     """
     if word.endswith(".py"):
         path = Path(word)
-        if not path.is_file():
+        if not path.exists():
             raise EstimatorError(f"{path}: there is no such file")
+        try:
+            open_input(path).close()
+        except DataError as error:
+            raise EstimatorError(str(error)) from error
         return Subject(printable(shown_name(path.stem)), lambda: _build_of(lambda: _imported(path), word))
     known = discover()
     if word in known:
         return Subject(word, known[word].load)
-    if "." in word:
+    if _MODULE.fullmatch(word):
         return Subject(shown_name(word), lambda: _build_of(lambda: importlib.import_module(word), word))
     raise EstimatorError(f"{no_such('estimator', word, known)}; a file ends in .py")
 
@@ -61,8 +69,8 @@ def _build_of(imported: Callable[[], ModuleType], word: str) -> Build:
         module = imported()
     except EstimatorError:
         raise
-    except Exception as error:
-        where = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+    except (Exception, SystemExit) as error:  # a script may end where it is imported
+        where = f", line {error.lineno}" if isinstance(error, SyntaxError) and error.lineno else ""
         raise EstimatorError(f"{word}{where}: it cannot be imported ({type(error).__name__}: {error})") from error
     if not callable(getattr(module, "build", None)):
         raise EstimatorError(f"{word}: it defines no function build(setup)")

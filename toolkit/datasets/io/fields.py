@@ -98,8 +98,10 @@ class Fields:
     def number(self, key: str) -> float:
         """Return a single finite number, whatever its number of axes."""
         vector = self.vector(key)
-        if vector.size != 1 or not np.isfinite(vector[0]):
+        if vector.size != 1:
             raise DataError(f"{self.path}: {key} has {vector.size} values, expected one finite number")
+        if not np.isfinite(vector[0]):
+            raise DataError(f"{self.path}: {key} is {vector[0]:g}, expected a finite number")
         return float(vector[0])
 
     def rigid(self, key: str) -> Array:

@@ -221,12 +221,14 @@ class Columns:
     def _whole(self, name: str, row: int, value: Any) -> int:
         try:
             exact = Decimal(value.replace("_", "?")) if isinstance(value, str) else value
-            number = int(exact) if abs(exact) <= _LARGEST else None
+            too_large = bool(abs(exact) > _LARGEST)
+            number = None if too_large else int(exact)
         except (TypeError, ValueError, InvalidOperation):  # NaN is no number either
-            exact, number = value, None
+            exact, number, too_large = value, None, False
         if number is None or number != exact:
             shown = printable(str(value))[:50] or "empty"
-            raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number")
+            most = f" of at most {_LARGEST}" if too_large else ""
+            raise DataError(f"{self.what}: {self.at(row)}: {name} is {shown}, expected a whole number{most}")
         return number
 
     def _decimal(self, row: int, text: str) -> Decimal:

@@ -12,6 +12,7 @@ from toolkit.metrics import Evaluation, Unavailable
 from toolkit.metrics.bound import AgainstBound, against_bound
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.figures.style import (
+    MUTED_COLOUR,
     TRUTH_COLOUR,
     Entry,
     NamedFigure,
@@ -31,7 +32,7 @@ _CAPTION = (
     "the same measurements; well below the bound it loses nothing that matters. Thin: the standard deviation it "
     "states; below the bound it is too sure."
 )
-_LEAST_SHARE = 1e-3
+_LEAST_SHARE, _STATED_WIDTH = 1e-3, 0.7
 
 
 def draw(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -63,7 +64,9 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
         Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))
         for output in dict.fromkeys(row.output for row, _ in found)
     ]
-    legend_below(figure, bounds + entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found]))
+    stated = Entry("thin: stated", (Line2D([], [], color=MUTED_COLOUR, linewidth=_STATED_WIDTH),))
+    estimators = entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
+    legend_below(figure, [*bounds, *estimators, stated])
     return NamedFigure("against_bound", _CAPTION, figure)
 
 
@@ -74,7 +77,7 @@ def _plot_estimator(
     line, label = line_of_estimator(comparison, row.estimator, shown_as(row)), f"{row.estimator} {row.label}"
     lost = np.linalg.norm(one.excess[:, block], axis=1)
     axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
-    axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=0.7)
+    axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=_STATED_WIDTH)
 
 
 def _plot_bounds(
