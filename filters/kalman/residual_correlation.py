@@ -103,7 +103,8 @@ class ResidualCorrelation:
 
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Take in the next frame whose pose (4, 4) will hardly change any more."""
-        if self.correlation > 0.0:
+        # Tracks are scored of frames that follow one another: once begun, none is left out.
+        if self.correlation > 0.0 or self._scores.sightings:
             self._scores.add(frame, T_world_imu)
 
     def settle_last(self) -> None:
