@@ -109,19 +109,25 @@ def test_outliers_by_the_stated_noise_say_nothing(rig):
     assert scored(rig, uvs_px, poses) == pytest.approx(before, rel=0.1)
 
 
-def test_a_track_is_scored_when_it_is_lost_and_few_tracks_say_nothing(rig):
+def test_a_track_is_scored_when_it_is_lost(rig):
     poses = poses_of(12)
     uvs_px, scores = seen_px(rig, poses, white(4, 12)), TrackScores(rig)
     for k, T in enumerate(poses):
-        kept = np.arange(TRACKS)[: 10 if k >= 6 else TRACKS]
+        kept = np.arange(TRACKS)[: 30 if k >= 6 else TRACKS]
         scores.add(StereoFrame(k, kept, uvs_px[kept, k], np.full(kept.size, k)), T)
         assert (scores.design_effect is None) == (k < 6)
     assert scores.design_effect == pytest.approx(1.0, abs=0.2)
-    few = TrackScores(rig)
-    for k, T in enumerate(poses):
-        few.add(StereoFrame(k, np.arange(10), uvs_px[:10, k], np.full(10, k)), T)
-    few.finish()
-    assert few.design_effect is None
+    assert scores.sightings == 30 * 12
+
+
+@pytest.mark.parametrize(("at_once", "says"), [(19, False), (20, True)])
+def test_few_tracks_at_once_say_nothing_however_many_follow(rig, at_once, says):
+    poses, scores = poses_of(12), TrackScores(rig)
+    for turn in range(5):
+        uvs_px = seen_px(rig, poses, white(turn, 12)[:at_once])
+        for k, T in enumerate(poses):
+            scores.add(StereoFrame(k, turn * 100 + np.arange(at_once), uvs_px[:, k], np.full(at_once, k)), T)
+    assert (scores.design_effect is not None) == says
 
 
 def test_a_track_without_end_is_scored_in_parts_and_forgotten(rig):
