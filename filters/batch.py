@@ -14,8 +14,8 @@ import numpy as np
 
 from filters.kalman.correction import KnownPoseMapper
 from filters.kalman.linearisation import AtFirstEstimates
-from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.sliding_window import SlidingWindowFilter
+from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.indeterminate import with_covariances
 from filters.smoothing.robust_schedule import Smoothed, seen_ids, solve_robustly, worth_smoothing
 from filters.smoothing.scale_state import ScaleState
@@ -46,7 +46,7 @@ class Batch:
         self._rig, self._outliers, self._progress = setup.rig, setup.settings.outliers, setup.progress
         noise = setup.settings.noise
         self._scale = None if noise.disparity_scale is None else ScaleState(noise.disparity_scale)
-        self._correlation = ResidualCorrelation(setup.rig, noise.match_tracks)
+        self._tracks = DiscountedTracks(setup)
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._first_belief = self._motion.initial_belief(setup.prior)
         self._causal_pass = SlidingWindowFilter(
@@ -75,11 +75,11 @@ class Batch:
             factors.push_back(bridged(frames, bridge.noise))
         if self._scale is not None:
             self._scale.add_to(factors, start)
-        smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._correlation, self._progress)
+        smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._tracks, self._progress)
         trajectory, log = self._with_covariances(smoothed)
         values = smoothed.solution.values
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, log + self._correlation.told)
+        return Finished(trajectory, landmarks, smoothed.solution.converged, log + self._tracks.told)
 
     def _with_covariances(self, smoothed: Smoothed) -> tuple[Trajectory, tuple[str, ...]]:
         values = smoothed.solution.values

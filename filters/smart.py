@@ -10,6 +10,7 @@ Where the rig states noise of tracks, what is new in each sighting of a track is
 (:class:`toolkit.models.correlated_noise.Chain`). A track that starts anew does so at its age.
 """
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -55,11 +56,13 @@ class Smart:
         self._tracked = TrackedWindow.empty()
         self._solution = SolvedWindow(self._tracked.window, np.empty((0, 0)))
         self._states: list[Estimate] = []
+        self._frames = deque[StereoFrame]()
         self._points: dict[int, Array] = {}
         self._log: list[str] = []
 
     def step(self, packet: Packet) -> Estimate:
         """Take in one packet and return the state at its frame."""
+        self._frames.append(packet.frame)
         tracked = self._extended(self._noise.applied(packet))
         try:
             self._solution = solve_window(tracked.window, self._camera)
@@ -140,6 +143,8 @@ class Smart:
         if leaving:
             self._complete(range(leaving))
             self._learn(leaving)
+            for state in self._states[-in_window:][:leaving]:
+                self._tracks.settle(self._frames.popleft(), state.T_world_imu)
             window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
             self._camera = RobustCamera.of(*self._tracks.now)

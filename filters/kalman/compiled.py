@@ -19,9 +19,9 @@ from filters.kalman.joint import JointBelief, times_root, transposed_root_times,
 from filters.kalman.landmark_map import LandmarkMap
 from filters.kalman.linearisation import Integrator
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.residual_correlation import FEWEST_SIGHTINGS as FEWEST_CORRELATED
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.kalman.track_gate import TestedTracks, TrackTest, Window
+from filters.kalman.track_scores import FEWEST_SIGHTINGS as FEWEST_CORRELATED
 from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow, Told
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp

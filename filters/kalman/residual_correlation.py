@@ -1,15 +1,21 @@
 """How much a sighting of a track counts for, by how alike the residuals of its successive sightings are.
 
-A tracker takes its error along from image to image, and a filter told white noise takes every sighting of such a track
-for new. Residuals that are correlated by rho from one sighting to the next carry, as a sum, as much as (1 - rho) / (1 +
-rho) times as many independent ones (Bayley & Hammersley 1946, "The 'effective' number of independent observations in an
-autocorrelated time series"): for long tracks whose errors are an autoregression of first order that is exact. So with a
-variance that is v times the stated one a sighting tells (1 - rho) / (1 + rho) / v of what it is stated to, and where
-that is less than all of it, every track corrects with that share of its information; what is an outlier stays a matter
-of the stated noise. Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is
-smaller by as many as err as one (:mod:`filters.kalman.neighbour_correlation`). Noise that was stated large enough for
-such tracks counts in full. White errors have residuals that are correlated negatively, by the landmark that was fitted
-to them, and count in full: a filter whose noise is as stated stays, to the bit, what it is without.
+A tracker takes its error along from image to image, and an estimator told white noise takes every sighting of such a
+track for new. That it does shows in residuals that are correlated from one sighting to the next, by rho beyond what
+chance makes of white ones. From then on every track corrects with a share of its information; what is an outlier stays
+a matter of the stated noise. The share is
+
+- one over the design effect of what tracks say of a drift (:mod:`filters.kalman.track_scores`), once enough tracks have
+  ended whose poses will hardly change any more;
+- until then that of long tracks whose errors are an autoregression of first order: with v times the stated variance a
+  sighting tells (1 - rho) / (1 + rho) / v of what it is stated to (Bayley & Hammersley 1946, "The 'effective' number of
+  independent observations in an autocorrelated time series"). Poses that few tracks have corrected take up much of
+  what these are off by, so it is too large rather than too small.
+
+Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is smaller by as many as
+err as one (:mod:`filters.kalman.neighbour_correlation`). Noise that was stated large enough for such tracks counts in
+full. White errors have residuals that are correlated negatively, by the landmark that was fitted to them, and count in
+full: a filter whose noise is as stated stays, to the bit, what it is without.
 """
 
 import numpy as np
@@ -17,21 +23,18 @@ import numpy as np
 from filters.kalman import multiview
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
+from filters.kalman.track_scores import FEWEST_SIGHTINGS, SOUND, TrackScores
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
-# Of three sightings the landmark takes up too much for what is left to say how successive ones are related.
-FEWEST_SIGHTINGS = 4
 # Chance makes white residuals look correlated once in a thousand: beyond so many standard errors of none they are.
 _STANDARD_ERRORS = 3.0
 # What counts for less than a hundredth would be no measurement; beyond that another cause is likelier.
 _MOST_CORRELATED = 0.98
 # What rounds to the full information is none to speak of.
 _MOST_TOLD = 0.95
-# What chance explains less often, by the stated noise, is an outlier and says nothing of the others.
-SOUND = 0.999
 # Gates, robust weights and linearisation leave residuals of white landmarks correlated, however many there are: by up
 # to 0.07 where there are thousands, on drive, flight and exports of OpenVINS. Tracks that walk are beyond 0.5.
 _LEAST_OF_LANDMARKS = 0.15
@@ -46,7 +49,7 @@ class ResidualCorrelation:
         # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
         self._rig, self.matches = rig, matches and rig.track_noise is None
         self._products, self._squares, self._pairs = 0.0, 0.0, 0
-        self._neighbours = NeighbourCorrelation()
+        self._neighbours, self._scores = NeighbourCorrelation(), TrackScores(rig)
 
     @property
     def correlation(self) -> float:
@@ -63,8 +66,10 @@ class ResidualCorrelation:
         rho = self.correlation
         if rho == 0.0:
             return 1.0
-        effective = (1.0 - rho) / (1.0 + rho) / self._neighbours.erring_as_one(rho)
-        return min(1.0, effective * self._pairs / self._squares)
+        effect = self._scores.design_effect
+        if effect is None:
+            effect = (1.0 + rho) / (1.0 - rho) * self._squares / self._pairs
+        return min(1.0, 1.0 / (effect * self._neighbours.erring_as_one(rho)))
 
     @property
     def told(self) -> tuple[str, ...]:
@@ -95,6 +100,16 @@ class ResidualCorrelation:
         self._products += float((before * after).sum())
         self._squares += 0.5 * float(np.square(before).sum() + np.square(after).sum())
         self._pairs += 3 * len(before)
+
+    def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Take in the next frame whose pose (4, 4) will hardly change any more."""
+        # Tracks are scored of frames that follow one another: once begun, none is left out.
+        if self.correlation > 0.0 or self._scores.sightings:
+            self._scores.add(frame, T_world_imu)
+
+    def settle_last(self) -> None:
+        """Take in the tracks that are seen to the end."""
+        self._scores.finish()
 
     def add_images(self, frames: IntArray, uvs_px: Array, whitened: Array, H_pose: Array) -> None:
         """Take in what images show together: whitened residuals (N, 3) of sightings (N, 3) px in frames (N,).

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from filters.kalman.residual_correlation import FEWEST_SIGHTINGS, SOUND, ResidualCorrelation
+from filters.kalman.residual_correlation import ResidualCorrelation
+from filters.kalman.track_scores import FEWEST_SIGHTINGS, SOUND
 from filters.smoothing.smart_factors import Sightings
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
@@ -72,11 +73,17 @@ def _discounted_marginal(
 
 
 class DiscountedTracks:
-    """What the sightings of an incremental smoother count for, by those of earlier frames."""
+    """What the sightings of a smoother count for, by those of earlier frames, or by all.
+
+    Beside odometry that is what the correlation along tracks leaves, and beside an IMU what they tell of a drift.
+    Odometry's noise is stated, or found in its scatter, as white, which says nothing of errors that last, such as a
+    wrong radius of the wheels: tracks that count for no more than they tell of a drift leave the drift to it.
+    """
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._huber = setup.rig, setup.settings.outliers.smoother_huber
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._beside_imu = setup.motion_kind == "imu"
 
     @property
     def share(self) -> float:
@@ -98,6 +105,25 @@ class DiscountedTracks:
         if self._correlation.matches:
             left = residuals_of(frames, T_world_imu, points, self._rig)
             self._learn(left, left.select(left.frames == 0))
+            self.settle(frames[0], T_world_imu[0])
+
+    def learn_from_all(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
+        """Take in what all frames saw of points (3,) m, at the answer for their poses (K, 4, 4)."""
+        if not self._correlation.matches:
+            return
+        left = residuals_of(frames, T_world_imu, points, self._rig)
+        if not self._beside_imu:
+            self._correlation.add(*left.successive())
+            return
+        self._learn(left, left)
+        for frame, pose in zip(frames, T_world_imu, strict=True):
+            self.settle(frame, pose)
+        self._correlation.settle_last()
+
+    def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
+        """Take in the next frame whose pose (4, 4) will hardly change any more."""
+        if self._beside_imu:
+            self._correlation.settle(frame, T_world_imu)
 
     def learn_from(self, sightings: Sightings, T_world_imu: Array, points: Array) -> None:
         """Take in sightings, each by the rows of its pose of (K, 4, 4) and of its point of (M, 3) m."""

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from filters.kalman.residual_correlation import ResidualCorrelation
-from filters.smoothing.discounted_tracks import discounted, residuals_of, seen_often
+from filters.smoothing.discounted_tracks import DiscountedTracks, discounted, seen_often
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
@@ -52,7 +51,7 @@ def solve_robustly(
     rig: StereoRig,
     start: gtsam.Values,
     outliers: Outliers,
-    correlation: ResidualCorrelation,
+    tracks: DiscountedTracks,
     progress: Progress,
 ) -> Smoothed:
     """Solve the motion factors together with the frames' sightings: with Huber's loss, with Cauchy's, then with none.
@@ -60,7 +59,7 @@ def solve_robustly(
     Frame k observes from pose X(k). A landmark behind a camera that saw it is left out from then on: a sighting of
     it has no gradient and would leave it there. The solution is that of the last solve; it converged when that did.
     A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
-    tracks count for the share that the correlation of their residuals leaves them by then.
+    tracks count for the share that their residuals leave them by then.
     """
     values, order_of = start, cheaper_order(motion, frames)
     for robust, stopping, stage in _stages(outliers):
@@ -76,8 +75,8 @@ def solve_robustly(
     if rig.track_noise is not None:
         return _solve_chained(motion, frames, rig, values, outliers, progress)
     poses, points = _poses(values, len(frames)), {i: values.atPoint3(L(i)) for i in seen_often(frames)}
-    correlation.add(*residuals_of(frames, poses, points, rig).successive())
-    rig, huber = discounted(rig, outliers.batch_last_huber, correlation.share)
+    tracks.learn_from_all(frames, poses, points)
+    rig, huber = discounted(rig, outliers.batch_last_huber, tracks.share)
     if values.exists(SCALE):
         sightings = ChainedSightings.of(frames, rig)
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
