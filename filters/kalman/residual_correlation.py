@@ -3,14 +3,14 @@
 A tracker takes its error along from image to image, and an estimator told white noise takes every sighting of such a
 track for new. That it does shows in residuals that are correlated from one sighting to the next, by rho beyond what
 chance makes of white ones. From then on every track corrects with a share of its information; what is an outlier stays
-a matter of the stated noise. The share is
+a matter of the stated noise. The share is one over the larger of two design effects, either of which misses some of it:
 
-- one over the design effect of what tracks say of a drift (:mod:`filters.kalman.track_scores`), once enough tracks have
-  ended whose poses will hardly change any more;
-- until then that of long tracks whose errors are an autoregression of first order: with v times the stated variance a
-  sighting tells (1 - rho) / (1 + rho) / v of what it is stated to (Bayley & Hammersley 1946, "The 'effective' number of
+- that of what tracks say of a drift (:mod:`filters.kalman.track_scores`), of those that have ended at poses that will
+  hardly change any more. Early in a run these are the short ones, and it is 1 until there are enough;
+- that of long tracks whose errors are an autoregression of first order: with v times the stated variance a sighting
+  tells (1 - rho) / (1 + rho) / v of what it is stated to (Bayley & Hammersley 1946, "The 'effective' number of
   independent observations in an autocorrelated time series"). Poses that few tracks have corrected take up much of
-  what these are off by, so it is too large rather than too small.
+  what these are off by.
 
 Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is smaller by as many as
 err as one (:mod:`filters.kalman.neighbour_correlation`). Noise that was stated large enough for such tracks counts in
@@ -66,9 +66,7 @@ class ResidualCorrelation:
         rho = self.correlation
         if rho == 0.0:
             return 1.0
-        effect = self._scores.design_effect
-        if effect is None:
-            effect = (1.0 + rho) / (1.0 - rho) * self._squares / self._pairs
+        effect = max((1.0 + rho) / (1.0 - rho) * self._squares / self._pairs, self._scores.design_effect or 0.0)
         return min(1.0, 1.0 / (effect * self._neighbours.erring_as_one(rho)))
 
     @property

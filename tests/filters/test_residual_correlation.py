@@ -96,6 +96,28 @@ def test_noise_stated_large_enough_for_correlated_errors_counts_in_full(drive):
     assert found.share == 1.0
 
 
+def settled(found, sightings, poses):
+    """Return it once all frames of some tracks have settled, and the tracks have ended."""
+    for k, pose in enumerate(poses):
+        found.settle(StereoFrame(k, sightings.track_ids, sightings.uvs_px[:, k], sightings.ages[:, k]), pose)
+    found.settle_last()
+    return found
+
+
+def test_what_tracks_say_of_a_drift_takes_from_the_share_and_never_adds_to_it(drive):
+    """Residuals correlated by a half are told 0.40; a drift of errors correlated by 0.9 has seven times its variance."""
+    share = learnt(drive.rig, 0.5).share
+    white, _, poses = tracks_of(drive.rig, 0.0, 1)
+    assert settled(learnt(drive.rig, 0.5), white, poses).share == share
+    alike, _, _ = tracks_of(drive.rig, 0.9, 2)
+    assert settled(learnt(drive.rig, 0.5), alike, poses).share < 0.5 * share
+
+
+def test_frames_of_a_run_whose_residuals_are_white_are_not_scored(drive):
+    sightings, _, poses = tracks_of(drive.rig, 0.9, 2)
+    assert settled(learnt(drive.rig, 0.0), sightings, poses).share == 1.0
+
+
 def test_a_handful_of_residuals_that_happen_to_agree_proves_nothing(drive):
     sightings, points, poses = tracks_of(drive.rig, 0.9, 0)
     found = ResidualCorrelation(drive.rig)
