@@ -105,7 +105,7 @@ def settled(found, sightings, poses):
 
 
 def test_what_tracks_say_of_a_drift_takes_from_the_share_and_never_adds_to_it(drive):
-    """Residuals correlated by a half are told 0.40; a drift of errors correlated by 0.9 has seven times its variance."""
+    """Residuals correlated by a half are told 0.40; a drift of errors correlated by 0.9 varies seven times as much."""
     share = learnt(drive.rig, 0.5).share
     white, _, poses = tracks_of(drive.rig, 0.0, 1)
     assert settled(learnt(drive.rig, 0.5), white, poses).share == share
