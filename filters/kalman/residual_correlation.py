@@ -5,17 +5,20 @@ track for new. That it does shows in residuals that are correlated from one sigh
 chance makes of white ones. From then on every track corrects with a share of its information; what is an outlier stays
 a matter of the stated noise. The share is one over the larger of two design effects, either of which misses some of it:
 
-- that of what tracks say of a drift (:mod:`filters.kalman.track_scores`), of those that have ended at poses that will
-  hardly change any more. Early in a run these are the short ones, and it is 1 until there are enough;
 - that of long tracks whose errors are an autoregression of first order: with v times the stated variance a sighting
   tells (1 - rho) / (1 + rho) / v of what it is stated to (Bayley & Hammersley 1946, "The 'effective' number of
   independent observations in an autocorrelated time series"). Poses that few tracks have corrected take up much of
-  what these are off by.
+  what these are off by;
+- that of what tracks say of a drift (:mod:`filters.kalman.track_scores`), of those that have ended, at poses that will
+  hardly change any more. Early in a run these are the short ones, and there is none until there are enough.
+
+Where the first is not beyond 1, noise was stated large enough for such tracks, and they count in full: what they say of
+a drift all the same is the motion's error, not theirs (kitti00, dataset3).
 
 Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is smaller by as many as
-err as one (:mod:`filters.kalman.neighbour_correlation`). Noise that was stated large enough for such tracks counts in
-full. White errors have residuals that are correlated negatively, by the landmark that was fitted to them, and count in
-full: a filter whose noise is as stated stays, to the bit, what it is without.
+err as one (:mod:`filters.kalman.neighbour_correlation`). White errors have residuals that are correlated negatively, by
+the landmark that was fitted to them, and count in full: a filter whose noise is as stated stays, to the bit, what it is
+without.
 """
 
 import numpy as np
@@ -63,11 +66,16 @@ class ResidualCorrelation:
     @property
     def share(self) -> float:
         """Return the share of its information that a track counts for: all where residuals along it are not alike."""
-        rho = self.correlation
-        if rho == 0.0:
+        along = self._effect_along_tracks
+        if along <= 1.0:
             return 1.0
-        effect = max((1.0 + rho) / (1.0 - rho) * self._squares / self._pairs, self._scores.design_effect or 0.0)
-        return min(1.0, 1.0 / (effect * self._neighbours.erring_as_one(rho)))
+        return 1.0 / (max(along, self._scores.design_effect or 0.0) * self._neighbours.erring_as_one(self.correlation))
+
+    @property
+    def _effect_along_tracks(self) -> float:
+        """Return how many times the stated variance the mean of a long track has: 0 where residuals are not alike."""
+        rho = self.correlation
+        return (1.0 + rho) / (1.0 - rho) * self._squares / self._pairs if rho > 0.0 else 0.0
 
     @property
     def told(self) -> tuple[str, ...]:
@@ -102,7 +110,7 @@ class ResidualCorrelation:
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Take in the next frame whose pose (4, 4) will hardly change any more."""
         # Tracks are scored of frames that follow one another: once begun, none is left out.
-        if self.correlation > 0.0 or self._scores.sightings:
+        if self._effect_along_tracks > 1.0 or self._scores.sightings:
             self._scores.add(frame, T_world_imu)
 
     def settle_last(self) -> None:
