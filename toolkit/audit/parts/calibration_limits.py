@@ -1,14 +1,14 @@
-"""What of a calibration found from tracks beside an IMU is wrong beyond chance and sound recordings, in words."""
+"""What of a calibration found from tracks beside an IMU is wrong beyond chance and sound recordings, in words.
+
+Where the camera is belongs to `lever_arm`.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.bundle import BASELINE, CENTRE, FOCAL, LATE, LEVER, TURN
-from toolkit.audit.parts.placement import metres
-from toolkit.audit.parts.robust import Scalar
+from toolkit.audit.parts.bundle import BASELINE, CENTRE, FOCAL, LATE, TURN
 from toolkit.audit.parts.self_calibration import SelfCalibration
-from toolkit.geometry import Array
 from toolkit.sequence import StereoRig
 
 # What is beyond so many standard errors and what sound recordings have counts. On 80 parts of real recordings beside an
@@ -16,12 +16,9 @@ from toolkit.sequence import StereoRig
 # and nothing of the rest. Chosen with them in view, about twice that.
 SIGMAS = 4.0
 SYSTEMATIC_FOCAL, SYSTEMATIC_CENTRE_PX, SYSTEMATIC_BASELINE = 0.012, np.array([2.0, 5.0]), 0.015
-SYSTEMATIC_TURN_RAD, SYSTEMATIC_LEVER_M, SYSTEMATIC_LATE_S = 0.006, 0.015, 0.0008
+SYSTEMATIC_TURN_RAD, SYSTEMATIC_LATE_S = 0.006, 0.0008
 # Where more than this of the focal length (a share), the principal point (px) or a turn (rad) would hide, it is said.
 HIDDEN_FOCAL, HIDDEN_CENTRE_PX, HIDDEN_TURN_RAD = 0.08, 25.0, 0.05
-# A place of the camera that a slip of who wrote the file would give is told at odds of a thousand to one, if it is so
-# far (m) from the one given; beside the scatter stands what sound recordings have (m).
-LOG_ODDS, LEAST_APART_M, PLACE_M = float(np.log(1000.0)), 0.05, 0.02
 
 
 class Wrong(NamedTuple):
@@ -33,7 +30,7 @@ class Wrong(NamedTuple):
 
 def wrong(found: SelfCalibration, rig: StereoRig) -> list[Wrong]:
     """Name what is wrong of the rig by which the calibration was begun."""
-    return [*_intrinsics(found, rig), *_baseline(found), *_turn(found), *_place(found, rig), *_clock(found)]
+    return [*_intrinsics(found, rig), *_baseline(found), *_turn(found), *_clock(found)]
 
 
 def hidden(found: SelfCalibration) -> str | None:
@@ -78,43 +75,6 @@ def _turn(found: SelfCalibration) -> list[Wrong]:
     told = ", ".join(f"{t:+.3f} +- {e:.3f}" for t, e in zip(turn, error, strict=True))
     said = f"the camera moves as if it were turned by ({told}) rad about its own x, y, z against T_imu_cam"
     return [Wrong(said, "the rotation of T_imu_cam")]
-
-
-def _place(found: SelfCalibration, rig: StereoRig) -> list[Wrong]:
-    """Tell of a camera elsewhere, and by what slip it would be there."""
-    lever, cov = found.value[LEVER], found.cov[LEVER, LEVER]
-    given, slips = rig.T_imu_cam[:3, 3], _slips(rig.T_imu_cam)
-    odds = {name: _log_odds(lever, cov + PLACE_M**2 * np.eye(3), place - given) for name, place in slips.items()}
-    likeliest = max(odds, key=lambda name: odds[name])
-    error = np.sqrt(np.diag(cov))
-    if odds[likeliest] > LOG_ODDS:
-        slip = f", as if {likeliest}: {metres(slips[likeliest])}"
-    elif (np.abs(lever) > SYSTEMATIC_LEVER_M + SIGMAS * error).any():
-        slip = ""
-    else:
-        return []
-    told = ", ".join(f"{x:+.2f} +- {e:.2f}" for x, e in zip(lever, error, strict=True))
-    said = f"the camera is ({told}) m from {metres(given)}, where T_imu_cam has it{slip}"
-    return [Wrong(said, "the translation of T_imu_cam")]
-
-
-def _slips(T_imu_cam: Array) -> dict[str, Array]:
-    """Return where the camera is if the translation was written down otherwise than it is meant."""
-    given = T_imu_cam[:3, 3]
-    return {"its sign were changed": -given, "it were that of the inverse": -T_imu_cam[:3, :3].T @ given}
-
-
-def _log_odds(lever: Array, cov: Array, way: Array) -> float:
-    """Return the logarithm of the odds of the end of a way (3,) m against its begin, negative where neither fits it."""
-    if float(np.linalg.norm(way)) < LEAST_APART_M:
-        return -np.inf
-    weighted = np.linalg.solve(cov, way)
-    share = Scalar(float(weighted @ lever / (weighted @ way)), float(1.0 / np.sqrt(weighted @ way)))
-    beside = lever - share.value * way
-    elsewhere = (
-        float(beside @ np.linalg.solve(cov, beside)) > SIGMAS**2 or abs(share.value - 1.0) > SIGMAS * share.error
-    )
-    return -np.inf if elsewhere else (share.value - 0.5) / share.error**2
 
 
 def _clock(found: SelfCalibration) -> list[Wrong]:
