@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LEVER
-from toolkit.audit.parts.calibration_limits import SIGMAS as FITTED_SIGMAS
+from toolkit.audit.parts.calibration_limits import LIMITS
 from toolkit.audit.parts.placement import MOST_SIGMAS, is_there, metres, share_of_way
 from toolkit.audit.parts.self_calibration import OFF_BY
 from toolkit.geometry import Array
@@ -76,7 +76,9 @@ def _place(evidence: Evidence) -> _Place | None:
         by_data = np.maximum(1.0 - (fitted.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
         error_m = fitted.error[LEVER] / np.sqrt(by_data)
         slip = _slip(fitted.value[LEVER], fitted.cov[LEVER, LEVER], evidence.sequence.rig.T_imu_cam)
-        return _Place(fitted.value[LEVER] / by_data, error_m, SYSTEMATIC_FITTED_M + FITTED_SIGMAS * error_m, slip)
+        return _Place(
+            fitted.value[LEVER] / by_data, error_m, SYSTEMATIC_FITTED_M + LIMITS["imu"].sigmas * error_m, slip
+        )
     if regressed is None:
         return None
     least_m = SYSTEMATIC_M[evidence.sequence.motion_kind] + SIGMAS * regressed.lever_error_m

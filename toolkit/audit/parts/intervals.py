@@ -114,12 +114,12 @@ def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Arra
     beside odometry for more than ``MOST_BIAS_RADPS``. An IMU measures no velocity: there the camera's own is taken.
     Only intervals whose camera motion is known.
     """
-    return _median(_one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))[1])
+    return _median(_one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))[1])
 
 
 def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
     """Return the median of the same residuals in each known interval that has any (M,), in pixels."""
-    interval, each_px = _one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))
+    interval, each_px = _one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))
     first = np.flatnonzero(np.diff(interval, prepend=-1))
     return np.array([_median(part) for part in np.split(each_px, first[1:])]) if interval.size else np.empty(0)
 
@@ -129,8 +129,8 @@ def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
     return _median(_one_step_px(sequence, camera, moved_by(camera, sequence))[1])
 
 
-def _moved(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
-    """Return the camera's motion (K - 1, 4, 4) as the motion samples have it through an extrinsic."""
+def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
+    """Return the camera's motion (K - 1, 4, 4) as the samples have it through an extrinsic, less a gyro's bias."""
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     w_radps, v_mps = mean[:, 3:], mean[:, :3]
     R_imu_cam = T_imu_cam[:3, :3]
