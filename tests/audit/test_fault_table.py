@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
+from toolkit.geometry import IntArray
 from toolkit.report.comparison_text import audit_text
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -31,6 +32,38 @@ class Case(NamedTuple):
     scenarios: tuple[str, ...] = ALL
 
 
+def half_as_large(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Give the K of images of another size, by the dose."""
+    rig = sequence.rig
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    return replace(sequence, rig=replace(rig, **{name: dose * getattr(rig, name) for name in names}))
+
+
+def _at(t_ns: IntArray, dose: float, first_ns: int) -> IntArray:
+    return (first_ns + dose * (t_ns - first_ns)).astype(np.int64)
+
+
+def samples_stamped_in(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Multiply the time of the samples, and not of the frames, by the dose: another unit."""
+    t_ns = _at(sequence.motion.t_ns, dose, int(sequence.frames_t_ns[0]))
+    return replace(sequence, motion=sequence.motion.of(t_ns, sequence.motion.values))
+
+
+def stamps_in(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Multiply all times by the dose."""
+    first_ns = int(sequence.frames_t_ns[0])
+    all_alike = replace(samples_stamped_in(sequence, dose, seed), frames_t_ns=_at(sequence.frames_t_ns, dose, first_ns))
+    return replace(all_alike, truth=None, prior=None)
+
+
+def mirrored(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Mirror the images about the principal point's column, which exchanges left and right."""
+    u_left, u_right, v = sequence.observations.uv_px.T
+    twice = 2.0 * sequence.rig.cx_px
+    uv_px = np.stack([twice - u_right, twice - u_left, v], axis=1)
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+
+
 CASES = [
     Case(faults.swapped_images, 1.0, "swapped-coordinates", "repaired", "left and right are exchanged"),
     Case(faults.swapped_images, 0.4, "swapped-coordinates", "repaired", "whole tracks"),
@@ -40,6 +73,12 @@ CASES = [
     Case(faults.identity_intrinsics, 1.0, "intrinsics", "blocks", "fx_px = 1 "),
     Case(faults.zero_intrinsics, 0.0, "intrinsics", "blocks", "fx_px = 0 "),
     Case(faults.transposed_intrinsics, 0.0, "intrinsics", "blocks", "(cx_px, cy_px) = (0, 0)"),
+    Case(half_as_large, 0.5, "intrinsics", "blocks", "looks like that of images of 0.5"),
+    Case(stamps_in, 1000.0, "units", "blocks", "they are not in seconds"),
+    Case(stamps_in, 0.001, "units", "blocks", "they are not in seconds"),
+    Case(samples_stamped_in, 1000.0, "sparse-motion", "blocks", "check both"),
+    Case(mirrored, 0.0, "mixed-axes", "blocks", "images that are mirrored look so", TWIST),
+    Case(mirrored, 0.0, "accelerometer-axes", "blocks", "images that are mirrored look so", IMU),
     Case(faults.shifted_pixels, 5000.0, "intrinsics", "blocks", "lies outside the sightings"),
     Case(faults.baseline_unit, 1000.0, "units", "repaired", "it is in millimetres, 0.54 m", TWIST),
     Case(faults.baseline_unit, 1000.0, "units", "blocks", "baseline_m is 110", IMU),

@@ -101,5 +101,5 @@ def test_a_sound_drive_is_not_accused_and_one_with_a_wrong_focal_length_is(seed:
 
 def test_a_drive_that_hardly_turns_says_what_would_not_show() -> None:
     short = recorded(DRIVE, 0, 5.0)
-    assert "cx off by" in audit(short).undecided["miscalibration"]
+    assert "fx off by" in audit(short).undecided["miscalibration"]
     assert hidden(SelfCalibration(np.zeros(COMMON), 1e-12 * np.eye(COMMON), 1), "twist") is None
