@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import audit, lever_arm
-from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.parts.bundle import COMMON, LEVER
 from toolkit.audit.parts.self_calibration import SelfCalibration
 from toolkit.geometry import Array, se3
@@ -70,3 +70,11 @@ def test_a_displaced_camera_beside_an_imu_is_told_once() -> None:
     sound = simulate(replace(FLIGHT, duration_s=8.0), 6)
     found = [finding.fault for finding in audit(faults.displaced_camera(sound, 0.25, 6)).findings]
     assert found == ["lever-arm"]
+
+
+def test_a_place_that_is_known_badly_says_what_would_not_show() -> None:
+    evidence = Evidence(recorded())
+    evidence.__dict__["self_calibration"] = SelfCalibration(np.zeros(COMMON), 0.15**2 * np.eye(COMMON), 1)
+    said = lever_arm.check(evidence)
+    assert isinstance(said, Undecided)
+    assert "0.7 m along x, 0.7 m along y, 0.7 m along z would not show" in said.why

@@ -14,7 +14,7 @@ from toolkit.audit.parts.bundle import LEVER
 from toolkit.audit.parts.calibration_limits import LIMITS
 from toolkit.audit.parts.placement import MOST_SIGMAS, is_there, metres, share_of_way
 from toolkit.audit.parts.self_calibration import OFF_BY
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 
 # Each axis counts from so many standard errors on (by the self-calibration, as many as all that it finds), beyond what
 # sound recordings at hand have (m). The velocities of cars are those of another point, or slip: 0.43 to 0.85 m along x
@@ -22,6 +22,8 @@ from toolkit.geometry import Array
 SIGMAS, SYSTEMATIC_M, SYSTEMATIC_FITTED_M = 5.0, {"twist": 0.6, "imu": 0.05}, 0.015
 # An axis about which the position is known worse than this (m) is not judged.
 LARGEST_ERROR_M = 0.25
+# Where a camera must be farther off than this (m) to be told, it is said.
+HIDDEN_M = {"twist": 1.2, "imu": 0.5}
 # The prior of the self-calibration is taken off again: by the share of what is known that the data tell, or this.
 LEAST_BY_DATA = 1e-3
 # A place that a slip of who wrote the file would give is told if it is so far (m) from the one given; what sound
@@ -51,7 +53,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return Undecided(f"too little rotation: where the camera is along x, y and z is not known{errors}")
     off = judged & (np.abs(found.lacking_m) > found.least_m)
     if not off.any() and not found.slip:
-        return None
+        return _hidden(found, judged, HIDDEN_M[kind])
     axes = np.flatnonzero(off if off.any() else judged).tolist()
     told = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
@@ -67,6 +69,15 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         harmful=False,
         warns=True,
     )
+
+
+def _hidden(found: _Place, judged: BoolArray, most_m: float) -> Undecided | None:
+    """Say how far off the camera could be along the axes that are judged, where that is much."""
+    far = np.flatnonzero(judged & (found.least_m > most_m)).tolist()
+    if not far:
+        return None
+    parts = ", ".join(f"{found.least_m[k]:.1f} m along {'xyz'[k]}" for k in far)
+    return Undecided(f"too little rotation: a camera that is off by less than {parts} would not show")
 
 
 def _place(evidence: Evidence) -> _Place | None:
