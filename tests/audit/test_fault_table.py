@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
+from toolkit.geometry import IntArray
 from toolkit.report.comparison_text import audit_text
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -31,6 +32,38 @@ class Case(NamedTuple):
     scenarios: tuple[str, ...] = ALL
 
 
+def half_as_large(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Give the K of images of another size, by the dose."""
+    rig = sequence.rig
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    return replace(sequence, rig=replace(rig, **{name: dose * getattr(rig, name) for name in names}))
+
+
+def _at(t_ns: IntArray, dose: float, first_ns: int) -> IntArray:
+    return (first_ns + dose * (t_ns - first_ns)).astype(np.int64)
+
+
+def samples_stamped_in(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Multiply the time of the samples, and not of the frames, by the dose: another unit."""
+    t_ns = _at(sequence.motion.t_ns, dose, int(sequence.frames_t_ns[0]))
+    return replace(sequence, motion=sequence.motion.of(t_ns, sequence.motion.values))
+
+
+def stamps_in(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Multiply all times by the dose."""
+    first_ns = int(sequence.frames_t_ns[0])
+    all_alike = replace(samples_stamped_in(sequence, dose, seed), frames_t_ns=_at(sequence.frames_t_ns, dose, first_ns))
+    return replace(all_alike, truth=None, prior=None)
+
+
+def mirrored(sequence: Sequence, dose: float, seed: int) -> Sequence:
+    """Mirror the images about the principal point's column, which exchanges left and right."""
+    u_left, u_right, v = sequence.observations.uv_px.T
+    twice = 2.0 * sequence.rig.cx_px
+    uv_px = np.stack([twice - u_right, twice - u_left, v], axis=1)
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
+
+
 CASES = [
     Case(faults.swapped_images, 1.0, "swapped-coordinates", "repaired", "left and right are exchanged"),
     Case(faults.swapped_images, 0.4, "swapped-coordinates", "repaired", "whole tracks"),
@@ -40,6 +73,12 @@ CASES = [
     Case(faults.identity_intrinsics, 1.0, "intrinsics", "blocks", "fx_px = 1 "),
     Case(faults.zero_intrinsics, 0.0, "intrinsics", "blocks", "fx_px = 0 "),
     Case(faults.transposed_intrinsics, 0.0, "intrinsics", "blocks", "(cx_px, cy_px) = (0, 0)"),
+    Case(half_as_large, 0.5, "intrinsics", "blocks", "looks like that of images of 0.5"),
+    Case(stamps_in, 1000.0, "units", "blocks", "they are not in seconds"),
+    Case(stamps_in, 0.001, "units", "blocks", "they are not in seconds"),
+    Case(samples_stamped_in, 1000.0, "sparse-motion", "blocks", "check both"),
+    Case(mirrored, 0.0, "mixed-axes", "blocks", "images that are mirrored look so", TWIST),
+    Case(mirrored, 0.0, "accelerometer-axes", "blocks", "images that are mirrored look so", IMU),
     Case(faults.shifted_pixels, 5000.0, "intrinsics", "blocks", "lies outside the sightings"),
     Case(faults.baseline_unit, 1000.0, "units", "repaired", "it is in millimetres, 0.54 m", TWIST),
     Case(faults.baseline_unit, 1000.0, "units", "blocks", "baseline_m is 110", IMU),
@@ -63,17 +102,22 @@ CASES = [
     Case(faults.camera_clock, -0.02, "time-offset", "repaired", "stamped early", IMU),
     Case(faults.camera_clock, 0.06, "time-offset", "repaired", "stamped late", TWIST),
     Case(faults.camera_clock, 0.25, "time-offset", "repaired", "stamped late"),
+    Case(faults.gyro_bias, 0.05, "gyro-bias", "repaired", "the prior's covariance of it is widened", TWIST),
+    Case(faults.gyro_bias, 0.15, "gyro-bias", "repaired", "the prior's covariance of it is widened"),
     Case(faults.disturbed_motion, 2.0, "conflict", "warned", "vision and odometry disagree at 5-10 s", TWIST),
     Case(faults.disturbed_motion, 2.0, "conflict", "warned", "m/s^2 of specific force", IMU),
     Case(faults.moving_objects, 0.8, "conflict", "warned"),
     Case(faults.turned_camera, 0.15, "miscalibration", "warned", "as if it were turned"),
     Case(faults.turned_camera, 0.035, "miscalibration", "warned", "about its own x, y, z", IMU),
+    Case(faults.wrong_focal_length, 1.1, "miscalibration", "warned", "tracks and odometry fit fx_px = 7", TWIST),
+    Case(faults.wrong_aspect, 0.85, "miscalibration", "warned", "tracks and odometry fit fx_px = 7", TWIST),
+    Case(faults.shifted_centre, 25.0, "miscalibration", "warned", "tracks and odometry fit cx_px = 6", TWIST),
     Case(faults.wrong_focal_length, 1.05, "miscalibration", "warned", "fit fx_px = 45", IMU),
     Case(faults.wrong_aspect, 0.95, "miscalibration", "warned", "fit fx_px = 4", IMU),
     Case(faults.shifted_centre, 15.0, "miscalibration", "warned", "fit cx_px = 3", IMU),
-    Case(faults.extrinsic_unit, -1.0, "miscalibration", "warned", "as if its sign were changed", IMU),
-    Case(faults.shifted_pixels, 30.0, "miscalibration", "warned", "px off", TWIST),
-    Case(faults.misaligned_rows, 60.0, "miscalibration", "warned", "px off", TWIST),
+    Case(faults.extrinsic_unit, -1.0, "lever-arm", "warned", "as if its sign were changed", IMU),
+    Case(faults.shifted_pixels, 30.0, "miscalibration", "warned", "tracks and odometry fit cx_px = 64", TWIST),
+    Case(faults.misaligned_rows, 60.0, "miscalibration", "warned", "tracks and odometry fit cy_px = 21", TWIST),
     Case(faults.linear_unit, 1.1, "vision-scale", "warned", "% shorter than the odometry's", TWIST),
     Case(faults.stretched_disparity, 0.9, "vision-scale", "warned", "% longer than the odometry's", TWIST),
     Case(faults.displaced_camera, 1.0, "lever-arm", "warned", "the camera is off by", IMU),

@@ -262,6 +262,27 @@ def test_a_gyro_bias_that_a_prior_allows_is_left_to_it(clean_recording: Make) ->
     assert outcome.sequence.prior is allowed
 
 
+@pytest.mark.parametrize("bias_radps", [0.1, -0.15])
+def test_a_bias_of_odometry_without_a_prior_that_estimators_do_not_expect_is_taken_off(
+    clean_recording: Make, bias_radps: float
+) -> None:
+    clean = clean_recording("drive")
+    motion = replace(clean.motion, w_radps=clean.motion.w_radps + np.array([0.0, bias_radps, 0.0]))
+    outcome = audit(replace(clean, motion=motion, prior=None))
+    assert [(finding.fault, finding.repaired, finding.blocking) for finding in outcome.findings] == [
+        ("gyro-bias", True, False)
+    ]
+    left_radps = outcome.sequence.motion.values[:, 3:] - clean.motion.values[:, 3:]
+    np.testing.assert_allclose(left_radps, np.zeros_like(left_radps), atol=0.0045)  # three standard errors
+
+
+def test_a_rate_that_no_gyro_reads_too_much_is_a_disagreement(clean_recording: Make) -> None:
+    clean = clean_recording("drive")
+    motion = replace(clean.motion, w_radps=clean.motion.w_radps + np.array([0.0, 0.0, 0.25]))
+    blocking = {finding.fault for finding in audit(replace(clean, motion=motion)).findings if finding.blocking}
+    assert blocking == {"disagreement"}
+
+
 def test_the_gyro_bias_of_an_imu_is_found_on_its_axis(clean_recording: Make) -> None:
     clean = clean_recording("flight")
     motion = replace(clean.motion, gyro_radps=clean.motion.gyro_radps + np.array([0.0, 0.02, 0.0]))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.mixed_axes import axes_named, cauchy, sigmas, signed_axes
+from toolkit.audit.mixed_axes import MIRRORED, axes_named, cauchy, sigmas, signed_axes
 from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
@@ -65,7 +65,7 @@ def check(evidence: Evidence) -> Symptom | None:
             f"the accelerometer's x, y, z are the gyro's {axes_named(orders[best])}: of the change of the camera's "
             f"velocity the samples leave {given_mps2:.2f} m/s^2 as given, {best_mps2:.2f} m/s^2 then (median)"
         ),
-        treatment="its channels are exchanged or have the wrong sign: set them right",
+        treatment=f"its channels are exchanged or have the wrong sign: set them right{MIRRORED}",
         remedy=None,
         spoils_vision=True,
     )

@@ -4,6 +4,7 @@ Where the vehicle stands, its gyro must read nothing. An IMU's bias is one of th
 to 0.002 rad/s; another recording without a standstill is compared with the rotation its own tracks show from frame to
 frame, which is good to half a degree a second only. An estimator whose prior has 0 +- 0.0005
 rad/s and that meets a bias of 0.05 believes the prior and loses its way: the prior is then widened by what it lacks.
+Beside odometry that has no prior, estimators begin with a bias of none: what is too much for that is taken off.
 """
 
 from dataclasses import replace
@@ -29,6 +30,8 @@ SYSTEMATIC_CAMERA = 0.00125
 # The same of self-calibrations: on V2_01 they are off by up to 0.0009 rad/s, six of their standard errors.
 SYSTEMATIC_FIT = 0.0004
 SIGMAS = 4.0
+# What estimators begin with beside odometry without a prior: a bias of zero, with this standard deviation (rad/s).
+UNKNOWN_SIGMA_RADPS = 0.02
 
 
 class _Reading(NamedTuple):
@@ -52,6 +55,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     values = ", ".join(f"{b:.4f} +- {e:.4f}" for b, e in zip(bias_radps, error_radps, strict=True))
     detail = f"the gyro reads ({values}) rad/s too much about x, y, z ({source})"
+    if prior is None and _is_too_much(evidence.sequence, bias_radps, error_radps):
+        return Symptom(
+            count=int(biased.sum()),
+            detail=f"{detail}, more than estimators expect that begin with none",
+            treatment="it is taken off",
+            remedy=_taken_off(evidence.sequence, bias_radps),
+        )
     if prior is None or not denied.any():
         return Symptom(
             count=int(biased.sum()),
@@ -73,6 +83,18 @@ def _denied(prior: Prior, bias_radps: Array, error_radps: Array) -> BoolArray:
     """Say about which axes (3,) a prior has the bias elsewhere, beyond what is chance."""
     apart = np.abs(bias_radps - prior.bias[3:])
     return np.asarray(apart > SIGMAS * np.hypot(_sigma_radps(prior), error_radps))
+
+
+def _is_too_much(sequence: Sequence, bias_radps: Array, error_radps: Array) -> bool:
+    """Say whether odometry without a prior has a bias beyond chance where none is expected."""
+    least_radps = SIGMAS * np.hypot(UNKNOWN_SIGMA_RADPS, error_radps)
+    return sequence.motion_kind == "twist" and bool((np.abs(bias_radps) > least_radps).any())
+
+
+def _taken_off(sequence: Sequence, bias_radps: Array) -> Sequence:
+    motion = sequence.motion
+    assert isinstance(motion, TwistSamples)
+    return replace(sequence, motion=replace(motion, w_radps=motion.w_radps - bias_radps))
 
 
 def _sigma_radps(prior: Prior) -> Array:

@@ -21,11 +21,13 @@ RANGE = (0.005, 0.995)
 WIDEST, NARROWEST = 12.0, 0.02
 # An image in pixels is wider than this, one in multiples of the focal length is not.
 NORMALISED = 10.0
-# What a usual lens has.
-USUAL = 1.5
+# What a usual lens has, and the least factor between two sizes of an image; in width and height they are alike to this.
+USUAL, ALIKE = 1.5, 1.3
 # Share by which other intrinsics must lower the tracks' residual: 0.15 and more where the point is off by half a view.
 LEAST_GAIN = 0.05
 TRIED_FRAMES = 300
+# A principal point that is farther than this share of their range from the middle of the sightings is tried in it.
+MOST_OFF_MIDDLE = 0.2
 # Pixels are square but for a rescaled image's.
 MOST_STRETCHED = 1.5
 
@@ -76,9 +78,12 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
     found: list[tuple[dict[str, Any], str]] = []
     middle, width_px = 0.5 * (low + high), float((high - low).max())
     centre = np.array([rig.cx_px, rig.cy_px])
-    if ((centre < low) | (centre > high)).any():
+    if (np.abs(centre - middle) > MOST_OFF_MIDDLE * (high - low)).any():
         u, v = (f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True))
-        where = f"(cx_px, cy_px) = ({centre[0]:.0f}, {centre[1]:.0f}) lies outside the sightings, u {u}, v {v} px"
+        lies = "outside" if ((centre < low) | (centre > high)).any() else "far off the middle of"
+        where = f"(cx_px, cy_px) = ({centre[0]:.0f}, {centre[1]:.0f}) lies {lies} the sightings, u {u}, v {v} px"
+        if (resized := _resized(rig, middle)) is not None:
+            return [resized]
         found.append(({"cx_px": float(middle[0]), "cy_px": float(middle[1])}, where))
     if not NARROWEST * rig.fx_px < width_px < WIDEST * rig.fx_px:
         angle_deg = np.degrees(2.0 * np.arctan2(0.5 * width_px, rig.fx_px))
@@ -89,6 +94,21 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
         words = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are not square by far"
         found.append(({"fy_px": rig.fx_px}, words))
     return found
+
+
+def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None:
+    """Return the K of images that are larger or smaller by one factor, if that brings the principal point there."""
+    ratio = middle / np.maximum([rig.cx_px, rig.cy_px], 1.0)
+    factor = float(np.sqrt(ratio[0] * ratio[1]))
+    if ratio.max() > ALIKE * ratio.min() or 1.0 / USUAL < factor < USUAL:
+        return None
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    words = (
+        f"K with (cx_px, cy_px) = ({rig.cx_px:.0f}, {rig.cy_px:.0f}) looks like that of images of {1.0 / factor:.2g}"
+    )
+    return {
+        name: factor * getattr(rig, name) for name in names
+    }, f"{words} times the size of those the sightings are in"
 
 
 def _own_px(sequence: Sequence) -> float:

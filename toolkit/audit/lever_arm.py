@@ -11,26 +11,36 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LEVER
-from toolkit.audit.parts.calibration_limits import SIGMAS as FITTED_SIGMAS
+from toolkit.audit.parts.calibration_limits import LIMITS
+from toolkit.audit.parts.placement import MOST_SIGMAS, is_there, metres, share_of_way
 from toolkit.audit.parts.self_calibration import OFF_BY
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 
 # Each axis counts from so many standard errors on (by the self-calibration, as many as all that it finds), beyond what
 # sound recordings at hand have (m). The velocities of cars are those of another point, or slip: 0.43 to 0.85 m along x
-# in all of seven; beside IMUs it is 0.06 m at most.
-SIGMAS, SYSTEMATIC_M = 5.0, {"twist": 0.6, "imu": 0.05}
+# in all of seven; beside IMUs a regression errs by 0.06 m at most, a self-calibration by nothing.
+SIGMAS, SYSTEMATIC_M, SYSTEMATIC_FITTED_M = 5.0, {"twist": 0.6, "imu": 0.05}, 0.015
 # An axis about which the position is known worse than this (m) is not judged.
 LARGEST_ERROR_M = 0.25
+# Where a camera must be farther off than this (m) to be told, it is said.
+HIDDEN_M = {"twist": 1.2, "imu": 0.5}
 # The prior of the self-calibration is taken off again: by the share of what is known that the data tell, or this.
 LEAST_BY_DATA = 1e-3
+# A place that a slip of who wrote the file would give is told if it is so far (m) from the one given; what sound
+# recordings have stands beside the scatter (m).
+LEAST_APART_M, SLIP_M = 0.05, 0.02
 
 
 class _Place(NamedTuple):
-    """What the camera's position in the IMU frame lacks (3,) m, its standard errors (3,) m, and how many count."""
+    """What the camera's position in the IMU frame lacks (3,) m, its standard errors (3,) m, and from where it counts.
+
+    ``slip`` says in words by what slip it would be there, if one explains it.
+    """
 
     lacking_m: Array
     error_m: Array
-    sigmas: float
+    least_m: Array
+    slip: str = ""
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -41,15 +51,19 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if found is None or not (judged := found.error_m < LARGEST_ERROR_M).any():
         errors = "" if found is None else f" to {', '.join(f'{error:.1f}' for error in found.error_m)} m"
         return Undecided(f"too little rotation: where the camera is along x, y and z is not known{errors}")
-    off = judged & (np.abs(found.lacking_m) > SYSTEMATIC_M[kind] + found.sigmas * found.error_m)
-    if not off.any():
-        return None
-    axes = np.flatnonzero(off).tolist()
+    off = judged & (np.abs(found.lacking_m) > found.least_m)
+    if not off.any() and not found.slip:
+        return _hidden(found, judged, HIDDEN_M[kind])
+    axes = np.flatnonzero(off if off.any() else judged).tolist()
     told = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
+    given = metres(evidence.sequence.rig.T_imu_cam[:3, 3])
     return Symptom(
         count=len(axes),
-        detail=f"residuals turn with the vehicle: the camera is off by {', '.join(told)} from where T_imu_cam has it",
+        detail=(
+            f"residuals turn with the vehicle: the camera is off by {', '.join(told)} from {given}, where T_imu_cam "
+            f"has it{found.slip}"
+        ),
         treatment=f"check the translation of T_imu_cam{other_point}",
         remedy=None,
         harmful=False,
@@ -57,13 +71,50 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
+def _hidden(found: _Place, judged: BoolArray, most_m: float) -> Undecided | None:
+    """Say how far off the camera could be along the axes that are judged, where that is much."""
+    far = np.flatnonzero(judged & (found.least_m > most_m)).tolist()
+    if not far:
+        return None
+    parts = ", ".join(f"{found.least_m[k]:.1f} m along {'xyz'[k]}" for k in far)
+    return Undecided(f"too little rotation: a camera that is off by less than {parts} would not show")
+
+
 def _place(evidence: Evidence) -> _Place | None:
     """Return the place by the self-calibration or, where there is none, by the regression."""
     fitted, regressed = evidence.self_calibration, evidence.alignment
     if fitted is not None:
         by_data = np.maximum(1.0 - (fitted.error[LEVER] / OFF_BY[LEVER]) ** 2, LEAST_BY_DATA)
-        return _Place(fitted.value[LEVER] / by_data, fitted.error[LEVER] / np.sqrt(by_data), FITTED_SIGMAS)
-    return None if regressed is None else _Place(regressed.lever_m, regressed.lever_error_m, SIGMAS)
+        error_m = fitted.error[LEVER] / np.sqrt(by_data)
+        slip = _slip(fitted.value[LEVER], fitted.cov[LEVER, LEVER], evidence.sequence.rig.T_imu_cam)
+        return _Place(
+            fitted.value[LEVER] / by_data, error_m, SYSTEMATIC_FITTED_M + LIMITS["imu"].sigmas * error_m, slip
+        )
+    if regressed is None:
+        return None
+    least_m = SYSTEMATIC_M[evidence.sequence.motion_kind] + SIGMAS * regressed.lever_error_m
+    return _Place(regressed.lever_m, regressed.lever_error_m, least_m)
+
+
+def _slip(lacking_m: Array, cov_m2: Array, T_imu_cam: Array) -> str:
+    """Say how the translation was written down otherwise than it is meant, if the camera then is where it is found."""
+    given = T_imu_cam[:3, 3]
+    meant = {"its sign were changed": -given, "it were that of the inverse": -T_imu_cam[:3, :3].T @ given}
+    likely = {how: place for how, place in meant.items() if _explains(place - given, lacking_m, cov_m2)}
+    if not likely:
+        return ""
+    how, place = min(likely.items(), key=lambda one: float(np.linalg.norm(one[1] - given - lacking_m)))
+    return f", as if {how}: {metres(place)}"
+
+
+def _explains(way_m: Array, lacking_m: Array, cov_m2: Array) -> bool:
+    """Say whether the end of a way (3,) m from the given place is where the camera is, and not beside the way."""
+    if float(np.linalg.norm(way_m)) < LEAST_APART_M:
+        return False
+    cov_m2 = cov_m2 + SLIP_M**2 * np.eye(3)
+    share = share_of_way(lacking_m, cov_m2, way_m)
+    beside = lacking_m - share.value * way_m
+    return is_there(share) and float(beside @ np.linalg.solve(cov_m2, beside)) <= MOST_SIGMAS**2
 
 
 FAULT = Fault(

@@ -2,8 +2,8 @@
 
 Too little to be told from noise in single frames, and enough to bend every trajectory. From frame to frame the
 recording does not say what is wrong: a camera turned by an angle and a principal point off by the focal length times
-that angle look the same. Beside an IMU, points that are followed for a second tell most of it apart
-(`parts.self_calibration`).
+that angle look the same. Points that are followed for a second tell most of it apart (`parts.self_calibration`); beside
+odometry, which slips for as long, the turn from frame to frame is judged as well.
 """
 
 from typing import NamedTuple
@@ -12,12 +12,13 @@ import numpy as np
 
 from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.calibration_limits import Wrong, hidden, wrong
+from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, hidden, wrong
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
-from toolkit.audit.parts.self_calibration import SelfCalibration
+from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
 from toolkit.audit.parts.turn import turn_of_camera
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
+from toolkit.measured_motion import MotionKind
 from toolkit.sequence import StereoRig
 
 SIGMAS = 5.0
@@ -34,7 +35,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     intervals = evidence.intervals
     if intervals is None:
         return evidence.blind
-    judged = _fitted(evidence.self_calibration, evidence.sequence.rig) or _by_turn(evidence, intervals)
+    judged = _judged(evidence, intervals)
     wrongs, rotation = list(judged.wrongs), rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
         said = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
@@ -62,19 +63,34 @@ class _Judged(NamedTuple):
     hidden: str | None
 
 
-def _fitted(found: SelfCalibration | None, rig: StereoRig) -> _Judged | None:
-    return None if found is None else _Judged(wrong(found, rig), hidden(found))
+def _judged(evidence: Evidence, intervals: Intervals) -> _Judged:
+    """Judge by the self-calibration; beside odometry, and where there is none, also from frame to frame."""
+    sequence = evidence.sequence
+    kind, found = sequence.motion_kind, evidence.self_calibration
+    if kind == "twist":
+        found = self_calibration(sequence, evidence.camera_motion, intervals)
+    fitted = _fitted(found, sequence.rig, kind)
+    if found is not None and kind == "imu":
+        return fitted
+    looks = _by_turn(evidence, intervals)
+    unseen = [one for one in (looks.hidden, fitted.hidden) if one is not None]
+    return _Judged(fitted.wrongs or looks.wrongs, "; ".join(unseen) or None)
+
+
+def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> _Judged:
+    if found is not None:
+        return _Judged(wrong(found, rig, kind), hidden(found, kind))
+    unseen = f"no tracks are seen for long enough beside the {BESIDE[kind]}"
+    return _Judged([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
 
 
 def _by_turn(evidence: Evidence, intervals: Intervals) -> _Judged:
-    """Judge where the camera looks from frame to frame, which leaves the intrinsics beside an IMU open."""
+    """Judge where the camera looks from frame to frame, which leaves the intrinsics open."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
     turn = turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
-        looks = _undecided(float(least_rad.min()), kind == "twist")
-        unfit = "no tracks are seen for long enough beside the IMU, or no calibration near the given one fits them"
-        return _Judged([], looks or (f"the intrinsics: {unfit}" if kind == "imu" else None))
+        return _Judged([], _undecided(float(least_rad.min()), kind == "twist"))
     angle = float(np.linalg.norm(turn.rad))
     said = (
         f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "

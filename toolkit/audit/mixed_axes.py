@@ -55,6 +55,10 @@ class Reading(NamedTuple):
     other_m: Array
 
 
+# What a mirror image does to both: it turns the other way about two axes and moves the other way along one.
+MIRRORED = "; images that are mirrored look so too"
+
+
 def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Find the extrinsic with which samples and camera agree; take it where it is not the given one."""
     if evidence.intervals is None:
@@ -91,13 +95,13 @@ def _exchanged(alone: str) -> Symptom:
         return Symptom(
             count=1,
             detail="the gyro turns as the camera does, and the velocities go elsewhere, which no turn makes of both",
-            treatment="the velocities' channels are exchanged or have the wrong sign: set them right",
+            treatment=f"the velocities' channels are exchanged or have the wrong sign: set them right{MIRRORED}",
             remedy=None,
         )
     return Symptom(
         count=1,
         detail=f"by the rotations alone the gyro's x, y, z are the extrinsic's {alone}, which no turn makes of all",
-        treatment="channels of the samples are exchanged or have the wrong sign, and not all alike: set them right",
+        treatment=f"channels of the samples are exchanged or have the wrong sign: set them right{MIRRORED}",
         remedy=None,
         spoils_vision=True,
     )
@@ -238,5 +242,5 @@ FAULT = Fault(
     "mixed-axes",
     "motion samples and camera extrinsic in different axes, or an inverted extrinsic",
     check,
-    after=("extrinsic-convention",),
+    after=("extrinsic-convention", "sparse-motion"),
 )

@@ -7,6 +7,10 @@ from toolkit.audit.parts.intervals import is_comparable
 from toolkit.audit.time_gap import GAP_RATIO
 from toolkit.resampling import NS_PER_S
 
+# A vehicle turns and stops within so long (s); samples that come more rarely, and so much more rarely than frames, are
+# no motion.
+MOST_STEP_S, MOST_RATIO = 2.0, 20.0
+
 
 def check(evidence: Evidence) -> Symptom | None:
     """Compare the usual step of the samples with that of the frames; more of those in one is what a hole would be."""
@@ -18,9 +22,18 @@ def check(evidence: Evidence) -> Symptom | None:
     )
     if step_s <= GAP_RATIO * frame_s:
         return None
+    detail = f"motion samples come every {step_s:.2g} s and frames every {frame_s:.2g} s"
+    if step_s > max(MOST_STEP_S, MOST_RATIO * frame_s):
+        return Symptom(
+            count=int(sequence.motion.t_ns.size),
+            detail=detail,
+            treatment="so few tell nothing, as of stamps in another unit than the frames': check both",
+            remedy=None,
+            spoils_vision=True,
+        )
     return Symptom(
         count=int(sequence.motion.t_ns.size),
-        detail=f"motion samples come every {step_s:.2g} s and frames every {frame_s:.2g} s",
+        detail=detail,
         treatment="between two samples the motion is a straight line, whose error no stated noise holds",
         remedy=None,
         harmful=False,

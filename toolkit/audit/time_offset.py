@@ -33,6 +33,8 @@ REFINEMENTS = 5
 # interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
 # which is half of one from the middle, and be one off: an indoor recording that is taken for sound is by 0.8.
 SIGMAS, LEAST_S, LEAST_TWIST_INTERVALS = 5.0, 0.005, 1.5
+# Beside an IMU no sound recording at hand is farther beyond than 3.1 standard errors; from so many on it is said.
+DOUBTFUL_SIGMAS = 3.2
 # Between frames nothing of that can be told from the clock, and what the shift mends is either.
 LEAST_OFF_FRAMES = 0.25
 # The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
@@ -98,9 +100,20 @@ def _refined(found: Scalar | None, evidence: Evidence) -> Scalar | None:
 def _unknown(sequence: Sequence, found: Scalar) -> Undecided | None:
     """Say how well an offset is known that is no more than chance, where that is badly."""
     if found.error <= _largest_error_s(sequence):
-        return None
+        return _doubtful(sequence, found)
     known = f"the offset of camera and gyro is known to {1e3 * found.error:.0f} ms"
     return Undecided(f"too little change of rotation: {known}")
+
+
+def _doubtful(sequence: Sequence, found: Scalar) -> Undecided | None:
+    """Say of an IMU's recording that its offset is between what chance makes and what is told."""
+    if isinstance(sequence.motion, TwistSamples) or abs(found.value) < max(LEAST_S, DOUBTFUL_SIGMAS * found.error):
+        return None
+    late = "late" if found.value < 0.0 else "early"
+    seen = f"{1e3 * abs(found.value):.0f} +- {1e3 * found.error:.0f} ms"
+    return Undecided(
+        f"frames look as if stamped {late} by {seen}, too little change of rotation to tell that from chance"
+    )
 
 
 def _largest_error_s(sequence: Sequence) -> float:

@@ -39,6 +39,8 @@ WITHIN_FACTOR, SIGMAS = 1.25, 5.0
 WITHIN_FACTOR_OF_SPEED = 1.08
 # Speeds and rates of rotation that are both off by more than the first factor, and alike to the second: the stamps.
 LEAST_OF_STAMPS, STAMPS_ALIKE = 1.3, 1.15
+# Between two frames of a vehicle's camera there is this much time (s).
+LEAST_FRAME_S, MOST_FRAME_S = 1e-3, 5.0
 IN_A_PART = " in a part of the recording and not in another"
 # Baselines of rigs on vehicles, in the hand or in the air (m), and the farthest that a camera stands from its IMU.
 LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
@@ -55,7 +57,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Count the quantities in another unit; convert them where the unit is certain."""
     found: list[_Wrong] = []
     now = evidence
-    stamps = _stamps(evidence)
+    stamps = _stamps(evidence) or _frame_rate(evidence)
     measures = (_baseline, _lever_arm, _speed, _rotation, _force, _truth)
     found += [] if stamps is None else [stamps]
     for measure in measures if stamps is None else ():
@@ -92,6 +94,16 @@ def _stamps(evidence: Evidence) -> _Wrong | None:
         "did, so that they are not in seconds",
         None,
     )
+
+
+def _frame_rate(evidence: Evidence) -> _Wrong | None:
+    """Tell of stamps by which frames come as no camera's on a vehicle do."""
+    if evidence.sequence.frame_count < 2 or evidence.intervals is None:
+        return None
+    step_s = float(np.median(np.diff(evidence.sequence.frames_t_ns))) / NS_PER_S
+    if LEAST_FRAME_S <= step_s <= MOST_FRAME_S:
+        return None
+    return _Wrong(f"by the stamps frames come every {step_s:.2g} s, as no camera's do: they are not in seconds", None)
 
 
 def _baseline(evidence: Evidence) -> _Wrong | None:

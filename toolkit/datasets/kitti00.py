@@ -14,7 +14,7 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray, se3_inverse
 from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models.noise import pixel_covariance
-from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
+from toolkit.sequence import ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig
 
 CITES = ("geiger2013kitti", "gtsam")
 # The first IMU sample is followed by a gap of 1.92 s, which covers frames 0 to 13.
@@ -36,6 +36,7 @@ _FACTS = (
     "the tracks carry a scale error of -1.6 %, which stereo alone cannot see; "
     "stereo bundle adjustment ends with about 2.2 % drift",
     "camera and IMU clocks were aligned by yaw rate to +-5 ms",
+    ONE_ROW_FOR_BOTH,
 )
 
 

@@ -1,4 +1,4 @@
-"""One window of an adjustment of key frames and points beside an IMU, with the calibration unknown, linearised.
+"""One window of an adjustment of key frames and points beside measured motion, linearised, its calibration unknown.
 
 Unknowns are the states of the key frames (9 each: turn on the right, position, velocity in the axes of the first), the
 gravity of the window (3), and the calibration that all windows share (19). Points are eliminated track by track, states
@@ -12,15 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.strides import Strides
-from toolkit.geometry import Array, IntArray, se3, skew, so3_exp, so3_log
+from toolkit.audit.parts.strides import ImuStrides, TwistStrides
+from toolkit.geometry import Array, IntArray, se3, skew, so3_exp
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
 STATE, GRAVITY, COMMON = 9, 3, 19
 # Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
 # in its own axes (rad), its position in the IMU (m), how much later than its stamps it saw (s), and by how much more so
-# in the second half of the recording than in the first (s); the biases of gyro and accelerometer.
+# in the second half of the recording than in the first (s); the biases of gyro and accelerometer, or beside odometry of
+# the gyro and the turn of the velocities (rad).
 FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE, CHANGE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11, 12
 GYRO_BIAS, _CAMERA, _BIASES = slice(13, 16), 13, slice(13, 19)
 CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
@@ -72,7 +73,7 @@ class Window(NamedTuple):
     w_radps: Array
     gravity: Array
     later: float
-    strides: Strides
+    strides: ImuStrides | TwistStrides
     key: IntArray
     track: IntArray
     uv_px: Array
@@ -93,13 +94,6 @@ class Window(NamedTuple):
             gravity=self.gravity + own[-GRAVITY:],
             points=self.points + points,
         )
-
-
-class Noise(NamedTuple):
-    """Densities of the gyro (rad/s/sqrt(Hz)) and the accelerometer (m/s^2/sqrt(Hz))."""
-
-    gyro: float
-    accel: float
 
 
 class Reduced(NamedTuple):
@@ -134,10 +128,10 @@ def moved(window: Window, reduced: Reduced, step: Array) -> Window:
     return window.moved(*reduced.back.steps(step))
 
 
-def reduce(window: Window, calibration: Calibration, noise: Noise) -> Reduced:
+def reduce(window: Window, calibration: Calibration) -> Reduced:
     """Linearise the window and eliminate its own unknowns and its points."""
     tracks = _tracks(window, calibration)
-    own, by_stride = window.unknowns, _strides(window, calibration, noise)
+    own, by_stride = window.unknowns, _strides(window, calibration)
     information = tracks.information + by_stride.information
     gradients = np.concatenate([tracks.gradients, by_stride.gradients])
     gradient = gradients.sum(axis=0)
@@ -246,10 +240,10 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     return _Tracks(information - flat.T @ flat, gradients, root, point_cross, rest)
 
 
-def _strides(window: Window, calibration: Calibration, noise: Noise) -> _Normal:
-    """Return the normal equations of the IMU between the key frames, with gradients by parts of a second or more."""
+def _strides(window: Window, calibration: Calibration) -> _Normal:
+    """Return the normal equations of the motion between the key frames, with gradients by parts of a second or more."""
     residual, jacobian = stride_equations(window, calibration)
-    whitener = _stride_whitener(window.strides.dt_s, noise)
+    whitener = window.strides.whitener
     residual, jacobian = _applied(whitener, residual), whitener @ jacobian
     strides, own = len(residual), window.unknowns
     information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((strides, own + COMMON))
@@ -264,40 +258,9 @@ def _strides(window: Window, calibration: Calibration, noise: Noise) -> _Normal:
 
 
 def stride_equations(window: Window, calibration: Calibration) -> tuple[Array, Array]:
-    """Return what the strides lack (m, 9), turn, velocity and position, and its change (m, 9, 27) by the unknowns.
-
-    These are the states at both ends, gravity and the biases.
-    """
-    strides = window.strides.biased(calibration.bias)
-    dt_s, one = strides.dt_s[:, None], np.eye(3)
-    R_first_a, R_first_b = window.R_first_imu[:-1], window.R_first_imu[1:]
-    R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
-    faster, moved = _applied(R_first_a, strides.faster), _applied(R_first_a, strides.moved)
-    turn = so3_log(strides.R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
-    velocity = window.velocity[1:] - window.velocity[:-1] - window.gravity * dt_s - faster
-    position = window.position[1:] - window.position[:-1] - window.velocity[:-1] * dt_s
-    position = position - 0.5 * window.gravity * dt_s**2 - moved
-    d = np.zeros((len(dt_s), 9, 27))
-    d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -strides.d_turn
-    d[:, 3:6, :3], d[:, 3:6, 6:9], d[:, 3:6, 15:18] = R_first_a @ skew(strides.faster), -one, one
-    d[:, 3:6, 18:21], d[:, 3:6, 21:] = -dt_s[:, :, None] * one, -R_first_a @ strides.d_faster
-    d[:, 6:, :3], d[:, 6:, 3:6], d[:, 6:, 12:15] = R_first_a @ skew(strides.moved), -one, one
-    d[:, 6:, 6:9], d[:, 6:, 18:21] = -dt_s[:, :, None] * one, -0.5 * dt_s[:, :, None] ** 2 * one
-    d[:, 6:, 21:] = -R_first_a @ strides.d_moved
-    return -np.concatenate([turn, velocity, position], axis=1), d
-
-
-def _stride_whitener(dt_s: Array, noise: Noise) -> Array:
-    """Return what makes the strides' errors (m, 9) independent of variance 1: white samples, integrated twice.
-
-    Of a position, what the velocity's error does not explain has the variance of the density times dt^3 / 12.
-    """
-    whitener, one = np.zeros((len(dt_s), 9, 9)), np.eye(3)
-    rest = (np.sqrt(12.0 / dt_s**3) / noise.accel)[:, None, None]
-    whitener[:, :3, :3] = (1.0 / np.sqrt(dt_s) / noise.gyro)[:, None, None] * one
-    whitener[:, 3:6, 3:6] = (1.0 / np.sqrt(dt_s) / noise.accel)[:, None, None] * one
-    whitener[:, 6:, 6:], whitener[:, 6:, 3:6] = rest * one, -0.5 * dt_s[:, None, None] * rest * one
-    return whitener
+    """Return what the strides lack (m, k) and its change (m, k, 27) by the states at both ends, gravity and biases."""
+    attitudes, position, velocity = window.R_first_imu, window.position, window.velocity
+    return window.strides.equations(attitudes, position, velocity, window.gravity, calibration.bias)
 
 
 def _applied(matrix: Array, vector: Array) -> Array:

@@ -16,6 +16,8 @@ from toolkit.sequence import Sequence, check_runnable
 LEAST_INTERVALS = 30
 # Steps in which an IMU's samples are integrated, with the orientation as it is in the middle of each.
 STEP_S = 0.02
+# What a gyro beside odometry reads too much at most, 11 degrees a second; more is another fault, such as wrong axes.
+MOST_BIAS_RADPS = 0.2
 
 
 class Intervals(NamedTuple):
@@ -108,15 +110,16 @@ def median_one_step_px(sequence: Sequence, camera: CameraMotion, T_imu_cam: Arra
     """Return the median over the sightings of the root mean square of (uL, uR, v) residuals, in pixels.
 
     Points triangulated in one frame are moved by the motion samples through the extrinsic ``T_imu_cam`` and projected
-    into the next. An IMU measures no velocity and its gyro has a bias: there the camera's own velocity is taken, and
-    the rates of rotation about their median difference from the camera's. Only intervals whose camera motion is known.
+    into the next. A gyro has a bias: rates of rotation are taken about their median difference from the camera's, but
+    beside odometry for more than ``MOST_BIAS_RADPS``. An IMU measures no velocity: there the camera's own is taken.
+    Only intervals whose camera motion is known.
     """
-    return _median(_one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))[1])
+    return _median(_one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))[1])
 
 
 def one_step_px_by_interval(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
     """Return the median of the same residuals in each known interval that has any (M,), in pixels."""
-    interval, each_px = _one_step_px(sequence, camera, _moved(sequence, camera, T_imu_cam))
+    interval, each_px = _one_step_px(sequence, camera, moved_as_measured(sequence, camera, T_imu_cam))
     first = np.flatnonzero(np.diff(interval, prepend=-1))
     return np.array([_median(part) for part in np.split(each_px, first[1:])]) if interval.size else np.empty(0)
 
@@ -126,17 +129,19 @@ def own_one_step_px(sequence: Sequence, camera: CameraMotion) -> float:
     return _median(_one_step_px(sequence, camera, moved_by(camera, sequence))[1])
 
 
-def _moved(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
-    """Return the camera's motion (K - 1, 4, 4) as the motion samples have it through an extrinsic."""
+def moved_as_measured(sequence: Sequence, camera: CameraMotion, T_imu_cam: Array) -> Array:
+    """Return the camera's motion (K - 1, 4, 4) as the samples have it through an extrinsic, less a gyro's bias."""
     mean = interval_means(sequence.motion.t_ns, sequence.motion.values, sequence.frames_t_ns)
     w_radps, v_mps = mean[:, 3:], mean[:, :3]
     R_imu_cam = T_imu_cam[:3, :3]
-    if isinstance(sequence.motion, TwistSamples):
-        dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
-        T_before_after_imu = se3_exp(dt_s * np.concatenate([w_radps, v_mps], axis=1))
-        return np.asarray(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
     bias_radps = np.median((w_radps - camera.w_radps @ R_imu_cam.T)[camera.known], axis=0)
-    return moved_by(camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam), sequence)
+    if not isinstance(sequence.motion, TwistSamples):
+        return moved_by(camera._replace(w_radps=(w_radps - bias_radps) @ R_imu_cam), sequence)
+    if float(np.linalg.norm(bias_radps)) <= MOST_BIAS_RADPS:
+        w_radps = w_radps - bias_radps
+    dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
+    T_before_after_imu = se3_exp(dt_s * np.concatenate([w_radps, v_mps], axis=1))
+    return np.asarray(se3_inverse(T_imu_cam) @ T_before_after_imu @ T_imu_cam)
 
 
 def moved_by(camera: CameraMotion, sequence: Sequence) -> Array:

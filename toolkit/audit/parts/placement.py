@@ -26,11 +26,15 @@ BESIDE_IMU_M = 0.05
 
 
 def way_gone(sequence: Sequence, intervals: Intervals, found: Alignment, way_m: Array) -> Scalar:
-    """Return how far along a way (3,) m from the place given the camera is, by weighted least squares: 1 is its end."""
-    cov_m2 = found.lever_cov_m2 + _systematic_cov_m2(sequence, intervals)
+    """Return how far along a way (3,) m from the place given the camera is: 1 is its end."""
+    return share_of_way(found.lever_m, found.lever_cov_m2 + _systematic_cov_m2(sequence, intervals), way_m)
+
+
+def share_of_way(lacking_m: Array, cov_m2: Array, way_m: Array) -> Scalar:
+    """Return the same of a place that lacks (3,) m, with its covariance (3, 3), by weighted least squares."""
     weighted = np.linalg.solve(cov_m2, way_m)
     information = float(weighted @ way_m)
-    return Scalar(float(weighted @ found.lever_m) / information, float(1.0 / np.sqrt(information)))
+    return Scalar(float(weighted @ lacking_m) / information, float(1.0 / np.sqrt(information)))
 
 
 def is_there(share: Scalar) -> bool:

@@ -1,7 +1,7 @@
-"""The calibration by which tracks and an IMU fit together best: windows of key frames adjusted with it unknown.
+"""The calibration by which tracks and measured motion fit best: windows of key frames adjusted with it unknown.
 
 From frame to frame the noise of the tracks hides a focal length, a clock or a turn that is off by little; a point that
-is followed over a second, beside the integrated IMU, shows it. See `bundle` for the equations.
+is followed over a second, beside the integrated IMU or odometry, shows it. See `bundle` for the equations.
 """
 
 from typing import NamedTuple
@@ -10,32 +10,56 @@ import numpy as np
 from scipy.special import chdtri
 
 from toolkit.audit.parts.alignment import chained
-from toolkit.audit.parts.bundle import COMMON, GYRO_BIAS, Calibration, Noise, Reduced, Window, moved, reduce
-from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by
+from toolkit.audit.parts.bundle import COMMON, GYRO_BIAS, Calibration, Reduced, Window, moved, reduce
+from toolkit.audit.parts.intervals import Intervals, interval_means, moved_as_measured, moved_by
 from toolkit.audit.parts.robust import LEVEL
-from toolkit.audit.parts.strides import Strides, strides_between
+from toolkit.audit.parts.strides import ImuStrides, TwistStrides, imu_strides, twist_strides
 from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.measured_motion import ImuNoise
+from toolkit.measured_motion import MotionKind
 from toolkit.models.camera_motion import CameraMotion
 from toolkit.models.stereo import disparity_px, triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, is_left_only
 
 # Key frames are so far apart, in windows about so long: one, or an even number, of which none has a clock that is set
-# halfway within. Of longer recordings so many windows are taken, spread evenly.
-STRIDE_S, WINDOW_S, MOST_WINDOWS, FEWEST_KEYS = 0.2, 4.0, 6, 4
+# halfway within.
+STRIDE_S, WINDOW_S, FEWEST_KEYS = 0.2, 4.0, 4
 # Tracks that are used: the longest of those seen in so many key frames.
-FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, MOST_TRACKS, FEWEST_TRACKS = 3, 2.0, 200, 20
-MOST_ITERATIONS = 10
+FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, FEWEST_TRACKS = 3, 2.0, 20
+
+
+class Effort(NamedTuple):
+    """How many windows, tracks of a window and iterations there are at most."""
+
+    windows: int
+    tracks: int
+    iterations: int
+
+
+# Of longer recordings the windows are spread evenly beside an IMU, whose clock may change, and are those of the most
+# rotation beside odometry: cars go straight ahead for long. There tracks that creep leave no use for more of them.
+MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 100, 14)}
 # Settled is what changes by less than this share of its standard errors.
 SETTLED = 0.4
+# A step of more than so many standard deviations of what a calibration is off by leads nowhere.
+STRAYED = 10.0
 # Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2. What is beyond
 # them is no solution.
 OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 1, 3, 3])
-# What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
-# ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
-GYRO_ERROR = 0.1
+# Beside odometry: the place is that of the camera and of the point whose velocities are given (m), a twist may stand
+# for the interval before its stamp or after it (s), and for the bias of an accelerometer there is a turn of the
+# velocities (rad), as of cars that slip and pitch. A place that nothing tells, and a turn up to the last number, are no
+# failure.
+POINT_M, PAIRING_S, SLIP_RAD, MOST_POINT_M, MOST_SLIP_RAD = 2.0, 0.06, 0.02, 10.0, 0.1
+
+
+def _beside_odometry(point_m: float, slip_rad: float) -> Array:
+    return np.concatenate([OFF_BY[:8], np.full(3, point_m), [PAIRING_S], OFF_BY[12:16], np.full(3, slip_rad)])
+
+
+PRIOR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(POINT_M, SLIP_RAD)}
+NEAR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(MOST_POINT_M, MOST_SLIP_RAD)}
 
 
 class SelfCalibration(NamedTuple):
@@ -57,7 +81,7 @@ class SelfCalibration(NamedTuple):
 def self_calibration(
     sequence: Sequence, camera: CameraMotion, intervals: Intervals, fewest_windows: int = 1
 ) -> SelfCalibration | None:
-    """Find the calibration of an IMU's recording.
+    """Find the calibration by tracks and the measured motion.
 
     None where no window has the tracks for it, or where none near the one that is given fits.
     """
@@ -65,59 +89,54 @@ def self_calibration(
     windows = _windows(sequence, camera, w_bias, fewest_windows)
     if not windows:
         return None
+    kind = sequence.motion_kind
     try:
-        value, settled, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), _noise(sequence))
-        cov = _cov(all_reduced)
+        value, settled, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), kind)
+        cov = _cov(all_reduced, PRIOR[kind])
     except (np.linalg.LinAlgError, DataError):  # steps that lead nowhere: singular, or a rig that is none
         return None
-    if not settled or (np.abs(value) > OFF_BY).any():
+    if not settled or (np.abs(value) > NEAR[kind]).any():
         return None
     value[GYRO_BIAS] += w_bias
     return SelfCalibration(value, cov, len(windows))
 
 
-def _adjusted(windows: list[Window], calibration: Calibration, noise: Noise) -> tuple[Array, bool, list[Reduced]]:
+def _adjusted(windows: list[Window], calibration: Calibration, kind: MotionKind) -> tuple[Array, bool, list[Reduced]]:
     """Return the calibration's change (19,) by Gauss-Newton, whether it settled, and what it rests on."""
-    value = np.zeros(COMMON)
-    for _ in range(MOST_ITERATIONS):
-        all_reduced = [reduce(window, calibration, noise) for window in windows]
-        step = _step(all_reduced, value)
+    value, prior = np.zeros(COMMON), PRIOR[kind]
+    for _ in range(MOST[kind].iterations):
+        all_reduced = [reduce(window, calibration) for window in windows]
+        step = _step(all_reduced, value, prior)
         value = value + step
-        if (np.abs(step) < SETTLED * np.sqrt(np.diag(np.linalg.inv(_information(all_reduced))))).all():
+        if not (np.abs(step) < STRAYED * prior).all():
+            return value, False, all_reduced
+        if (np.abs(step) < SETTLED * np.sqrt(np.diag(np.linalg.inv(_information(all_reduced, prior))))).all():
             return value, True, all_reduced
         windows = [moved(window, reduced, step) for window, reduced in zip(windows, all_reduced, strict=True)]
         calibration = calibration.moved(step)
     return value, False, all_reduced
 
 
-def _noise(sequence: Sequence) -> Noise:
-    assert isinstance(sequence.noise, ImuNoise)
-    sample_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
-    return Noise(
-        float(np.hypot(sequence.noise.gyro_noise_density, GYRO_ERROR * sample_s)), sequence.noise.accel_noise_density
-    )
-
-
-def _step(all_reduced: list[Reduced], value: Array) -> Array:
+def _step(all_reduced: list[Reduced], value: Array, prior: Array) -> Array:
     """Return the step (19,) of the calibration that all windows want together, and the prior about zero."""
-    gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / OFF_BY**2
-    return np.asarray(np.linalg.solve(_information(all_reduced), gradient))
+    gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / prior**2
+    return np.asarray(np.linalg.solve(_information(all_reduced, prior), gradient))
 
 
-def _information(all_reduced: list[Reduced]) -> Array:
-    return np.asarray(np.diag(OFF_BY**-2.0) + sum(reduced.information for reduced in all_reduced))
+def _information(all_reduced: list[Reduced], prior: Array) -> Array:
+    return np.asarray(np.diag(prior**-2.0) + sum(reduced.information for reduced in all_reduced))
 
 
-def _cov(all_reduced: list[Reduced]) -> Array:
+def _cov(all_reduced: list[Reduced], prior: Array) -> Array:
     """Return the covariance (19, 19), robust to errors that stay the same along a track, for a second or in a window.
 
     Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich. It is no
     less than that of errors that are all independent, for few parts can look too calm; and windows, of which there are
     two to six, count only where they scatter more than is chance.
     """
-    inverse = np.linalg.inv(_information(all_reduced))
+    inverse = np.linalg.inv(_information(all_reduced, prior))
     gradients = np.concatenate([reduced.gradients for reduced in all_reduced])
-    cov = inverse @ (gradients.T @ gradients + np.diag(OFF_BY**-2.0)) @ inverse
+    cov = inverse @ (gradients.T @ gradients + np.diag(prior**-2.0)) @ inverse
     cov = cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))
     by_window = np.array([reduced.gradients.sum(axis=0) for reduced in all_reduced]) @ inverse
     dof = len(all_reduced) - 1
@@ -129,19 +148,39 @@ def _cov(all_reduced: list[Reduced]) -> Array:
 
 
 def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[Window]:
-    """Return the windows whose camera motion is known and that have tracks enough."""
+    """Return the windows that can be begun and have tracks enough."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     stride = max(1, round(STRIDE_S / step_s))
     keys = np.arange(0, sequence.frame_count, stride)
     whole = round(sequence.duration_s / WINDOW_S)
     count = max(fewest, whole - whole % 2, 1)
     edges = np.linspace(0, keys.size - 1, count + 1).round().astype(int)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST_WINDOWS)).round().astype(int)).tolist()
-    spans = [keys[edges[k] : edges[k + 1] + 1] for k in chosen]
-    T_before_after = moved_by(camera, sequence)
-    known = [span for span in spans if span.size >= FEWEST_KEYS and camera.known[span[0] : span[-1]].all()]
-    found = [_window(sequence, span, T_before_after[span[0] : span[-1]], w_bias) for span in known]
+    spans = [keys[edges[k] : edges[k + 1] + 1] for k in range(count)]
+    spans = [spans[k] for k in _chosen(sequence, spans)]
+    T_before_after, known = _roughly_moved(sequence, camera)
+    spans = [span for span in spans if span.size >= FEWEST_KEYS and known[span[0] : span[-1]].all()]
+    found = [_window(sequence, span, T_before_after[span[0] : span[-1]], w_bias) for span in spans]
     return [window for window in found if window is not None]
+
+
+def _chosen(sequence: Sequence, spans: list[IntArray]) -> list[int]:
+    """Return which of the spans of frames are taken, in the order of time."""
+    count, most = len(spans), MOST[sequence.motion_kind].windows
+    if sequence.motion_kind == "imu" or count <= most:
+        return [int(k) for k in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values[:, 3:], sequence.frames_t_ns)
+    rates = mean - np.median(mean, axis=0)
+    turned = [float(np.linalg.norm(rates[span[0] : span[-1]], axis=1).sum()) for span in spans]
+    return sorted(int(k) for k in np.argsort(turned)[-most:])
+
+
+def _roughly_moved(sequence: Sequence, camera: CameraMotion) -> tuple[Array, BoolArray]:
+    """Return how the camera moved over each interval (K - 1, 4, 4), and whether it is known; odometry fills gaps."""
+    T_before_after, known = moved_by(camera, sequence), camera.known
+    if sequence.motion_kind != "twist":
+        return T_before_after, known
+    measured = moved_as_measured(sequence, camera, sequence.rig.T_imu_cam)
+    return np.where(known[:, None, None], T_before_after, measured), np.ones_like(known)
 
 
 def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: Array) -> Window | None:
@@ -152,7 +191,8 @@ def _window(sequence: Sequence, keys: IntArray, T_before_after: Array, w_bias: A
     T_imu_cam, uv_px = sequence.rig.T_imu_cam, sequence.observations.uv_px[sighting]
     T_first_cam = T_imu_cam @ chained(T_before_after)[keys - keys[0]]
     T_first_imu = T_first_cam @ se3_inverse(T_imu_cam)
-    strides = strides_between(sequence, sequence.frames_t_ns[keys], w_bias)
+    by_imu = sequence.motion_kind == "imu"
+    strides = (imu_strides if by_imu else twist_strides)(sequence, sequence.frames_t_ns[keys], w_bias)
     nearest_first = np.lexsort((-disparity_px(uv_px), track))
     nearest = nearest_first[np.searchsorted(track, np.arange(track[-1] + 1))]
     points = transform(T_first_cam[key[nearest]], triangulate(uv_px[nearest], sequence.rig))
@@ -172,7 +212,7 @@ def _long_tracks(sequence: Sequence, keys: IntArray) -> tuple[IntArray, IntArray
     key_of[keys - keys[0]] = np.arange(keys.size)
     row = begin + np.flatnonzero((key_of[seen.frame[begin:end] - keys[0]] >= 0) & _usable(seen.uv_px[begin:end]))
     _, track, sightings = np.unique(seen.track_id[row], return_inverse=True, return_counts=True)
-    longest = np.argsort(-sightings, kind="stable")[:MOST_TRACKS]
+    longest = np.argsort(-sightings, kind="stable")[: MOST[sequence.motion_kind].tracks]
     chosen = longest[sightings[longest] >= FEWEST_SIGHTINGS]
     row = row[np.isin(track, chosen)]
     row = row[np.argsort(seen.track_id[row], kind="stable")]
@@ -187,10 +227,17 @@ def _usable(uv_px: Array) -> BoolArray:
     return np.asarray(both & np.isfinite(uv_px).all(axis=1))
 
 
-def _velocities(T_first_imu: Array, strides: Strides) -> tuple[Array, Array]:
-    """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4), by linear least squares over the strides."""
+def _velocities(T_first_imu: Array, strides: ImuStrides | TwistStrides) -> tuple[Array, Array]:
+    """Return velocities (n, 3) and gravity (3,) at poses (n, 4, 4), by linear least squares over an IMU's strides.
+
+    Beside odometry they are those of the strides around, and nothing.
+    """
     n, dt_s = len(T_first_imu), strides.dt_s
     R_first_a, position = T_first_imu[:-1, :3, :3], T_first_imu[:, :3, 3]
+    if isinstance(strides, TwistStrides):
+        v_mps = (R_first_a @ strides.moved[:, :, None])[..., 0] / dt_s[:, None]
+        ends = np.concatenate([v_mps[:1], v_mps, v_mps[-1:]])
+        return 0.5 * (ends[1:] + ends[:-1]), np.zeros(3)
     rows, jacobian = np.arange(n - 1), np.zeros((2, n - 1, n + 1))
     jacobian[0, rows, rows], jacobian[0, :, n] = dt_s, 0.5 * dt_s**2
     jacobian[1, rows, rows], jacobian[1, rows, rows + 1], jacobian[1, :, n] = -1.0, 1.0, -dt_s

@@ -1,7 +1,9 @@
-"""The motion of an IMU over strides of some frames, preintegrated, and how it changes with the biases.
+"""The measured motion over strides of some frames, integrated, what states at their ends lack of it, and its noise.
 
+Of an IMU the samples are preintegrated; odometry's twists are chained, with an unknown turn of their velocities. The
+derivatives by the biases are differences of the integrals: all are linear to what biases are off by.
 Source: Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry"
-(2017), section VI. The derivatives are differences of the integrals: all are linear to what biases are off by.
+(2017), section VI.
 """
 
 from typing import NamedTuple
@@ -9,20 +11,24 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.audit.parts.intervals import interval_means, subdivided
-from toolkit.geometry import Array, IntArray, so3_exp, so3_log
+from toolkit.geometry import Array, IntArray, se3_exp, skew, so3_exp, so3_log
+from toolkit.measured_motion import ImuNoise, TwistMotion, TwistNoise, motions_between
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Of the biases (rad/s, m/s^2), for derivatives.
+# Of the biases (rad/s, and m/s^2 or rad), for derivatives.
 _DIFFERENCE = 1e-4
+# What a gyro errs by beside its stated noise, as a density (rad/s/sqrt(Hz)) over the time between its samples (s): real
+# ones filter what shakes them. With it the only recording at hand of a vehicle (100 Hz) fits its calibration.
+GYRO_ERROR = 0.1
 
 
-class Strides(NamedTuple):
+class ImuStrides(NamedTuple):
     """The strides (m,) between m + 1 frames: durations (m,) s, turns (m, 3, 3), and changes (m, 3) of the velocity and
     the position in the axes of their begin, as if the IMU began at rest in free fall.
 
     The derivatives (m, 3, 6) are those of the turn's logarithm and of the changes by the biases of gyro and
-    accelerometer, in that order.
+    accelerometer, in that order. ``whitener`` (m, 9, 9) makes the errors independent and of variance 1.
     """
 
     dt_s: Array
@@ -32,8 +38,9 @@ class Strides(NamedTuple):
     d_turn: Array
     d_faster: Array
     d_moved: Array
+    whitener: Array
 
-    def biased(self, bias: Array) -> "Strides":
+    def biased(self, bias: Array) -> "ImuStrides":
         """Return what the strides are where the biases (6,) are these."""
         return self._replace(
             R_a_b=self.R_a_b @ so3_exp(self.d_turn @ bias),
@@ -41,8 +48,66 @@ class Strides(NamedTuple):
             moved=self.moved + self.d_moved @ bias,
         )
 
+    def equations(
+        self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
+    ) -> tuple[Array, Array]:
+        """Return what states lack (m, 9), turn, velocity and position, and its change (m, 9, 27) by the unknowns.
 
-def strides_between(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> Strides:
+        States are m + 1 attitudes (m + 1, 3, 3), positions and velocities (m + 1, 3) in the axes of the first, with
+        gravity (3,). Unknowns are the states at both ends (9 each), gravity and the biases (6,).
+        """
+        strides = self.biased(bias)
+        dt_s, one = strides.dt_s[:, None], np.eye(3)
+        R_first_a, R_first_b = R_first_imu[:-1], R_first_imu[1:]
+        R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
+        turn = so3_log(strides.R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
+        faster = velocity[1:] - velocity[:-1] - gravity * dt_s - _applied(R_first_a, strides.faster)
+        moved = position[1:] - position[:-1] - velocity[:-1] * dt_s
+        moved = moved - 0.5 * gravity * dt_s**2 - _applied(R_first_a, strides.moved)
+        d = np.zeros((len(dt_s), 9, 27))
+        d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -strides.d_turn
+        d[:, 3:6, :3], d[:, 3:6, 6:9], d[:, 3:6, 15:18] = R_first_a @ skew(strides.faster), -one, one
+        d[:, 3:6, 18:21], d[:, 3:6, 21:] = -dt_s[:, :, None] * one, -R_first_a @ strides.d_faster
+        d[:, 6:, :3], d[:, 6:, 3:6], d[:, 6:, 12:15] = R_first_a @ skew(strides.moved), -one, one
+        d[:, 6:, 6:9], d[:, 6:, 18:21] = -dt_s[:, :, None] * one, -0.5 * dt_s[:, :, None] ** 2 * one
+        d[:, 6:, 21:] = -R_first_a @ strides.d_moved
+        return -np.concatenate([turn, faster, moved], axis=1), d
+
+
+class TwistStrides(NamedTuple):
+    """The same of odometry: durations (m,) s, turns (m, 3, 3) and ways gone (m, 3) m in the axes of their begin.
+
+    The derivatives (m, 3, 6) are by the bias of the gyro and a turn (rad) of the measured velocities, which a vehicle
+    that slips or pitches has; ``whitener`` (m, 6, 6).
+    """
+
+    dt_s: Array
+    R_a_b: Array
+    moved: Array
+    d_turn: Array
+    d_moved: Array
+    whitener: Array
+
+    def equations(
+        self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
+    ) -> tuple[Array, Array]:
+        """Return what states lack (m, 6), turn and position, and its change (m, 6, 27) by the same unknowns.
+
+        Velocities and gravity are not among what odometry tells of states.
+        """
+        R_first_a, R_first_b, one = R_first_imu[:-1], R_first_imu[1:], np.eye(3)
+        R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
+        R_a_b, way = self.R_a_b @ so3_exp(self.d_turn @ bias), self.moved + self.d_moved @ bias
+        turn = so3_log(R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
+        moved = position[1:] - position[:-1] - _applied(R_first_a, way)
+        d = np.zeros((len(way), 6, 27))
+        d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -self.d_turn
+        d[:, 3:, :3], d[:, 3:, 3:6], d[:, 3:, 12:15] = R_first_a @ skew(way), -one, one
+        d[:, 3:, 21:] = -R_first_a @ self.d_moved
+        return -np.concatenate([turn, moved], axis=1), d
+
+
+def imu_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> ImuStrides:
     """Integrate an IMU's samples, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
     part_t_ns, frame_at = subdivided(t_ns)
     count, parts = len(t_ns) - 1, int(frame_at[1])
@@ -61,5 +126,58 @@ def strides_between(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> 
         faster = faster + step_s * force
         R_a_now = middle @ half
     turned = so3_log(R_a_now[0].swapaxes(1, 2) @ R_a_now[1:])
-    changes = (np.moveaxis(x / _DIFFERENCE, 0, -1) for x in (turned, faster[1:] - faster[0], moved[1:] - moved[0]))
-    return Strides(np.diff(t_ns) / NS_PER_S, R_a_now[0], faster[0], moved[0], *changes)
+    changed = (turned, faster[1:] - faster[0], moved[1:] - moved[0])
+    d_turn, d_faster, d_moved = (np.moveaxis(x / _DIFFERENCE, 0, -1) for x in changed)
+    dt_s = np.diff(t_ns) / NS_PER_S
+    whitener = _imu_whitener(sequence, dt_s)
+    return ImuStrides(dt_s, R_a_now[0], faster[0], moved[0], d_turn, d_faster, d_moved, whitener)
+
+
+def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
+    """Return what makes the errors (m, 9) of an IMU's strides white: samples' noise, integrated twice.
+
+    Of a position, what the velocity's error does not explain has the variance of the density times dt^3 / 12.
+    """
+    noise = sequence.noise
+    assert isinstance(noise, ImuNoise)
+    sample_s = float(np.median(np.diff(sequence.motion.t_ns))) / NS_PER_S
+    gyro, accel = float(np.hypot(noise.gyro_noise_density, GYRO_ERROR * sample_s)), noise.accel_noise_density
+    whitener, one = np.zeros((len(dt_s), 9, 9)), np.eye(3)
+    rest = (np.sqrt(12.0 / dt_s**3) / accel)[:, None, None]
+    whitener[:, :3, :3] = (1.0 / np.sqrt(dt_s) / gyro)[:, None, None] * one
+    whitener[:, 3:6, 3:6] = (1.0 / np.sqrt(dt_s) / accel)[:, None, None] * one
+    whitener[:, 6:, 6:], whitener[:, 6:, 3:6] = rest * one, -0.5 * dt_s[:, None, None] * rest * one
+    return whitener
+
+
+def twist_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> TwistStrides:
+    """Chain the twists, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
+    off = np.concatenate([np.zeros((1, 6)), _DIFFERENCE * np.eye(6)])[:, None]
+    ends = []
+    for motion in motions_between(sequence.motion, t_ns, None):
+        assert isinstance(motion, TwistMotion)
+        w_radps = motion.w_radps - w_bias_radps - off[:, :, :3]
+        v_mps = motion.v_mps + np.cross(off[:, :, 3:], motion.v_mps)
+        T_a_now = np.tile(np.eye(4), (7, 1, 1))
+        steps = se3_exp(motion.dt_s[:, None] * np.concatenate([w_radps, v_mps], axis=2))
+        for k in range(steps.shape[1]):
+            T_a_now = T_a_now @ steps[:, k]
+        ends.append(T_a_now)
+    T_a_b = np.array(ends)
+    R_a_b, moved, dt_s = T_a_b[:, :, :3, :3], T_a_b[:, :, :3, 3], np.diff(t_ns) / NS_PER_S
+    turned = so3_log(R_a_b[:, :1].swapaxes(2, 3) @ R_a_b[:, 1:])
+    d_turn, d_moved = (np.moveaxis(x / _DIFFERENCE, 1, -1) for x in (turned, moved[:, 1:] - moved[:, :1]))
+    return TwistStrides(dt_s, R_a_b[:, 0], moved[:, 0], d_turn, d_moved, _twist_whitener(sequence, dt_s))
+
+
+def _twist_whitener(sequence: Sequence, dt_s: Array) -> Array:
+    """Return what makes the errors (m, 6) of odometry's strides white: the stated noise of its twists."""
+    noise = sequence.noise
+    assert isinstance(noise, TwistNoise)
+    density = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density])
+    return np.asarray(np.eye(6) / (np.sqrt(dt_s)[:, None] * density)[:, None])
+
+
+def _applied(matrix: Array, vector: Array) -> Array:
+    """Return the products (N, i) of matrices (N, i, j) and vectors (N, j)."""
+    return np.asarray((matrix @ vector[:, :, None])[..., 0])

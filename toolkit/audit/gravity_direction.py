@@ -1,0 +1,93 @@
+"""Gravity that points elsewhere in the world than an IMU shows beside the truth's attitudes: z down for z up, say.
+
+Over a recording the specific force, turned into the world by the truth, is the mean acceleration less gravity. Who
+begins at the truth with gravity upside down falls at twice its rate. The truth is believed where it turns as the gyro
+does; without one gravity has no direction but that in which the first frame is levelled.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.intervals import interval_means, is_comparable
+from toolkit.geometry import Array, interpolate_poses, so3_log
+from toolkit.measured_motion import ImuSamples
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, Truth
+
+# Sound recordings are within a degree; 1 m/s^2 of mean acceleration that the truth does not tell is six. A world's axis
+# that is nearer than the second is taken for gravity's.
+LEAST_DEG, NEAR_AXIS_DEG = 30.0, 15.0
+# So long (s) a recording must be for its mean acceleration to be small, and so often the truth is read in a second.
+LEAST_S, READ_HZ = 2.0, 20.0
+# The truth turns as the gyro does where no more than this share of the rates of rotation, squared, is left.
+MOST_LEFT = 0.25
+STANDARD_MPS2 = 9.81
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Compare the direction of gravity that is given with that of the samples."""
+    sequence, truth = evidence.sequence, evidence.sequence.truth
+    if not isinstance(sequence.motion, ImuSamples) or truth is None or evidence.spoilt_by:
+        return None
+    if not is_comparable(sequence) or (measured := _measured(sequence, truth)) is None:
+        return None
+    given = sequence.gravity_world
+    size_mps2 = float(np.linalg.norm(given))
+    if size_mps2 > 0.0 and _angle_deg(given, measured) < LEAST_DEG:
+        return None
+    axis = np.zeros(3)
+    largest = int(np.argmax(np.abs(measured)))
+    axis[largest] = np.sign(measured[largest])
+    measured_text, given_text = _rounded(measured), _rounded(given)
+    told = f"the samples fall along {measured_text} m/s^2 of the truth's world, and gravity_world is {given_text}"
+    certain = _angle_deg(axis, measured) < NEAR_AXIS_DEG
+    gravity_world = (size_mps2 if size_mps2 > 0.0 else STANDARD_MPS2) * axis
+    return Symptom(
+        count=1,
+        detail=told,
+        treatment=f"it is set to {_rounded(gravity_world)}"
+        if certain
+        else "no axis of the world is near: set it right",
+        remedy=replace(sequence, gravity_world=gravity_world) if certain else None,
+    )
+
+
+def _measured(sequence: Sequence, truth: Truth) -> Array | None:
+    """Return gravity (3,) m/s^2 in the truth's world; None where the truth is short, or turns otherwise."""
+    in_order = truth.t_ns.size >= 2 and (np.diff(truth.t_ns) > 0).all() and np.isfinite(truth.T_world_imu).all()
+    begin_ns = max(int(truth.t_ns[0]), int(sequence.motion.t_ns[0])) if truth.t_ns.size else 0
+    end_ns = min(int(truth.t_ns[-1]), int(sequence.motion.t_ns[-1])) if truth.t_ns.size else 0
+    duration_s = (end_ns - begin_ns) / NS_PER_S
+    if not in_order or duration_s < LEAST_S:
+        return None
+    t_ns = np.linspace(begin_ns, end_ns, round(READ_HZ * duration_s) + 1).astype(np.int64)
+    poses, step_s = interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns), np.diff(t_ns)[:, None] / NS_PER_S
+    R_world_imu = poses[:, :3, :3]
+    mean = interval_means(sequence.motion.t_ns, sequence.motion.values, t_ns)
+    seen, turned = mean[:, 3:], so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+    apart = turned - seen
+    apart, seen = apart - np.median(apart, axis=0), seen - np.median(seen, axis=0)
+    if np.sum(apart**2) > MOST_LEFT * np.sum(seen**2):
+        return None
+    v_world = np.diff(poses[:, :3, 3], axis=0) / step_s
+    faster = (np.median(v_world[-5:], axis=0) - np.median(v_world[:5], axis=0)) / duration_s
+    force = np.mean((R_world_imu[:-1] @ mean[:, :3, None])[..., 0], axis=0)
+    return np.asarray(faster - force)
+
+
+def _angle_deg(a: Array, b: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1.0, 1.0))))
+
+
+def _rounded(vector: Array) -> str:
+    return "(" + ", ".join(f"{x:.2f}" for x in vector) + ")"
+
+
+FAULT = Fault(
+    "gravity-direction",
+    "gravity that points elsewhere in the truth's world than an IMU shows",
+    check,
+    after=("accelerometer-axes", "time-offset"),
+)
