@@ -71,24 +71,18 @@ def track_test(compilation: Compilation) -> TrackTest:
         """Test tracks as the definition does, and by it where right images are missing."""
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
-        points, reliable, nis, worst, ends, H, residuals = kernel.test_tracks(
+        points, reliable, nis, dof, worst, H, residuals, owners = kernel.test_tracks(
             _given((sightings.uvs_px, sightings.seen, sightings.ages)),
             _given(window),
             _camera(rig),
             _GATE_RULES,
             bounds,
         )
-        rows = np.diff(ends, prepend=0)[reliable]
-        count = int(rows.sum())
-        return TestedTracks(
-            sightings.select(reliable),
-            points[:-1][reliable],
-            nis[reliable],
-            worst[reliable],
-            H[:count],
-            residuals[:count],
-            np.repeat(np.arange(len(rows)), rows),
-        )
+        points = points[:-1]
+        if not reliable.all():
+            sightings, points = sightings.select(reliable), points[reliable]
+            nis, dof, worst = nis[reliable], dof[reliable], worst[reliable]
+        return TestedTracks(sightings, points, nis, dof, worst, H, residuals, owners)
 
     return tested
 

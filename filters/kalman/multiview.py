@@ -41,8 +41,10 @@ class TrackSightings(NamedTuple):
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return some of the tracks, themselves where a mask has all."""
-        if rows.dtype == np.bool_ and rows.all():
-            return self
+        if rows.dtype == np.bool_:
+            rows = rows.nonzero()[0]  # places are found once for all four arrays; a mask has them found for each
+            if rows.size == self.track_ids.size:
+                return self
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":

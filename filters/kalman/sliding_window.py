@@ -143,9 +143,18 @@ class SlidingWindowFilter:
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
         first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
-        H, residuals = multiview.compressed(accepted.H[:, first:], accepted.residuals)
-        joint.update(H, residuals, slice(joint.clone_columns.start + first, joint.clone_columns.stop))
+        self._update(accepted.H[:, first:], accepted.residuals)
         self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
+
+    def _update(self, H: Array, residuals: Array) -> None:
+        """Correct everything by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
+        joint, (count, size) = self._joint, H.shape
+        end = joint.clone_columns.stop
+        if count > size and end == joint.cov.shape[0]:
+            joint.inform(H.T @ H, H.T @ residuals)
+            return
+        # With landmarks behind the clones, an update by fewer rows takes less.
+        joint.update(*multiview.compressed(H, residuals), slice(end - size, end))
 
     def _correct_by_bridge(self, packet: Packet) -> None:
         """Correct the last three poses where no track leads from one of them to the next."""
@@ -214,13 +223,12 @@ class WindowTracks:
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
-        taken = self.unused().select(np.flatnonzero(rows))
+        tracks = self.unused()
         self._keep(np.logical_not(rows))
-        return taken
+        return tracks.select(rows)
 
     def _keep(self, rows: BoolArray) -> None:
-        # Places are found once for all four arrays; a mask has them found for each.
-        self._ids, self._uvs_px, self._seen, self._ages = self.unused().select(np.flatnonzero(rows))
+        self._ids, self._uvs_px, self._seen, self._ages = self.unused().select(rows)
 
 
 def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:
