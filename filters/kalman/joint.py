@@ -116,8 +116,11 @@ class JointBelief:
     def _add_rows(self, jacobian: Array | csr_array, cov: Array) -> None:
         """Add to the end of the error state what is ``jacobian`` (m, n) times the state's error, plus noise."""
         cross = np.asarray(jacobian @ self._cov)
-        own = _symmetric(jacobian @ cross.T + cov)
-        self._cov = np.block([[self._cov, cross.T], [cross, own]])
+        before, size = self._cov, len(self._cov) + len(cov)
+        self._cov = np.empty((size, size))
+        self._cov[: len(before), : len(before)] = before
+        self._cov[len(before) :, : len(before)], self._cov[: len(before), len(before) :] = cross, cross.T
+        self._cov[len(before) :, len(before) :] = _symmetric(jacobian @ cross.T + cov)
 
     def update(self, H: Rows, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
@@ -201,9 +204,9 @@ def cholesky_root(cov: Array) -> Array:
 
 
 def regular_root(cov: Array) -> Array:
-    """Return the lower triangular root of a covariance (n, n), each variance larger by a rounding that keeps it regular.
+    """Return the lower triangular root of a covariance (n, n) that may be singular but for rounding.
 
-    Raises LinAlgError where it has none.
+    Each variance is taken for larger by a rounding. Raises LinAlgError where it has no root even so.
     """
     cov = cov.copy()
     cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT

@@ -12,11 +12,11 @@ from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
-from filters.kalman.multiview import Linearised, TrackSightings
+from filters.kalman.multiview import Linearised
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
-from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.models import left_only
+from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
+from toolkit.models import left_only, stereo
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -82,18 +82,13 @@ def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: Ster
 def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
     """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
-    rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    sightings = TrackSightings(
-        joint.landmark_ids,
-        frame.uvs_px[rows][:, None],
-        np.ones((len(rows), 1), dtype=bool),
-        frame.ages[rows][:, None],
-    )
-    residuals, depth_m = multiview.compared(sightings, joint.points, joint.clones[-1:], rig)
-    newest_at = at.clones(joint)[-1:]
-    there = multiview.linearise(sightings, at.points(joint), newest_at, newest_at, rig)
-    dof = left_only.degrees_of_freedom(frame.uvs_px[rows])
-    return LandmarkSightings(residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], depth_m[:, 0], dof)
+    uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
+    predicted_px, depth_m = stereo.images(transform(se3_inverse(joint.clones[-1]), joint.points), rig)
+    there = stereo.predict(at.points(joint), at.clones(joint)[-1], rig)
+    whitener = left_only.whitener(uvs_px, rig)
+    residuals = left_only.whitened_residuals(uvs_px, predicted_px, rig)
+    dof = left_only.degrees_of_freedom(uvs_px)
+    return LandmarkSightings(residuals, whitener @ there.d_uv_d_pose, whitener @ there.d_uv_d_point, depth_m, dof)
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:

@@ -111,13 +111,6 @@ def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: 
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))
 
 
-def compared(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return residuals (F, W, 3) and depths (F, W) m as :func:`linearise` does, without the Jacobians."""
-    uv_px, depth_m = stereo.images(_in_imu(poses, points), rig)
-    residuals = np.where(sightings.seen[..., None], left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
-    return residuals, np.where(sightings.seen, depth_m, np.inf)
-
-
 def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
     """Return tracks together with what makes their rows independent, where the rig's noise is correlated."""
     if rig.track_noise is None:
