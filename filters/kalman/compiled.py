@@ -38,6 +38,7 @@ from toolkit.models.gating import (
 from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
 from toolkit.models.motion import Increment, MotionModel, motion_model, predicted
 from toolkit.models.state import Belief, Layout, Prediction
+from toolkit.models.stereo import StereoPrediction
 from toolkit.sequence import StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS
 
@@ -157,6 +158,26 @@ def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
     if kernel is None:
         return se3_exp
     return lambda twists: kernel.exponentials(np.ascontiguousarray(twists))
+
+
+def images(compilation: Compilation) -> multiview.Images:
+    """Return what predicts images: :data:`filters.kalman.multiview.NUMPY`."""
+    kernel = _kernel(compilation, "corrections")
+    if kernel is None:
+        return multiview.NUMPY
+
+    def linearised(points: Array, poses: Array, rig: StereoRig) -> StereoPrediction:
+        """Predict images and their Jacobians as the definition does."""
+        uvs_px, d_pose, d_point, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        seen = depths_m.shape
+        return StereoPrediction(uvs_px, d_pose.reshape(*seen, 3, 6), d_point.reshape(*seen, 3, 3), depths_m)
+
+    def plain(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
+        """Predict images as the definition does."""
+        uvs_px, _, _, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        return uvs_px, depths_m
+
+    return multiview.Images(plain, linearised)
 
 
 def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], CorrectionTest]:

@@ -18,8 +18,8 @@ from filters.kalman import multiview
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from toolkit.arrays import rows_of
-from toolkit.geometry import Array, IntArray, se3_inverse, transform
-from toolkit.models import left_only, stereo
+from toolkit.geometry import Array, IntArray
+from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -122,7 +122,14 @@ class LandmarkCorrelation(ResidualCorrelation):
         self._before_ids: IntArray = np.empty(0, dtype=np.int64)
         self._before = np.empty((0, 3))
 
-    def learn_frame(self, frame: StereoFrame, track_ids: IntArray, points: Array, T_world_imu: Array) -> None:
+    def learn_frame(
+        self,
+        frame: StereoFrame,
+        track_ids: IntArray,
+        points: Array,
+        T_world_imu: Array,
+        images: multiview.Images = multiview.NUMPY,
+    ) -> None:
         """Take in a frame's sightings of landmarks (L, 3) m with ids (L,), all as they have corrected its pose (4, 4).
 
         Outliers by the stated noise are left out.
@@ -132,8 +139,8 @@ class LandmarkCorrelation(ResidualCorrelation):
         order = np.argsort(frame.track_ids)
         places, seen = rows_of(track_ids, frame.track_ids[order])
         ids, uvs_px = track_ids[seen], frame.uvs_px[order[places[seen]]]
-        predicted_px, _ = stereo.images(transform(se3_inverse(T_world_imu), points[seen]), self._rig)
-        residuals = left_only.whitened_residuals(uvs_px, predicted_px, self._rig)
+        predicted_px, _ = images.plain(points[seen], T_world_imu[None], self._rig)
+        residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], self._rig)
         sound = np.square(residuals).sum(axis=1) < chi2_bound(3, SOUND)
         ids, residuals = ids[sound], residuals[sound]
         order = np.argsort(ids)

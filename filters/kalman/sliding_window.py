@@ -60,7 +60,7 @@ class SlidingWindowFilter:
         self._joint = _joint_belief(model.initial_belief(setup.prior), setup.rig.track_noise)
         self._joint.exponentials = compiled.exponentials(setup.compilation)
         self._tracks = WindowTracks()
-        self._track_test = compiled.track_test(setup.compilation)
+        self._track_test, self._images = compiled.track_test(setup.compilation), compiled.images(setup.compilation)
         self._in_view = TracksInView(
             linearisation, setup.rig, self._outliers, compiled.steps_in_view(setup.compilation)
         )
@@ -106,10 +106,12 @@ class SlidingWindowFilter:
             track_error_states.correct(self._joint, frame, self._at, self._rig, gate)
             joint_landmarks.forget(self._joint, track_error_states.implausible_errors(self._joint, gate), self._memory)
         else:
-            joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+            joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate, self._images)
         joint = self._joint
         if self._most_landmarks:
-            self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
+            self._landmark_correlation.learn_frame(
+                frame, joint.landmark_ids, joint.points, joint.clones[-1], self._images
+            )
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
@@ -132,7 +134,7 @@ class SlidingWindowFilter:
         """Correct the window by tracks; add as many of those still seen as landmarks as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        track_gate = TrackGate(joint, self._at, self._rig, self._track_test)
+        track_gate = TrackGate(joint, self._at, self._rig, self._track_test, self._images)
         accepted = track_gate.accepted(sightings, gate)
         if not len(accepted.points):
             return

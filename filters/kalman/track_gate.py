@@ -101,8 +101,14 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     return TestedTracks(sightings, points, nis, constraints.dof, worst, H[used], residuals[used], owner[used])
 
 
-def _linearised(sightings: TrackSightings, points: Array, window: Window, rig: StereoRig) -> Linearised:
-    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig)
+def _linearised(
+    sightings: TrackSightings,
+    points: Array,
+    window: Window,
+    rig: StereoRig,
+    images: multiview.Images = multiview.NUMPY,
+) -> Linearised:
+    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig, images)
     return multiview.decorrelated(linearised, sightings, rig)
 
 
@@ -133,8 +139,15 @@ def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray
 class TrackGate:
     """Tests tracks against a joint belief, by NumPy or by what computes the same."""
 
-    def __init__(self, joint: JointBelief, at: Linearisation, rig: StereoRig, test: TrackTest = tested) -> None:
-        self._rig, self._test = rig, test
+    def __init__(
+        self,
+        joint: JointBelief,
+        at: Linearisation,
+        rig: StereoRig,
+        test: TrackTest = tested,
+        images: multiview.Images = multiview.NUMPY,
+    ) -> None:
+        self._rig, self._test, self._images = rig, test, images
         self._window = Window.of(joint, at)
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
@@ -147,7 +160,8 @@ class TrackGate:
 
     def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
         """Return some of the accepted tracks linearised, landmarks included, with their weights."""
-        linearised = _linearised(tracks.sightings.select(rows), tracks.points[rows], self._window, self._rig)
+        sightings, points = tracks.sightings.select(rows), tracks.points[rows]
+        linearised = _linearised(sightings, points, self._window, self._rig, self._images)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
