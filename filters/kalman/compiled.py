@@ -54,12 +54,19 @@ _GATE_RULES = np.array(
         MISMATCHED_TRACK_FACTOR,
     ]
 )
+_KERNELS = "filters.kalman.kernels"
 _EVEN_NOISE = np.empty((0, 2))
 _DOF = np.array([3, 2])
 
 
 def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
-    return compilation.module(f"filters.kalman.kernels.{name}")
+    return compilation.module(f"{_KERNELS}.{name}")
+
+
+def share_windowed(noise: MotionNoise, compilation: Compilation) -> None:
+    """Have processes that begin at once share the compilation of what the windowed filters need, the longest first."""
+    along_imu = ["preintegration"] if isinstance(noise, ImuNoise) else []
+    compilation.share(f"{_KERNELS}.{name}" for name in ["track_gate", "corrections", "tracks_in_view", *along_imu])
 
 
 def track_test(compilation: Compilation) -> TrackTest:

@@ -52,6 +52,7 @@ class SlidingWindowFilter:
     ) -> None:
         self._rig, self._at = setup.rig, linearisation
         self._outliers, model = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
+        compiled.share_windowed(setup.noise, setup.compilation)
         self._motion = compiled.integrator(setup.noise, setup.gravity_world, setup.compilation)
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
