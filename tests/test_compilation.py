@@ -67,6 +67,43 @@ def test_a_run_says_what_computed_where_there_are_both(estimator, ran):
     assert run.arithmetic == ran
 
 
+SLOW_ONCE = """
+import time
+from pathlib import Path
+kept = Path(__file__ + ".kept")
+compiled = not kept.exists()
+time.sleep(1.0 if compiled else 0.0)
+kept.touch()
+COMPILED = ""
+"""
+SHARING = """
+import sys, time
+from pathlib import Path
+from toolkit import compilation
+compilation.find_spec = lambda name: name
+Path(sys.argv[1]).touch()
+while not all(Path(path).exists() for path in "ab"):
+    time.sleep(0.01)
+asked = compilation.Compilation("auto")
+asked.share(["one", "other"])
+print(*(asked.module(name).compiled for name in ["one", "other"]))
+"""
+
+
+def test_processes_that_begin_together_share_what_is_to_be_compiled(tmp_path):
+    """Two modules that take a while each, once: each process compiles one, and finds the other when it is through."""
+    for name in ("one", "other"):
+        (tmp_path / f"{name}.py").write_text(SLOW_ONCE)
+    where = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", SHARING, name], stdout=subprocess.PIPE, text=True, env=where, cwd=tmp_path
+        )
+        for name in "ab"
+    ]
+    assert sorted(process.communicate()[0].split() for process in both) == [["False", "True"], ["True", "False"]]
+
+
 def test_processes_compile_one_after_another(tmp_path):
     """Two that begin together: each module takes a while, and neither begins before the other has ended."""
     (tmp_path / "slow.py").write_text(

@@ -8,13 +8,13 @@ import fcntl
 import importlib.util
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
+from typing import BinaryIO, Literal
 
 from toolkit.errors import EstimatorError
 
@@ -48,14 +48,29 @@ class Compilation:
         Its constant ``COMPILED`` says in words what had to be compiled; empty where that was found on disk. Raises
         EstimatorError where it is asked for and cannot be had.
         """
+        return self._imported(name, _one_process_at_a_time(name)) if self._can_run() else None
+
+    def share(self, names: Iterable[str]) -> None:
+        """Import those of some compiled modules that no other process has begun to: each compiles some for all.
+
+        :meth:`module` then waits for the others. Raises what it raises.
+        """
+        for name in names if self._can_run() else ():
+            with _unless_another_process(name) as alone:
+                if alone:
+                    self._imported(name, nullcontext())
+
+    def _can_run(self) -> bool:
         check_possible(self._asked)
         self.ran = "numpy"
-        if self._asked == "numpy" or find_spec("numba") is None:
-            return None
+        return self._asked != "numpy" and find_spec("numba") is not None
+
+    def _imported(self, name: str, turn: AbstractContextManager[object]) -> ModuleType | None:
+        """Import a module when it is this process's turn, and take down what that took."""
         first = name not in sys.modules
         wall, cpu = time.perf_counter(), time.process_time()
         try:
-            with _one_process_at_a_time(name):
+            with turn:
                 module = import_module(name)
         except Exception as error:
             # A numba that does not fit this Python or NumPy says so in errors of many kinds.
@@ -78,9 +93,26 @@ def _one_process_at_a_time(name: str) -> Iterator[None]:
 
     They wait at the module's own file, so that none is left behind.
     """
-    spec = importlib.util.find_spec(name)
     with ExitStack() as held:
         with suppress(OSError):  # no file, or a file system without locks: then they compile side by side
-            file = held.enter_context(Path(spec.origin or "" if spec else "").open("rb"))
-            fcntl.flock(file, fcntl.LOCK_EX)
+            fcntl.flock(held.enter_context(_file_of(name)), fcntl.LOCK_EX)
         yield
+
+
+@contextmanager
+def _unless_another_process(name: str) -> Iterator[bool]:
+    """Say whether no other process imports a module, and have none do so meanwhile."""
+    with ExitStack() as held:
+        alone = True
+        with suppress(OSError):
+            file = held.enter_context(_file_of(name))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                alone = False
+        yield alone
+
+
+def _file_of(name: str) -> BinaryIO:
+    spec = importlib.util.find_spec(name)
+    return Path(spec.origin or "" if spec else "").open("rb")

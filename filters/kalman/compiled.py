@@ -38,6 +38,7 @@ from toolkit.models.gating import (
 from toolkit.models.imu import INTEGRATION_DENSITY, mean_noise_scale, transition_over
 from toolkit.models.motion import Increment, MotionModel, motion_model, predicted
 from toolkit.models.state import Belief, Layout, Prediction
+from toolkit.models.stereo import StereoPrediction
 from toolkit.sequence import StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS
 
@@ -53,12 +54,19 @@ _GATE_RULES = np.array(
         MISMATCHED_TRACK_FACTOR,
     ]
 )
+_KERNELS = "filters.kalman.kernels"
 _EVEN_NOISE = np.empty((0, 2))
 _DOF = np.array([3, 2])
 
 
 def _kernel(compilation: Compilation, name: str) -> ModuleType | None:
-    return compilation.module(f"filters.kalman.kernels.{name}")
+    return compilation.module(f"{_KERNELS}.{name}")
+
+
+def share_windowed(noise: MotionNoise, compilation: Compilation) -> None:
+    """Have processes that begin at once share the compilation of what the windowed filters need, the longest first."""
+    along_imu = ["preintegration"] if isinstance(noise, ImuNoise) else []
+    compilation.share(f"{_KERNELS}.{name}" for name in ["track_gate", "corrections", "tracks_in_view", *along_imu])
 
 
 def track_test(compilation: Compilation) -> TrackTest:
@@ -71,24 +79,18 @@ def track_test(compilation: Compilation) -> TrackTest:
         """Test tracks as the definition does, and by it where right images are missing."""
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
-        points, reliable, nis, worst, ends, H, residuals = kernel.test_tracks(
+        points, reliable, nis, dof, worst, H, residuals, owners = kernel.test_tracks(
             _given((sightings.uvs_px, sightings.seen, sightings.ages)),
             _given(window),
             _camera(rig),
             _GATE_RULES,
             bounds,
         )
-        rows = np.diff(ends, prepend=0)[reliable]
-        count = int(rows.sum())
-        return TestedTracks(
-            sightings.select(reliable),
-            points[:-1][reliable],
-            nis[reliable],
-            worst[reliable],
-            H[:count],
-            residuals[:count],
-            np.repeat(np.arange(len(rows)), rows),
-        )
+        points = points[:-1]
+        if not reliable.all():
+            sightings, points = sightings.select(reliable), points[reliable]
+            nis, dof, worst = nis[reliable], dof[reliable], worst[reliable]
+        return TestedTracks(sightings, points, nis, dof, worst, H, residuals, owners)
 
     return tested
 
@@ -163,6 +165,26 @@ def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
     if kernel is None:
         return se3_exp
     return lambda twists: kernel.exponentials(np.ascontiguousarray(twists))
+
+
+def images(compilation: Compilation) -> multiview.Images:
+    """Return what predicts images: :data:`filters.kalman.multiview.NUMPY`."""
+    kernel = _kernel(compilation, "corrections")
+    if kernel is None:
+        return multiview.NUMPY
+
+    def linearised(points: Array, poses: Array, rig: StereoRig) -> StereoPrediction:
+        """Predict images and their Jacobians as the definition does."""
+        uvs_px, d_pose, d_point, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        seen = depths_m.shape
+        return StereoPrediction(uvs_px, d_pose.reshape(*seen, 3, 6), d_point.reshape(*seen, 3, 3), depths_m)
+
+    def plain(points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
+        """Predict images as the definition does."""
+        uvs_px, _, _, depths_m = kernel.predict_images(*_given((points, poses)), _camera(rig))
+        return uvs_px, depths_m
+
+    return multiview.Images(plain, linearised)
 
 
 def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], CorrectionTest]:

@@ -7,6 +7,7 @@ is estimated now, and as it was first estimated; which of the two a Jacobian use
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -16,6 +17,10 @@ from scipy.sparse import csr_array
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import POSE, Belief, Prediction
+
+# Of its own every error has at least this share of its variance: less is lost in rounding, and without it a pose that
+# two clones agree on to sixteen digits leaves their covariance without a root.
+_LEAST_INDEPENDENT = 1e-12
 
 
 class Rows(Protocol):
@@ -77,7 +82,7 @@ class JointBelief:
     def clone(self, frame: int) -> None:
         """Add a clone of the pose now, with all its correlations (stochastic cloning)."""
         end = self.clone_columns.stop
-        self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, None)])
+        self._cov = _of_slices(self._cov, [slice(0, end), slice(0, 6), slice(end, self._cov.shape[0])])
         self.clone_frames = np.append(self.clone_frames, frame)
         self.clones = np.concatenate([self.clones, self._core.T_world_imu[None]])
         self.first_clones = np.concatenate([self.first_clones, self.first_core.T_world_imu[None]])
@@ -111,14 +116,37 @@ class JointBelief:
     def _add_rows(self, jacobian: Array | csr_array, cov: Array) -> None:
         """Add to the end of the error state what is ``jacobian`` (m, n) times the state's error, plus noise."""
         cross = np.asarray(jacobian @ self._cov)
-        own = _symmetric(jacobian @ cross.T + cov)
-        self._cov = np.block([[self._cov, cross.T], [cross, own]])
+        before, size = self._cov, len(self._cov) + len(cov)
+        self._cov = np.empty((size, size))
+        self._cov[: len(before), : len(before)] = before
+        self._cov[len(before) :, : len(before)], self._cov[: len(before), len(before) :] = cross, cross.T
+        self._cov[len(before) :, len(before) :] = _symmetric(jacobian @ cross.T + cov)
 
     def update(self, H: Rows, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
         self.move(half_gain.T @ divided_by_root(root, residual[:, None].copy())[:, 0])
+
+    def inform(self, information: Array, vector: Array) -> None:
+        """Correct everything by the information matrix (k, k) and vector (k,) on the last k errors of the state.
+
+        It is :meth:`update` by rows H and residuals r with ``H^T H`` and ``H^T r``, whatever their number. With the
+        root R of the covariance of the last, ``Y = R^-1 P`` of all and ``M = 1 + R^T H^T H R`` the correction is
+        ``Y^T M^-1 R^T H^T r`` and the covariance left ``P - Y^T Y + Y^T M^-1 Y``;
+        the Y of the last themselves is ``R^T``.
+        """
+        first = self._cov.shape[0] - len(vector)
+        root = regular_root(self._cov[first:, first:])
+        matrix = transposed_root_times(root, times_root(information, root))
+        matrix.flat[:: len(matrix) + 1] += 1.0
+        matrix_root = cholesky_root(matrix)
+        to_others = divided_by_root(root, self._cov[first:, :first].copy())
+        half_gain = divided_by_root(matrix_root, np.concatenate([to_others, root.T], axis=1))
+        others = self._cov[:first, :first] - to_others.T @ to_others
+        self._cov = half_gain.T @ half_gain
+        self._cov[:first, :first] += others
+        self.move(half_gain.T @ divided_by_root(matrix_root, (root.T @ vector)[:, None])[:, 0])
 
     def reduce_covariance(self, H: Rows, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
@@ -175,6 +203,16 @@ def cholesky_root(cov: Array) -> Array:
     return np.asarray(root.T)
 
 
+def regular_root(cov: Array) -> Array:
+    """Return the lower triangular root of a covariance (n, n) that may be singular but for rounding.
+
+    Each variance is taken for larger by a rounding. Raises LinAlgError where it has no root even so.
+    """
+    cov = cov.copy()
+    cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
+    return cholesky_root(cov)
+
+
 def divided_by_root(root: Array, right: Array) -> Array:
     """Return ``C^-1 B`` of a lower triangular root C (n, n) and right sides B (n, m), which may be overwritten."""
     # BLAS takes columns where NumPy has rows: for the transposed problem nothing is copied.
@@ -215,5 +253,9 @@ def _stretches(kept: BoolArray) -> list[slice]:
 
 def _of_slices(cov: Array, stretches: list[slice]) -> Array:
     """Return the rows and columns of a matrix in some stretches, in their order; of few it is faster than an index."""
-    rows = np.concatenate([cov[stretch] for stretch in stretches])
-    return np.concatenate([rows[:, stretch] for stretch in stretches], axis=1)
+    ends = list(accumulate(stretch.stop - stretch.start for stretch in stretches))
+    result, begin = np.empty((ends[-1], ends[-1])), 0
+    for stretch, end in zip(stretches, ends, strict=True):
+        np.concatenate([cov[stretch, other] for other in stretches], axis=1, out=result[begin:end])
+        begin = end
+    return result

@@ -12,7 +12,7 @@ from filters.kalman import multiview
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
-from filters.kalman.multiview import Linearised, TrackSightings
+from filters.kalman.multiview import NUMPY, Images, Linearised
 from filters.kalman.online_output import LandmarkMemory
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -68,32 +68,36 @@ def forget(joint: JointBelief, which: BoolArray, memory: LandmarkMemory) -> None
         joint.forget_landmarks(which)
 
 
-def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
+def correct(
+    joint: JointBelief,
+    frame: StereoFrame,
+    at: Linearisation,
+    rig: StereoRig,
+    gate: FrameGate,
+    images: Images = NUMPY,
+) -> None:
     """Correct everything by the landmarks of the state, every one of which the frame must show."""
     if not len(joint.landmark_ids):
         return
-    seen = linearise_sightings(joint, frame, at, rig)
+    seen = linearise_sightings(joint, frame, at, rig, images)
     weights = weighed(joint, seen, gate)
     if weights.any():
         H, residuals = stacked(joint, seen).weighed(weights)
         joint.update(H, residuals, columns(joint))
 
 
-def linearise_sightings(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig) -> LandmarkSightings:
+def linearise_sightings(
+    joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, images: Images = NUMPY
+) -> LandmarkSightings:
     """Linearise the frame's sightings of all landmarks of the state, every one of which it must show."""
     order = np.argsort(frame.track_ids)
-    rows = order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]
-    sightings = TrackSightings(
-        joint.landmark_ids,
-        frame.uvs_px[rows][:, None],
-        np.ones((len(rows), 1), dtype=bool),
-        frame.ages[rows][:, None],
-    )
-    residuals, depth_m = multiview.compared(sightings, joint.points, joint.clones[-1:], rig)
-    newest_at = at.clones(joint)[-1:]
-    there = multiview.linearise(sightings, at.points(joint), newest_at, newest_at, rig)
-    dof = left_only.degrees_of_freedom(frame.uvs_px[rows])
-    return LandmarkSightings(residuals[:, 0], there.H_pose[:, 0], there.H_point[:, 0], depth_m[:, 0], dof)
+    uvs_px = frame.uvs_px[order[np.searchsorted(frame.track_ids, joint.landmark_ids, sorter=order)]]
+    predicted_px, depth_m = images.plain(joint.points, joint.clones[-1:], rig)
+    there = images.linearised(at.points(joint), at.clones(joint)[-1:], rig)
+    whitener = left_only.whitener(uvs_px, rig)
+    residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], rig)
+    H_pose, H_point = whitener @ there.d_uv_d_pose[:, 0], whitener @ there.d_uv_d_point[:, 0]
+    return LandmarkSightings(residuals, H_pose, H_point, depth_m[:, 0], left_only.degrees_of_freedom(uvs_px))
 
 
 def stacked(joint: JointBelief, seen: LandmarkSightings) -> StackedSightings:

@@ -5,6 +5,7 @@ Sources: Mourikis & Roumeliotis 2007, "A multi-state constraint Kalman filter fo
 navigation", eqs. 17-26; the stereo measurement replaces their monocular one.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -41,8 +42,10 @@ class TrackSightings(NamedTuple):
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
         """Return some of the tracks, themselves where a mask has all."""
-        if rows.dtype == np.bool_ and rows.all():
-            return self
+        if rows.dtype == np.bool_:
+            rows = rows.nonzero()[0]  # places are found once for all four arrays; a mask has them found for each
+            if rows.size == self.track_ids.size:
+                return self
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":
@@ -53,6 +56,16 @@ class TrackSightings(NamedTuple):
         )
         seen, ages = np.concatenate([self.seen, other.seen]), np.concatenate([self.ages, other.ages])
         return TrackSightings(track_ids, uvs_px, seen, ages)
+
+
+class Images(NamedTuple):
+    """What predicts the images of points (F, 3) from poses (W, 4, 4): ``plain`` (F, W, 3) px and depths (F, W) m.
+
+    ``linearised`` has the Jacobians as well, (F, W, 3, .).
+    """
+
+    plain: Callable[[Array, Array, StereoRig], tuple[Array, Array]]
+    linearised: Callable[[Array, Array, StereoRig], stereo.StereoPrediction]
 
 
 class Linearised(NamedTuple):
@@ -91,29 +104,37 @@ class Linearised(NamedTuple):
         return self.residuals, self.H_pose, self.H_point, self.depth_m
 
 
-def linearise(sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig) -> Linearised:
+def _in_imu(points: Array, poses: Array) -> Array:
+    """Return points (F, 3) of the world in the IMU frame of each pose (W, 4, 4), (F, W, 3)."""
+    T_imu_world = se3_inverse(poses)
+    rotated = points @ np.swapaxes(T_imu_world[:, :3, :3], 1, 2)
+    return np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
+
+
+NUMPY = Images(
+    lambda points, poses, rig: stereo.images(_in_imu(points, poses), rig),
+    lambda points, poses, rig: stereo.linearise(_in_imu(points, poses), poses[:, :3, :3], rig),
+)
+
+
+def linearise(
+    sightings: TrackSightings, points: Array, poses: Array, poses_at: Array, rig: StereoRig, images: Images = NUMPY
+) -> Linearised:
     """Linearise the sightings of points (F, 3) from poses (W, 4, 4).
 
     Residuals are taken at the poses, Jacobians at ``poses_at`` (W, 4, 4): the same, or their first estimates.
     What was not seen is zero throughout, and so is uR where the right image is missing.
     """
     whitener, seen = left_only.whitener(sightings.uvs_px, rig), sightings.seen[..., None]
-    there = stereo.linearise(_in_imu(poses_at, points), poses_at[:, :3, :3], rig)
+    there = images.linearised(points, poses_at, rig)
     if poses_at is poses:
         uv_px, depth_m = there.uv_px, there.depth_m
     else:
-        uv_px, depth_m = stereo.images(_in_imu(poses, points), rig)
+        uv_px, depth_m = images.plain(points, poses, rig)
     residuals = np.where(seen, left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
     H_pose = np.where(seen[..., None], whitener @ there.d_uv_d_pose, 0.0)
     H_point = np.where(seen[..., None], whitener @ there.d_uv_d_point, 0.0)
     return Linearised(residuals, H_pose, H_point, np.where(sightings.seen, depth_m, np.inf))
-
-
-def compared(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return residuals (F, W, 3) and depths (F, W) m as :func:`linearise` does, without the Jacobians."""
-    uv_px, depth_m = stereo.images(_in_imu(poses, points), rig)
-    residuals = np.where(sightings.seen[..., None], left_only.whitened_residuals(sightings.uvs_px, uv_px, rig), 0.0)
-    return residuals, np.where(sightings.seen, depth_m, np.inf)
 
 
 def decorrelated(linearised: Linearised, sightings: TrackSightings, rig: StereoRig) -> Linearised:
@@ -140,13 +161,6 @@ def refined(sightings: TrackSightings, points: Array, poses: Array, rig: StereoR
         most = 0.2 * here.depth_m.min(axis=1)
         points = points + step * np.minimum(1.0, most / np.maximum(np.linalg.norm(step, axis=1), 1e-9))[:, None]
     return points
-
-
-def _in_imu(poses: Array, points: Array) -> Array:
-    """Return points (F, 3) of the world in the IMU frame of each pose (W, 4, 4), (F, W, 3)."""
-    T_imu_world = se3_inverse(poses)
-    rotated = points @ np.swapaxes(T_imu_world[:, :3, :3], 1, 2)
-    return np.swapaxes(rotated, 0, 1) + T_imu_world[:, :3, 3]
 
 
 class Constraints(NamedTuple):

@@ -27,8 +27,9 @@ from filters.kalman import multiview
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from filters.kalman.track_scores import FEWEST_SIGHTINGS, SOUND, TrackScores
-from toolkit.geometry import Array, IntArray, se3_inverse, transform
-from toolkit.models import left_only, stereo
+from toolkit.arrays import rows_of
+from toolkit.geometry import Array, IntArray
+from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
 
@@ -142,20 +143,31 @@ class LandmarkCorrelation(ResidualCorrelation):
         self._before_ids: IntArray = np.empty(0, dtype=np.int64)
         self._before = np.empty((0, 3))
 
-    def learn_frame(self, frame: StereoFrame, track_ids: IntArray, points: Array, T_world_imu: Array) -> None:
+    def learn_frame(
+        self,
+        frame: StereoFrame,
+        track_ids: IntArray,
+        points: Array,
+        T_world_imu: Array,
+        images: multiview.Images = multiview.NUMPY,
+    ) -> None:
         """Take in a frame's sightings of landmarks (L, 3) m with ids (L,), all as they have corrected its pose (4, 4).
 
         Outliers by the stated noise are left out.
         """
         if not self.matches:
             return
-        _, rows, seen = np.intersect1d(track_ids, frame.track_ids, assume_unique=True, return_indices=True)
-        predicted_px, _ = stereo.images(transform(se3_inverse(T_world_imu), points[rows]), self._rig)
-        residuals = left_only.whitened_residuals(frame.uvs_px[seen], predicted_px, self._rig)
+        order = np.argsort(frame.track_ids)
+        places, seen = rows_of(track_ids, frame.track_ids[order])
+        ids, uvs_px = track_ids[seen], frame.uvs_px[order[places[seen]]]
+        predicted_px, _ = images.plain(points[seen], T_world_imu[None], self._rig)
+        residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], self._rig)
         sound = np.square(residuals).sum(axis=1) < chi2_bound(3, SOUND)
-        ids, residuals = track_ids[rows][sound], residuals[sound]
-        _, before, now = np.intersect1d(self._before_ids, ids, assume_unique=True, return_indices=True)
-        self.add(self._before[before], residuals[now])
+        ids, residuals = ids[sound], residuals[sound]
+        order = np.argsort(ids)
+        ids, residuals = ids[order], residuals[order]
+        before, known = rows_of(ids, self._before_ids)
+        self.add(self._before[before[known]], residuals[known])
         self._before_ids, self._before = ids, residuals
 
 

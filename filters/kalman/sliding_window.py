@@ -54,6 +54,7 @@ class SlidingWindowFilter:
     ) -> None:
         self._rig, self._at = setup.rig, linearisation
         self._outliers, model = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
+        compiled.share_windowed(setup.noise, setup.compilation)
         self._motion = compiled.integrator(setup.noise, setup.gravity_world, setup.compilation)
         if window_s is None:
             window_s = setup.settings.window.seconds(setup.motion_kind)
@@ -62,7 +63,7 @@ class SlidingWindowFilter:
         self._joint = _joint_belief(model.initial_belief(setup.prior), setup.rig.track_noise)
         self._joint.exponentials = compiled.exponentials(setup.compilation)
         self._tracks, self._frames = WindowTracks(), deque[StereoFrame]()
-        self._track_test = compiled.track_test(setup.compilation)
+        self._track_test, self._images = compiled.track_test(setup.compilation), compiled.images(setup.compilation)
         self._in_view = TracksInView(
             linearisation, setup.rig, self._outliers, compiled.steps_in_view(setup.compilation)
         )
@@ -112,10 +113,12 @@ class SlidingWindowFilter:
             track_error_states.correct(self._joint, frame, self._at, self._rig, gate)
             joint_landmarks.forget(self._joint, track_error_states.implausible_errors(self._joint, gate), self._memory)
         else:
-            joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate)
+            joint_landmarks.correct(self._joint, frame, self._at, self._rig, gate, self._images)
         joint = self._joint
         if self._most_landmarks:
-            self._landmark_correlation.learn_frame(frame, joint.landmark_ids, joint.points, joint.clones[-1])
+            self._landmark_correlation.learn_frame(
+                frame, joint.landmark_ids, joint.points, joint.clones[-1], self._images
+            )
 
     def _correct_by_tracks(self, leaving: BoolArray, gate: FrameGate) -> None:
         """Correct by the tracks that ended, and by those that poses (C,) saw which leave the window now.
@@ -138,7 +141,7 @@ class SlidingWindowFilter:
         """Correct the window by tracks; add as many of those still seen as landmarks as there is room for."""
         joint = self._joint
         sightings = sightings.select(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
-        track_gate = TrackGate(joint, self._at, self._rig, self._track_test)
+        track_gate = TrackGate(joint, self._at, self._rig, self._track_test, self._images)
         accepted = track_gate.accepted(sightings, gate)
         if not len(accepted.points):
             return
@@ -149,9 +152,18 @@ class SlidingWindowFilter:
                 accepted.sightings.select(kept), accepted.points[kept], track_gate.linearised(accepted, kept)
             )
         first = 6 * int(np.argmax(accepted.sightings.seen.any(axis=0)))
-        H, residuals = multiview.compressed(accepted.H[:, first:], accepted.residuals)
-        joint.update(H, residuals, slice(joint.clone_columns.start + first, joint.clone_columns.stop))
+        self._update(accepted.H[:, first:], accepted.residuals)
         self._learn(self._correlation, accepted.sightings, accepted.points, joint.clones, self._rig)
+
+    def _update(self, H: Array, residuals: Array) -> None:
+        """Correct everything by whitened residuals (m,) with Jacobian (m, k) to the newest clones."""
+        joint, (count, size) = self._joint, H.shape
+        end = joint.clone_columns.stop
+        if count > size and end == joint.cov.shape[0]:
+            joint.inform(H.T @ H, H.T @ residuals)
+            return
+        # With landmarks behind the clones, an update by fewer rows takes less.
+        joint.update(*multiview.compressed(H, residuals), slice(end - size, end))
 
     def _correct_by_bridge(self, packet: Packet) -> None:
         """Correct the last three poses where no track leads from one of them to the next."""
@@ -224,13 +236,12 @@ class WindowTracks:
 
     def take(self, rows: BoolArray) -> TrackSightings:
         """Return those tracks (A,) and forget their sightings; a track that lives on starts anew."""
-        taken = self.unused().select(np.flatnonzero(rows))
+        tracks = self.unused()
         self._keep(np.logical_not(rows))
-        return taken
+        return tracks.select(rows)
 
     def _keep(self, rows: BoolArray) -> None:
-        # Places are found once for all four arrays; a mask has them found for each.
-        self._ids, self._uvs_px, self._seen, self._ages = self.unused().select(np.flatnonzero(rows))
+        self._ids, self._uvs_px, self._seen, self._ages = self.unused().select(rows)
 
 
 def _joint_belief(core: Belief, noise: TrackNoise | None) -> JointBelief:

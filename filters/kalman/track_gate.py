@@ -39,14 +39,15 @@ class Window(NamedTuple):
 class TestedTracks(NamedTuple):
     """F tracks with a landmark (F, 3) each: the NIS (F,) of what they constrain the window by, and those constraints.
 
-    ``worst`` (F,) is the sighting that disagrees most where the NIS is far above its bound, else -1. Of the tracks
-    below their bounds the whitened constraints stand under each other: ``H`` (n, 6 W), ``residuals`` (n,), and whose
-    each is, ``track`` (n,).
+    ``dof`` (F,) are the degrees of freedom of the NIS. ``worst`` (F,) is the sighting that disagrees most where the NIS
+    is far above its bound, else -1. Of the tracks below their bounds the whitened constraints stand under each other:
+    ``H`` (n, 6 W), ``residuals`` (n,), and whose each is, ``track`` (n,).
     """
 
     sightings: TrackSightings
     points: Array
     nis: Array
+    dof: IntArray
     worst: IntArray
     H: Array
     residuals: Array
@@ -96,13 +97,18 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
     H = constraints.H[below].reshape(-1, P.shape[0])
     used = H.any(axis=1)
     owner = np.repeat(below, constraints.H.shape[1])
-    return TestedTracks(
-        sightings, points, nis, worst, H[used], constraints.residuals[below].reshape(-1)[used], owner[used]
-    )
+    residuals = constraints.residuals[below].reshape(-1)
+    return TestedTracks(sightings, points, nis, constraints.dof, worst, H[used], residuals[used], owner[used])
 
 
-def _linearised(sightings: TrackSightings, points: Array, window: Window, rig: StereoRig) -> Linearised:
-    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig)
+def _linearised(
+    sightings: TrackSightings,
+    points: Array,
+    window: Window,
+    rig: StereoRig,
+    images: multiview.Images = multiview.NUMPY,
+) -> Linearised:
+    linearised = multiview.linearise(sightings, points, window.poses, window.poses_at, rig, images)
     return multiview.decorrelated(linearised, sightings, rig)
 
 
@@ -133,8 +139,15 @@ def _worst_sighting(basis: Array, residuals: Array, covs: Array, seen: BoolArray
 class TrackGate:
     """Tests tracks against a joint belief, by NumPy or by what computes the same."""
 
-    def __init__(self, joint: JointBelief, at: Linearisation, rig: StereoRig, test: TrackTest = tested) -> None:
-        self._rig, self._test = rig, test
+    def __init__(
+        self,
+        joint: JointBelief,
+        at: Linearisation,
+        rig: StereoRig,
+        test: TrackTest = tested,
+        images: multiview.Images = multiview.NUMPY,
+    ) -> None:
+        self._rig, self._test, self._images = rig, test, images
         self._window = Window.of(joint, at)
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
@@ -142,22 +155,21 @@ class TrackGate:
 
         ``gate`` counts every test, so a track that is tested twice counts twice.
         """
-        accepted, mismatched = self._tested(sightings, gate)
-        again = mismatched.select(mismatched.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
+        accepted, again = self._tested(sightings, gate)
         return accepted.joined(self._tested(again, gate)[0]) if len(again.track_ids) else accepted
 
     def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
         """Return some of the accepted tracks linearised, landmarks included, with their weights."""
-        linearised = _linearised(tracks.sightings.select(rows), tracks.points[rows], self._window, self._rig)
+        sightings, points = tracks.sightings.select(rows), tracks.points[rows]
+        linearised = _linearised(sightings, points, self._window, self._rig, self._images)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))
 
     def _tested(self, sightings: TrackSightings, gate: FrameGate) -> tuple[AcceptedTracks, TrackSightings]:
-        """Return the tracks that pass as they are, and those that fail by far less their worst sighting."""
+        """Return the tracks that pass as they are, and those that fail by far less their worst sighting, to test."""
         bounds = gate.bounds(3 * sightings.seen.shape[1])
         tracks = self._test(sightings, self._window, self._rig, bounds)
-        dof = tracks.sightings.degrees_of_freedom
-        accepted = gate.accepts(tracks.nis, dof)
-        weights = gate.weights(tracks.nis, dof, accepted)
+        accepted = gate.accepts(tracks.nis, tracks.dof)
+        weights = gate.weights(tracks.nis, tracks.dof, accepted)
         H, residuals = tracks.H, tracks.residuals
         if gate.weighs:
             roots = np.sqrt(weights)[tracks.track]
@@ -165,7 +177,9 @@ class TrackGate:
         passed = AcceptedTracks(
             tracks.sightings.select(accepted), tracks.points[accepted], weights[accepted], H, residuals
         )
-        mismatched = np.flatnonzero(tracks.worst >= 0)
+        mismatched = (tracks.worst >= 0).nonzero()[0]
         less = tracks.sightings.select(mismatched)
-        less.seen[np.arange(mismatched.size), tracks.worst[mismatched]] = False
+        if mismatched.size:
+            less.seen[np.arange(mismatched.size), tracks.worst[mismatched]] = False
+            less = less.select(less.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
         return passed, less

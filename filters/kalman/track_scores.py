@@ -91,7 +91,7 @@ class TrackScores:
     def _add_scores(self, sightings: TrackSightings) -> None:
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, self._poses, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
-        left, _ = multiview.compared(sightings, points, self._poses, self._rig)
+        left = multiview.linearise(sightings, points, self._poses, self._poses, self._rig).residuals
         sound = np.square(left).sum(axis=2) < chi2_bound(3, SOUND)
         sightings = sightings._replace(seen=sightings.seen & sound)
         rows = _is_long_enough(sightings)

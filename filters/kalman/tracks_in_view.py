@@ -24,6 +24,7 @@ from filters.kalman.joint import (
     JointBelief,
     cholesky_root,
     divided_by_root,
+    regular_root,
     times_root,
     transposed_root_times,
 )
@@ -38,10 +39,6 @@ from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DEPTH_M, mahalanobis_s
 from toolkit.models.state import POSE, Belief
 from toolkit.sequence import StereoRig
 from toolkit.settings import Outliers
-
-# Of its own every clone has at least this share of its variance: less is lost in rounding, and without it a pose that
-# two clones agree on to sixteen digits leaves their covariance without a root.
-_LEAST_INDEPENDENT = 1e-12
 
 
 class FollowedTracks(NamedTuple):
@@ -83,10 +80,8 @@ class RootedWindow(NamedTuple):
 
     @classmethod
     def of(cls, window: Window) -> "RootedWindow":
-        """Return that of a window's covariance, every variance larger by what keeps it from being singular."""
-        cov = window.cov.copy()
-        cov.flat[:: len(cov) + 1] *= 1.0 + _LEAST_INDEPENDENT
-        return cls(window.poses, window.poses_at, cholesky_root(cov))
+        """Return that of a window's covariance."""
+        return cls(window.poses, window.poses_at, regular_root(window.cov))
 
 
 class Told(NamedTuple):

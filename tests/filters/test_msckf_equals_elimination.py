@@ -4,6 +4,7 @@ The parts are compared at full noise, where both sides linearise at the same val
 compared with the batch on a problem that is linear in effect, as in test_joint_ekf_equals_batch.py.
 """
 
+import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -131,6 +132,23 @@ def test_what_many_rows_are_compressed_to_tells_the_same_in_products_from_either
     np.testing.assert_allclose(H.T @ compressed, rows.T @ residuals, atol=1e-12 * 50)
     np.testing.assert_allclose(triangle @ P[3:15], H @ P[3:15], atol=1e-12)
     np.testing.assert_allclose(triangle @ P[:, 3:15].T, H @ P[:, 3:15].T, atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [5, 60])
+@pytest.mark.parametrize("first", [0, 2], ids=["of all clones", "of the newest"])
+def test_information_on_the_newest_clones_corrects_as_the_rows_it_is_made_of(oracle, rows, first):
+    joint, *_ = window_of(oracle.recorded(SCENARIOS[1], 1.0))
+    rng = np.random.default_rng(6)
+    begin, end = joint.clone_columns.start + 6 * first, joint.clone_columns.stop
+    H, residuals = 100.0 * rng.normal(size=(rows, end - begin)), rng.normal(size=rows)
+    before, other, sigmas = (joint.core, joint.clones), copy.copy(joint), np.sqrt(np.diag(joint.cov))
+    joint.update(H, residuals, slice(begin, end))
+    other.inform(H.T @ H, H.T @ residuals)
+    steps, others = moved(before, joint, joint.points), moved(before, other, other.points)
+    assert np.abs(steps).max() > 1e-3, "there was something to agree on"
+    np.testing.assert_allclose(others, steps, atol=1e-9)
+    np.testing.assert_allclose(other.cov / np.outer(sigmas, sigmas), joint.cov / np.outer(sigmas, sigmas), atol=1e-9)
+    np.testing.assert_array_equal(other.cov, other.cov.T)
 
 
 def scenario_of(scenario, frames):

@@ -5,10 +5,10 @@ that ATE fits, as in Furgale, Rehder and Siegwart, "Unified temporal and spatial
 (IROS 2013), section III, with the truth's positions in the place of a spline of them.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from toolkit.geometry import Array, BoolArray, skew
 from toolkit.jackknife import STRETCHES, jackknife_error
@@ -92,6 +92,8 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
     usable = _beside_no_gap(t_s)
     if usable.sum() < _FEWEST_PAIRS:
         raise Unavailable(f"a clock offset needs {_FEWEST_PAIRS} matched pairs without a gap, there are {usable.sum()}")
+    from scipy.interpolate import CubicSpline  # its import takes a tenth of a process's start, and most do without
+
     path = CubicSpline(t_s, true)
     offset_s = 0.0
     for _ in range(_ITERATIONS):
@@ -114,7 +116,7 @@ def _beside_no_gap(t_s: Array) -> BoolArray:
     return ~(np.append(wide, False) | np.insert(wide, 0, False))
 
 
-def _linearised(path: CubicSpline, t_s: Array, estimated: Array) -> _Linearised:
+def _linearised(path: Callable[..., Array], t_s: Array, estimated: Array) -> _Linearised:
     """Align positions (n, 3) with the true ones at their shifted stamps (n,) s, and linearise what is left."""
     true, velocity = path(t_s), path(t_s, 1)
     alignment = fit_se3(true, estimated)

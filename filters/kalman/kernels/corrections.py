@@ -1,6 +1,7 @@
-"""What corrections are made of compiled: motions, what tracks leave of their residuals, and the test of a correction.
+"""What corrections are made of compiled: motions, images, what tracks leave of their residuals, a correction's test.
 
-In NumPy that is ``toolkit.geometry.se3_exp``, ``residual_correlation`` and ``toolkit.models.corrections``.
+In NumPy that is ``toolkit.geometry.se3_exp``, ``multiview.NUMPY``, ``residual_correlation`` and
+``toolkit.models.corrections``.
 Source of the eigenvalues: Golub & Van Loan, "Matrix Computations" (4th ed.), 8.3 (tridiagonal QR).
 """
 
@@ -32,6 +33,8 @@ RESIDUALS = (types.Tuple((STACK, MASK)), MATRIX, STACK, CAMERA, types.int64)
 # gyro bias stand in the error (3,), -1 what it has not; the least share that is told.
 _STATE = types.Tuple((STACK, ROW, MATRIX))
 CORRECTION = (_STATE, _STATE, types.int64[::1], types.float64)
+# Points (F, 3), poses (W, 4, 4), camera.
+IMAGES = (MATRIX, STACK, CAMERA)
 # Two or three are what an eigenvalue takes.
 _MOST_STEPS = 30
 
@@ -43,6 +46,32 @@ def exponentials(twists: Array) -> Array:
     for k in range(twists.shape[0]):
         exponential(twists[k], motions[k : k + 1])
     return motions
+
+
+@kept(IMAGES)
+def predict_images(points: Array, poses: Array, camera: Arrays) -> Arrays:
+    """Return what W poses see of F points, (uL, uR, v) (F, W, 3) px, with its Jacobians and depths; see :data:`IMAGES`.
+
+    The Jacobians to the pose (F, W, 18) and to the point (F, W, 9) are row by row; depths (F, W) m.
+    """
+    count, window = points.shape[0], poses.shape[0]
+    latest, eye = inverses(poses), (camera[0], inverses(camera[1]), np.zeros((3, 3)))
+    uvs_px, depths, where = np.zeros((count, window, 3)), np.empty((count, window)), np.zeros(1, dtype=np.int64)
+    d_pose, d_point = np.empty((count, window, 18)), np.empty((count, window, 9))
+    H_pose, H_point = np.empty((3, 6)), np.empty((3, 4))
+    for i in range(3):
+        eye[2][i, i] = 1.0
+    for f in range(count):
+        for j in range(window):
+            where[0] = j
+            depths[f, j] = linearise(points, f, uvs_px, where, (latest, poses, latest), eye, (H_pose, H_point))
+            for i in range(3):
+                uvs_px[f, j, i] = -H_point[i, 3]
+                for c in range(6):
+                    d_pose[f, j, 6 * i + c] = H_pose[i, c]
+                for c in range(3):
+                    d_point[f, j, 3 * i + c] = H_point[i, c]
+    return uvs_px, d_pose, d_point, depths
 
 
 @compiled

@@ -96,6 +96,37 @@ def carry(F: Array, P: Array, work: Array) -> None:
 
 
 @compiled
+def over_step(F: Array, A: Array, out: Array) -> None:
+    """Put the first nine rows of F A in ``out``, F being a step's Jacobian; A has 15 columns.
+
+    Theta depends on theta and the gyro's bias, velocity on theta, itself and the accelerometer's bias, and so does
+    position, which velocity moves as well.
+    """
+    for i in range(9):
+        bias = 12 if i < 3 else 9
+        x, y, z, u, v, w = F[i, 0], F[i, 1], F[i, 2], F[i, bias], F[i, bias + 1], F[i, bias + 2]
+        own, moved = 1.0 if i > 2 else 0.0, F[i, i + 3] if 2 < i < 6 else 0.0
+        for c in range(np.uint64(15)):
+            value = x * A[0, c] + y * A[1, c] + z * A[2, c] + u * A[bias, c] + v * A[bias + 1, c] + w * A[bias + 2, c]
+            out[i, c] = value + own * A[i, c] + moved * A[i + 3, c]
+
+
+@compiled
+def carry_over_step(F: Array, P: Array, work: Array) -> None:
+    """Put ``F P F^T`` in the place of a symmetric P (15, 15), F being a step's Jacobian."""
+    over_step(F, P, work)
+    for i in range(9):
+        for c in range(15):
+            P[c, i] = work[i, c]
+    over_step(F, P, work)
+    for i in range(9):
+        for c in range(9):
+            P[i, c] = work[i, c]
+        for c in range(9, 15):
+            P[i, c] = P[c, i]
+
+
+@compiled
 def add_noise(F: Array, variances: Array, dt_s: float, P: Array) -> None:
     """Add what the noise of a step of Jacobian F makes of theta, position, velocity and biases to P (15, 15)."""
     accel, gyro = variances[0] / dt_s, variances[1] / dt_s
@@ -140,9 +171,9 @@ def integrate(samples: Arrays, variances: Array, bias: Array, state: Array, P: A
         for i in range(3):
             force[i] += c[0] * across[i] + c[1] * twice[i]
         step(state, force, rate, dt_s[k], F)
-        carry(F, P, work)
+        carry_over_step(F, P, work)
         add_noise(F, variances, dt_s[k], P)
-        multiply(F, G, work)
+        over_step(F, G, work)
         for i in range(9):
             for j in range(9, 15):
                 G[i, j] = work[i, j]

@@ -284,31 +284,33 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
     """Triangulate F tracks, linearise them, free them of their landmarks and test them; see :data:`SIGNATURE`.
 
     Returns points (F + 1, 3), the last without meaning; which are reliable (F,): what else is told of others means
-    nothing; the NIS (F,); the worst sighting (F,), -1 where the NIS is not far above its bound; where each track's
-    rows end (F,); and those rows, of tracks below their bounds: H (n, 6 W), residuals (n,), n being the last end.
+    nothing; the NIS (F,) and its degrees of freedom (F,); the worst sighting (F,), -1 where the NIS is not far above
+    its bound; and of tracks below their bounds n rows, under each other: H (n, 6 W), residuals (n,), and whose each
+    is among the reliable tracks (n,).
     """
     uvs_px, seen, ages = sightings
     poses, poses_at, P = window
     intrinsics, T_imu_cam, whitener, variances, channels = camera
     (count, longest), correlated = seen.shape, variances.shape[0] > 0
     points, nis = np.empty((count + 1, 3)), np.empty(count)
-    worst, ends = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
+    worst, dof = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int64)
     reliable = triangulate((uvs_px, seen), poses, T_imu_cam, (intrinsics, whitener), rules, points)
     inverses_now, inverses_at, T_cam_imu = inverses(poses), inverses(poses_at), inverses(T_imu_cam)
     window_of_all = (poses, inverses_now, poses_at, inverses_at, P)
     eye = (intrinsics, T_cam_imu, channels if correlated else whitener, variances)
     most, rows = 3 * longest, 0
     for f in range(count):
-        ends[f] = 0
-        rows += 3 * sighted(seen, f).size
-    H, residuals = np.empty((rows, 2 * most)), np.empty(rows)
+        dof[f] = 3 * sighted(seen, f).size - 3
+        rows += max(dof[f], 0)
+    H, residuals, owners = np.empty((rows, 2 * most)), np.empty(rows), np.empty(rows, dtype=np.int64)
+    end, owner = 0, -1
     H_pose, H_point = np.empty((most, 6)), np.empty((most, 4))
     S, roots = np.empty((most, most)), np.empty((most, longest))
     V, tau, rest, J = np.empty((3, most)), np.empty(3), np.empty(most), np.empty((most, 2 * most))
     for f in range(count):
         nis[f], worst[f], where = np.inf, -1, sighted(seen, f)
-        ends[f] = ends[max(f - 1, 0)]
-        n = 3 * where.size
+        n = dof[f] + 3
+        owner += reliable[f]
         if reliable[f] and n > 3:
             work = (H_pose, H_point, S, roots)
             innovations(points, f, (uvs_px, ages, where), window_of_all, eye, rules[REFINEMENTS], work)
@@ -320,13 +322,13 @@ def test_tracks(sightings: Arrays, window: Arrays, camera: Arrays, rules: Array,
             nis[f] = nis_of(S, n, rest)
             if nis[f] < bounds[n - 3]:
                 own_jacobians(H_pose, where.size, roots, correlated, J)
-                constraint_rows(where, J, correlated, V, tau, H, ends[f])
+                constraint_rows(where, J, correlated, V, tau, H, end)
                 for i in range(3, n):
-                    residuals[ends[f] + i - 3] = H_point[i, 3]
-                ends[f] += n - 3
+                    residuals[end], owners[end] = H_point[i, 3], owner
+                    end += 1
             elif nis[f] > rules[MISMATCHED] * bounds[n - 3]:
                 worst[f] = where[worst_sighting(S, n, rest, V, tau, roots, correlated)]
-    return points, reliable, nis, worst, ends, H, residuals
+    return points, reliable, nis, dof, worst, H[:end], residuals[:end], owners[:end]
 
 
 COMPILED = what_was_compiled(test_tracks, "the track gate was")
