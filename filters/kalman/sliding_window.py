@@ -46,11 +46,16 @@ class SlidingWindowFilter:
     """Propagate, clone, correct by landmarks and by finished tracks, drop old poses; answer given all in view.
 
     ``landmarks`` is how many long-lived landmarks the state may have, ``window_s`` how far back the window reaches,
-    in seconds, if not as far as the settings say.
+    in seconds, if not as far as the settings say; ``scores_tracks`` whether tracks are asked what drift they speak of.
     """
 
     def __init__(
-        self, setup: Setup, linearisation: Linearisation, landmarks: int = 0, window_s: float | None = None
+        self,
+        setup: Setup,
+        linearisation: Linearisation,
+        landmarks: int = 0,
+        window_s: float | None = None,
+        scores_tracks: bool = True,
     ) -> None:
         self._rig, self._at = setup.rig, linearisation
         self._outliers, model = setup.settings.outliers, motion_model(setup.noise, setup.gravity_world)
@@ -72,7 +77,7 @@ class SlidingWindowFilter:
         self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
         # Beside odometry landmarks in the state are left to hold what other tracks give up: so told, msckf-slam gained
         # on some of the UTIAS drives and lost a third on the longest.
-        self._scores_tracks = setup.motion_kind == "imu" or not landmarks
+        self._scores_tracks = scores_tracks and (setup.motion_kind == "imu" or not landmarks)
         self._learn = compiled.learning(setup.compilation)
         self._landmark_correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None

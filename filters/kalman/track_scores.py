@@ -13,11 +13,14 @@ sampling", for the word). It assumes neither a shape of the correlation along tr
 comes to 1 for tracks of any length, a random walk to the more the longer they are.
 """
 
+from typing import NamedTuple, Self
+
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.multiview import TrackSightings
+from filters.kalman.multiview import Linearised, TrackSightings
 from filters.kalman.triangulation import triangulate
+from toolkit.arrays import is_among, rows_of
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
@@ -28,6 +31,8 @@ FEWEST_SIGHTINGS = 4
 SOUND = 0.999
 # Longer tracks are scored in parts, so that a landmark that is seen for ever is scored, and kept, for some time only.
 _MOST_SIGHTINGS = 64
+# So many tracks that have ended are scored at once, which takes little longer than one by itself.
+_SCORED_TOGETHER = 40
 # Fewer tracks say too little of a variance.
 _FEWEST_TRACKS = 20
 # Poses that fewer tracks at once hold err by more than a track is asked to tell of: on dataset3, with 4, tracks better
@@ -36,14 +41,19 @@ _FEWEST_AT_ONCE = 20
 
 
 class TrackScores:
-    """Measures over a run how many times their stated variance what tracks say of a drift has."""
+    """Measures over a run how many times their stated variance what tracks say of a drift has.
+
+    Sightings are kept until the tracks they are of have ended: N of them, each with the number of its track, counted
+    anew where an id comes again, and its column among the poses (W, 4, 4).
+    """
 
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig
         self._information, self._squares, self._tracks = np.zeros((6, 6)), np.zeros((6, 6)), 0
         self._frames, self._seen = 0, 0
-        self._ids, self._columns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        self._numbers, self._columns = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
         self._uvs_px, self._poses = np.empty((0, 3)), np.empty((0, 4, 4))
+        self._in_view, self._begun, self._ended = _InView.nothing(), 0, 0
 
     @property
     def design_effect(self) -> float | None:
@@ -55,70 +65,96 @@ class TrackScores:
     @property
     def sightings(self) -> int:
         """Return how many sightings wait for their tracks to end."""
-        return len(self._ids)
+        return len(self._numbers)
 
     def add(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Take in the next frame, with its pose (4, 4) as it will hardly change any more."""
         self._frames, self._seen = self._frames + 1, self._seen + len(frame.track_ids)
-        begun, counts = np.unique(self._ids, return_counts=True)
-        ended = begun[~np.isin(begun, frame.track_ids) | (counts >= _MOST_SIGHTINGS)]
-        self._score(np.isin(self._ids, ended))
-        self._columns = np.concatenate([self._columns, np.full(len(frame.track_ids), len(self._poses))])
-        self._ids = np.concatenate([self._ids, frame.track_ids])
-        self._uvs_px, self._poses = np.vstack([self._uvs_px, frame.uvs_px]), np.vstack([self._poses, T_world_imu[None]])
+        before, self._in_view = self._in_view, self._in_view.at(frame.track_ids, self._begun)
+        numbers = self._in_view.numbers
+        new = int((numbers >= self._begun).sum())
+        self._ended += len(before.numbers) - (len(numbers) - new)
+        self._begun += new
+        self._numbers = np.concatenate([self._numbers, numbers])
+        self._columns = np.concatenate([self._columns, np.full(len(numbers), len(self._poses))])
+        self._uvs_px = np.concatenate([self._uvs_px, frame.uvs_px[self._in_view.order]])
+        self._poses = np.concatenate([self._poses, T_world_imu[None]])
+        if self._ended >= _SCORED_TOGETHER:
+            self._score()
 
     def finish(self) -> None:
         """Score the tracks that are still seen."""
-        self._score(np.ones(len(self._ids), dtype=bool))
+        self._in_view = _InView.nothing()
+        self._score()
 
-    def _score(self, rows: BoolArray) -> None:
-        """Score the tracks of these sightings (N,), all of each, and forget them."""
-        self._add_scores(self._window_of(rows))
-        self._ids, self._columns, self._uvs_px = self._ids[~rows], self._columns[~rows], self._uvs_px[~rows]
+    def _score(self) -> None:
+        """Score the tracks that are not in view, and forget their sightings and the poses that only they need."""
+        rows = ~is_among(self._numbers, self._in_view.numbers)
+        self._add_scores(self._tracks_of(rows))
+        self._numbers, self._columns, self._uvs_px = self._numbers[~rows], self._columns[~rows], self._uvs_px[~rows]
         first = int(self._columns.min(initial=len(self._poses)))
-        self._columns, self._poses = self._columns - first, self._poses[first:]
+        self._columns, self._poses, self._ended = self._columns - first, self._poses[first:], 0
 
-    def _window_of(self, rows: BoolArray) -> TrackSightings:
+    def _tracks_of(self, rows: BoolArray) -> TrackSightings:
         """Return the tracks of sightings (N,) that are long enough, one column a pose."""
-        track_ids, track = np.unique(self._ids[rows], return_inverse=True)
-        shape = (len(track_ids), len(self._poses))
+        numbers, track = np.unique(self._numbers[rows], return_inverse=True)
+        shape = (len(numbers), len(self._poses))
         uvs_px, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
         places = track, self._columns[rows]
         uvs_px[places], seen[places] = self._uvs_px[rows], True
         ages: IntArray = np.zeros(shape, dtype=np.int64)
-        return _long_enough(TrackSightings(track_ids, uvs_px, seen, ages))
+        tracks = TrackSightings(numbers, uvs_px, seen, ages)
+        return tracks.select(_are_long_enough(tracks))
 
     def _add_scores(self, sightings: TrackSightings) -> None:
         points, reliable = triangulate(sightings.uvs_px, sightings.seen, self._poses, self._rig)
         sightings, points = sightings.select(reliable), points[reliable]
-        left = multiview.linearise(sightings, points, self._poses, self._poses, self._rig).residuals
-        sound = np.square(left).sum(axis=2) < chi2_bound(3, SOUND)
-        sightings = sightings._replace(seen=sightings.seen & sound)
-        rows = _is_long_enough(sightings)
+        here = multiview.linearise(sightings, points, self._poses, self._poses, self._rig)
+        sound = sightings.seen & (np.square(here.residuals).sum(axis=2) < chi2_bound(3, SOUND))
+        sightings = sightings._replace(seen=sound)
+        rows = _are_long_enough(sightings)
         if rows.any():
-            information, scores = _scores(sightings.select(rows), points[rows], self._poses, self._rig)
+            information, scores = _scores(sightings.select(rows), here.select(rows))
             self._information += information.sum(axis=0)
             self._squares += scores.T @ scores
             self._tracks += len(scores)
 
 
-def _is_long_enough(sightings: TrackSightings) -> BoolArray:
+class _InView(NamedTuple):
+    """The tracks of a frame by ascending id (A,), their numbers (A,) and lengths (A,), and the order they came in."""
+
+    track_ids: IntArray
+    numbers: IntArray
+    lengths: IntArray
+    order: IntArray
+
+    @classmethod
+    def nothing(cls) -> Self:
+        return cls(*(np.empty(0, dtype=np.int64) for _ in range(4)))
+
+    def at(self, track_ids: IntArray, begun: int) -> "_InView":
+        """Return those of the next frame; tracks that begin, or were seen often enough, are numbered from ``begun``."""
+        order = np.argsort(track_ids)
+        rows, known = rows_of(track_ids[order], self.track_ids)
+        known[known] = self.lengths[rows[known]] < _MOST_SIGHTINGS
+        numbers, lengths = np.empty_like(order), np.ones_like(order)
+        numbers[known], lengths[known] = self.numbers[rows[known]], self.lengths[rows[known]] + 1
+        numbers[~known] = begun + np.arange((~known).sum())
+        return _InView(track_ids[order], numbers, lengths, order)
+
+
+def _are_long_enough(sightings: TrackSightings) -> BoolArray:
     return np.asarray(sightings.seen.sum(axis=1) >= FEWEST_SIGHTINGS)
 
 
-def _long_enough(sightings: TrackSightings) -> TrackSightings:
-    return sightings.select(_is_long_enough(sightings))
-
-
-def _scores(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Return the information (F, 6, 6) of tracks of points (F, 3) m about a drift, and their scores (F, 6)."""
-    here = multiview.linearise(sightings, points, poses, poses, rig)
+def _scores(sightings: TrackSightings, here: Linearised) -> tuple[Array, Array]:
+    """Return the information (F, 6, 6) of tracks about a drift, and their scores (F, 6)."""
     count, window = sightings.seen.shape
-    frames = np.arange(window)
-    middle = (sightings.seen * frames).sum(axis=1) / sightings.seen.sum(axis=1)
-    levers = frames - middle[:, None]
+    seen, frames = sightings.seen, np.arange(window)
+    levers = np.where(seen, frames - ((seen * frames).sum(axis=1) / seen.sum(axis=1))[:, None], 0.0)
     H = (levers[..., None, None] * here.H_pose).reshape(count, 3 * window, 6)
-    reached = np.linalg.qr(here.H_point.reshape(count, 3 * window, 3)).Q
+    reached = np.linalg.qr(np.where(seen[..., None, None], here.H_point, 0.0).reshape(count, 3 * window, 3)).Q
     H -= reached @ (np.swapaxes(reached, 1, 2) @ H)
+    residuals = np.where(seen[..., None], here.residuals, 0.0).reshape(count, 3 * window, 1)
     H_transposed = np.swapaxes(H, 1, 2)
-    return H_transposed @ H, (H_transposed @ here.residuals.reshape(count, 3 * window, 1))[..., 0]
+    return H_transposed @ H, (H_transposed @ residuals)[..., 0]
