@@ -69,6 +69,7 @@ class Smart:
         except EstimatorError as refusal:
             self._log.append(f"frame {packet.index}: {refusal}; started afresh from here")
             self._complete_all()
+            self._settle(len(self._tracked.window.keys))
             tracked = self._started(packet)
             self._solution = solve_window(tracked.window, self._camera)
         self._tracked = replace(tracked, window=self._solution.window)
@@ -143,11 +144,15 @@ class Smart:
         if leaving:
             self._complete(range(leaving))
             self._learn(leaving)
-            for state in self._states[-in_window:][:leaving]:
-                self._tracks.settle(self._frames.popleft(), state.T_world_imu)
+            self._settle(leaving)
             window = without_oldest(self._tracked.window, leaving, self._camera)
             self._tracked = replace(self._tracked, window=window).compacted()
             self._camera = RobustCamera.of(*self._tracks.now)
+
+    def _settle(self, leaving: int) -> None:
+        """Take in the frames of so many of the window's oldest states, whose poses change no more."""
+        for state in self._states[-len(self._tracked.window.keys) :][:leaving]:
+            self._tracks.settle(self._frames.popleft(), state.T_world_imu)
 
     def _learn(self, leaving: int) -> None:
         """Learn what tracks count for from those that go with the oldest states, of which there are so many."""

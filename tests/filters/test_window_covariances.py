@@ -9,6 +9,7 @@ import pytest
 from filters import smart
 from filters.fixed_lag import FixedLag
 from filters.smart import Smart
+from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.fixed_lag_tree import FixedLagTree
 from filters.smoothing.indeterminate import without_gaps
 from filters.smoothing.smart_factors import Sightings
@@ -156,17 +157,34 @@ def test_a_solutions_covariances_are_the_blocks_of_the_inverse():
         np.testing.assert_allclose(SolvedWindow(window, root).cov(i), inverse[6 * i : 6 * i + 6, 6 * i : 6 * i + 6])
 
 
-def test_a_window_started_afresh_leaves_no_state_without_a_covariance(monkeypatch):
-    sequence, solved, refused = simulate(SCENARIOS[2], 3), smart.solve_window, []
+@pytest.fixture
+def refusing_once(monkeypatch):
+    """Have the smoother refuse a window of eight states, once; return the list of what was refused."""
+    solved, refused = smart.solve_window, []
 
-    def refusing_once(window, rig):
+    def solve_window(window, rig):
         if len(window.keys) == 8 and not refused:
             refused.append(window)
             raise EstimatorError("nothing determines it")
         return solved(window, rig)
 
-    monkeypatch.setattr(smart, "solve_window", refusing_once)
-    estimator = Smart(setup_of(sequence), LAG_S)
-    final = run_through(estimator, sequence)
-    assert refused
+    monkeypatch.setattr(smart, "solve_window", solve_window)
+    return refused
+
+
+def test_a_window_started_afresh_leaves_no_state_without_a_covariance(refusing_once):
+    sequence = simulate(SCENARIOS[2], 3)
+    final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
+    assert refusing_once
     assert np.linalg.eigvalsh(final.cov).min() > 0.0
+
+
+def test_a_window_started_afresh_has_each_frame_settle_once_with_its_own_pose(monkeypatch, refusing_once):
+    sequence, settled = simulate(SCENARIOS[2], 3), []
+    monkeypatch.setattr(DiscountedTracks, "settle", lambda _, frame, T: settled.append((frame.t_ns, T)))
+    final = run_through(Smart(setup_of(sequence), LAG_S), sequence)
+    stamps_ns, poses = zip(*settled, strict=True)
+    assert refusing_once
+    assert len(settled) > 8
+    np.testing.assert_array_equal(stamps_ns, final.t_ns[: len(settled)])
+    np.testing.assert_array_equal(poses, final.T_world_imu[: len(settled)])
