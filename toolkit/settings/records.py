@@ -23,6 +23,13 @@ class SettingsError(VislamError):
     exit_status: ClassVar[int] = 2
 
 
+def _setting(description: str, unit: str = "", *, none: str = "", **within: float) -> Meta:
+    """Return what is told of a setting: what it is, its unit, what None stands for, and its range as Meta has it."""
+    extra = {key: words for key, words in {"unit": unit, "none": none}.items() if words}
+    bounds: dict[str, Any] = {**within}
+    return Meta(description=description, extra=extra, **bounds)
+
+
 PolicyName = Literal["robust", "gate", "none", "classic"]
 HuberThreshold = Annotated[float, Meta(gt=0.0, extra={"unit": "sigma"})] | None
 
@@ -34,28 +41,26 @@ class Outliers(Struct, frozen=True, forbid_unknown_fields=True):
     exceeded as often. None is no gate, no loss.
     """
 
-    policy: Annotated[
-        PolicyName, Meta(description="the policy all of these are taken from, but for what is set by itself")
-    ] = "classic"
+    policy: Annotated[PolicyName, _setting("the policy all of these are taken from, but for what is set by itself")] = (
+        "classic"
+    )
     gate_probability: Annotated[
-        Probability | None, Meta(description="chi-square probability below which a measurement is accepted")
+        Probability | None, _setting("chi-square probability below which a measurement is accepted")
     ] = 0.95
     smoother_gate_factor: Annotated[
-        float, Meta(ge=1.0, description="the incremental smoothers' gate, as a multiple of the filters'")
+        float, _setting("the incremental smoothers' gate, as a multiple of the filters'", ge=1.0)
     ] = 4.0
-    joint_huber: Annotated[
-        HuberThreshold, Meta(description="Huber threshold of the joint and the windowed filters")
-    ] = None
-    filter_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of the decoupled filters")] = 1.5
-    smoother_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of the incremental smoothers")] = (
+    joint_huber: Annotated[HuberThreshold, _setting("Huber threshold of the joint and the windowed filters")] = None
+    filter_huber: Annotated[HuberThreshold, _setting("Huber threshold of the decoupled filters")] = 1.5
+    smoother_huber: Annotated[HuberThreshold, _setting("Huber threshold of the incremental smoothers")] = (
         2.7954834829151074  # a 95 % gate of three degrees of freedom, as a length
     )
-    batch_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of batch's first solve")] = 1.5
-    batch_cauchy: Annotated[HuberThreshold, Meta(description="Cauchy scale of batch's second solve")] = 2.0
+    batch_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's first solve")] = 1.5
+    batch_cauchy: Annotated[HuberThreshold, _setting("Cauchy scale of batch's second solve")] = 2.0
     batch_cut_probability: Annotated[
-        Probability | None, Meta(description="probability below which batch's last solve leaves a sighting out")
+        Probability | None, _setting("probability below which batch's last solve leaves a sighting out")
     ] = 1e-3
-    batch_last_huber: Annotated[HuberThreshold, Meta(description="Huber threshold of batch's last solve")] = None
+    batch_last_huber: Annotated[HuberThreshold, _setting("Huber threshold of batch's last solve")] = None
 
 
 def _alike(policy: PolicyName, gate_probability: float | None, huber: float | None) -> Outliers:
@@ -95,20 +100,21 @@ class Window(Struct, frozen=True, forbid_unknown_fields=True):
     lag_s: (
         Annotated[
             float,
-            Meta(
+            _setting(
+                "window of the windowed filters and smoothers",
+                "s",
+                none=f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}",
                 ge=1e-3,
                 le=3600.0,
-                description="window of the windowed filters and smoothers",
-                extra={"unit": "s", "none": f"{_LAG_WITH_IMU_S:g} with an IMU, else {_LAG_S:g}"},
             ),
         ]
         | None
     ) = None
     most_states: Annotated[
-        int, Meta(ge=2, le=10_000, description="states in the window at most; of more frames they are thinned evenly")
+        int, _setting("states in the window at most; of more frames they are thinned evenly", ge=2, le=10_000)
     ] = 50
     landmarks: Annotated[
-        int, Meta(ge=0, le=500, description="landmarks msckf-slam keeps in its state for as long as they are seen")
+        int, _setting("landmarks msckf-slam keeps in its state for as long as they are seen", ge=0, le=500)
     ] = 50
 
     def seconds(self, motion_kind: str) -> float:
@@ -131,40 +137,34 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     pixel_sigma_px: (
         Annotated[
             float,
-            Meta(
-                gt=0.0,
-                le=100.0,
-                description="standard deviation of uL and uR; v in proportion",
-                extra={"unit": "px", "none": "the recording's"},
+            _setting(
+                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", gt=0.0, le=100.0
             ),
         ]
         | None
     ) = None
     motion_scale: Annotated[
-        float, Meta(gt=0.0, le=1e3, description="factor on the white-noise densities of the motion samples")
+        float, _setting("factor on the white-noise densities of the motion samples", gt=0.0, le=1e3)
     ] = 1.0
     tracks: Annotated[
-        TrackModel,
-        Meta(description="errors of a track's sightings: each by itself, a stated walk and offset, or fitted"),
+        TrackModel, _setting("errors of a track's sightings: each by itself, a stated walk and offset, or fitted")
     ] = "white"
-    track_white_px: Annotated[
-        float,
-        Meta(gt=0.0, le=100.0, description="correlated: white part, in column and row", extra={"unit": "px"}),
-    ] = 0.03
-    track_walk_px: Annotated[
-        float, Meta(ge=0.0, le=100.0, description="correlated: walk per root frame", extra={"unit": "px"})
-    ] = 0.13
-    track_offset_px: Annotated[
-        float, Meta(ge=0.0, le=100.0, description="correlated: offset of a track's disparity", extra={"unit": "px"})
-    ] = 0.7
+    track_white_px: Annotated[float, _setting("correlated: white part, in column and row", "px", gt=0.0, le=100.0)] = (
+        0.03
+    )
+    track_walk_px: Annotated[float, _setting("correlated: walk per root frame", "px", ge=0.0, le=100.0)] = 0.13
+    track_offset_px: Annotated[float, _setting("correlated: offset of a track's disparity", "px", ge=0.0, le=100.0)] = (
+        0.7
+    )
     track_fit_s: (
         Annotated[
             float,
-            Meta(
+            _setting(
+                "fitted: how much of the beginning, so that later causal answers rest on the past",
+                "s",
+                none="all of it",
                 gt=0.0,
                 le=86400.0,
-                description="fitted: how much of the beginning, so that later causal answers rest on the past",
-                extra={"unit": "s", "none": "all of it"},
             ),
         ]
         | None
@@ -172,26 +172,23 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
     disparity_scale: (
         Annotated[
             float,
-            Meta(
+            _setting(
+                "standard deviation of a scale on all disparities, a state of its own, as 0.01",
+                none="none: no such state",
                 gt=0.0,
                 le=0.5,
-                description="standard deviation of a scale on all disparities, a state of its own, as 0.01",
-                extra={"none": "none: no such state"},
             ),
         ]
         | None
     ) = None
     bridge_gaps: Annotated[
-        bool,
-        Meta(description="where frames have no track in common, a measured twist is like those before and after, too"),
+        bool, _setting("where frames have no track in common, a measured twist is like those before and after, too")
     ] = True
     match_imu: Annotated[
-        bool,
-        Meta(description="causal estimators take an IMU for noisier than stated where tracks contradict it"),
+        bool, _setting("causal estimators take an IMU for noisier than stated where tracks contradict it")
     ] = True
     match_tracks: Annotated[
-        bool,
-        Meta(description="white noise: tracks count for less where residuals along them are correlated"),
+        bool, _setting("white noise: tracks count for less where residuals along them are correlated")
     ] = True
 
 
@@ -201,18 +198,17 @@ class TrackUse(Struct, frozen=True, forbid_unknown_fields=True):
     budget: (
         Annotated[
             int,
-            Meta(
+            _setting(
+                "tracks a frame for estimators at most, spread over image and depth, the oldest first",
+                none="all",
                 ge=10,
                 le=10_000,
-                description="tracks a frame for estimators at most, spread over image and depth, the oldest first",
-                extra={"none": "all"},
             ),
         ]
         | None
     ) = None
     leave_out_moving: Annotated[
-        bool,
-        Meta(description="give no estimator what moves against the motion and most other tracks: vehicles, mismatches"),
+        bool, _setting("give no estimator what moves against the motion and most other tracks: vehicles, mismatches")
     ] = False
 
 
@@ -220,7 +216,7 @@ class Metrics(Struct, frozen=True, forbid_unknown_fields=True):
     """Metrics that take long and are computed on request alone."""
 
     bound: Annotated[
-        bool, Meta(description="the Cramér-Rao bound and what each estimator loses against it, on simulations")
+        bool, _setting("the Cramér-Rao bound and what each estimator loses against it, on simulations")
     ] = False
 
     def requested(self) -> tuple[str, ...]:
@@ -232,47 +228,31 @@ class Frontend(Struct, frozen=True, forbid_unknown_fields=True):
     """How stereo tracks are made of images; the same tracks for every estimator."""
 
     tracks: Annotated[
-        Tracks,
-        Meta(description="where a recording with images has its tracks from; auto: images, where nearly all are there"),
+        Tracks, _setting("where a recording with images has its tracks from; auto: images, where nearly all are there")
     ] = "auto"
     topics: Annotated[
-        str | None,
-        Meta(description="of a bag, as in left=/cam0/image_raw,imu=/imu0; what is not said is guessed from names"),
+        str | None, _setting("of a bag, as in left=/cam0/image_raw,imu=/imu0; what is not said is guessed from names")
     ] = None
-    max_tracks: Annotated[int, Meta(ge=20, le=2000, description="stereo tracks a frame at most")] = 200
-    spacing_px: Annotated[
-        float,
-        Meta(ge=3.0, le=200.0, description="least distance of two tracks in the left image", extra={"unit": "px"}),
-    ] = 12.0
-    window_px: Annotated[
-        int, Meta(ge=7, le=63, description="side of the window that KLT compares", extra={"unit": "px"})
-    ] = 15
-    levels: Annotated[int, Meta(ge=0, le=8, description="halvings of the image in KLT's pyramid")] = 3
-    nearest_m: Annotated[
-        float, Meta(gt=0.0, le=100.0, description="depth of the nearest point looked for", extra={"unit": "m"})
-    ] = 0.25
+    max_tracks: Annotated[int, _setting("stereo tracks a frame at most", ge=20, le=2000)] = 200
+    spacing_px: Annotated[float, _setting("least distance of two tracks in the left image", "px", ge=3.0, le=200.0)] = (
+        12.0
+    )
+    window_px: Annotated[int, _setting("side of the window that KLT compares", "px", ge=7, le=63)] = 15
+    levels: Annotated[int, _setting("halvings of the image in KLT's pyramid", ge=0, le=8)] = 3
+    nearest_m: Annotated[float, _setting("depth of the nearest point looked for", "m", gt=0.0, le=100.0)] = 0.25
     forward_backward_px: Annotated[
-        float,
-        Meta(
-            gt=0.0, le=10.0, description="how far KLT there and back may end from where it began", extra={"unit": "px"}
-        ),
+        float, _setting("how far KLT there and back may end from where it began", "px", gt=0.0, le=10.0)
     ] = 0.3
-    epipolar_px: Annotated[
-        float, Meta(gt=0.0, le=20.0, description="how far the rows of left and right may differ", extra={"unit": "px"})
-    ] = 1.5
-    ransac_px: Annotated[
-        float,
-        Meta(gt=0.0, le=20.0, description="distance from the motion most tracks agree on", extra={"unit": "px"}),
-    ] = 2.0
+    epipolar_px: Annotated[float, _setting("how far the rows of left and right may differ", "px", gt=0.0, le=20.0)] = (
+        1.5
+    )
+    ransac_px: Annotated[float, _setting("distance from the motion most tracks agree on", "px", gt=0.0, le=20.0)] = 2.0
     patch_px: Annotated[
-        float,
-        Meta(
-            gt=0.0, le=20.0, description="how far a track may be from where its first patch fits", extra={"unit": "px"}
-        ),
+        float, _setting("how far a track may be from where its first patch fits", "px", gt=0.0, le=20.0)
     ] = 1.5
-    patch_correlation: Annotated[
-        float, Meta(gt=0.0, lt=1.0, description="least correlation with the track's first patch")
-    ] = 0.8
+    patch_correlation: Annotated[float, _setting("least correlation with the track's first patch", gt=0.0, lt=1.0)] = (
+        0.8
+    )
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -285,21 +265,16 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     metrics: Metrics = Metrics()
     frontend: Frontend = Frontend()
     start: Annotated[
-        Literal["measurements", "truth"], Meta(description="where the first state comes from; the truth is labelled")
+        Literal["measurements", "truth"], _setting("where the first state comes from; the truth is labelled")
     ] = "measurements"
-    card: Annotated[
-        bool, Meta(description="in the report, what the recording's tracks are like; takes some seconds")
-    ] = False
+    card: Annotated[bool, _setting("in the report, what the recording's tracks are like; takes some seconds")] = False
     arithmetic: Annotated[
-        Arithmetic,
-        Meta(description="of filters that have both: auto is compiled where the extra fast is installed"),
+        Arithmetic, _setting("of filters that have both: auto is compiled where the extra fast is installed")
     ] = "auto"
-    first_seed: Annotated[int, Meta(ge=0, description="seed of simulated sequences, the first of several")] = 0
-    seeds: Annotated[
-        int, Meta(ge=1, le=100_000, description="how many seeds a simulated sequence is repeated over")
-    ] = 1
+    first_seed: Annotated[int, _setting("seed of simulated sequences, the first of several", ge=0)] = 0
+    seeds: Annotated[int, _setting("how many seeds a simulated sequence is repeated over", ge=1, le=100_000)] = 1
     vary: Annotated[
-        Varied, Meta(description="what a seed draws of a simulation: the noise, or trajectory and landmarks as well")
+        Varied, _setting("what a seed draws of a simulation: the noise, or trajectory and landmarks as well")
     ] = "noise"
     estimators: dict[str, dict[str, Scalar]] = {}
 
