@@ -8,6 +8,7 @@ known.
 
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,8 +45,7 @@ class FirstGuess:
     contradiction: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
+class _SeenMotion(NamedTuple):
     """The IMU's motion T_before_after (N, 4, 4) over N intervals from the tracks alone, and where it is known (N,)."""
 
     T_before_after: Array
@@ -78,15 +78,15 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
     return FirstGuess(poses, path.velocities(v_first, gravity) @ level[:3, :3].T, bias, contradiction)
 
 
-def _seen(sequence: Sequence) -> _Seen:
+def _seen(sequence: Sequence) -> _SeenMotion:
     moved = camera_motion(sequence)
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     T_imu_cam = sequence.rig.T_imu_cam
     T_before_after = se3_exp(np.hstack([moved.w_radps, moved.v_mps]) * dt_s)
-    return _Seen(np.asarray(T_imu_cam @ T_before_after @ se3_inverse(T_imu_cam)), moved.known)
+    return _SeenMotion(np.asarray(T_imu_cam @ T_before_after @ se3_inverse(T_imu_cam)), moved.known)
 
 
-def _gyro_bias_left(pieces: list[Preintegration], seen: _Seen) -> Array:
+def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
     """Return the rate (3,) rad/s by which the gyro turns faster than the tracks, of all known intervals.
 
     A bias b over dt turns by exp(-b dt) on the right, to first order.
@@ -133,12 +133,12 @@ class _Path:
         """Return the velocities (N + 1, 3) m/s from the first velocity and gravity (3,)."""
         return np.asarray(self.gained_mps + v_first + self.t_s[:, None] * gravity)
 
-    def left(self, seen: _Seen) -> Array:
+    def left(self, seen: _SeenMotion) -> Array:
         """Return what of the seen translations (M, 3) m, where known, the specific force does not explain."""
         seen_m = (self.attitudes[:-1] @ seen.T_before_after[:, :3, 3:])[..., 0]
         return np.asarray((seen_m - np.diff(self.gained_m, axis=0))[seen.known])
 
-    def velocity_that_fits(self, seen: _Seen, gravity: Array) -> Array:
+    def velocity_that_fits(self, seen: _SeenMotion, gravity: Array) -> Array:
         """Return the first velocity (3,) m/s that explains the seen translations best; zero where none is known."""
         if not seen.known.any():
             return np.zeros(3)
@@ -147,7 +147,7 @@ class _Path:
         return _robust(per_velocity, self.left(seen) - per_gravity[:, None] * gravity)[0]
 
 
-def _gravity(path: _Path, seen: _Seen, length: float) -> tuple[Array, str | None]:
+def _gravity(path: _Path, seen: _SeenMotion, length: float) -> tuple[Array, str | None]:
     """Return gravity (3,) m/s^2 in the first frame, and why it cannot be so, if it cannot."""
     down = -path.gained_mps[-1]
     contradiction = None

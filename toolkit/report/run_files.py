@@ -5,6 +5,7 @@ import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import UNSET
@@ -33,8 +34,7 @@ _TUM_COLUMNS, _LANDMARK_COLUMNS = 8, 4
 _Rows = list[tuple[str, Output]]
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnPath:
+class DrawnPath(NamedTuple):
     """Positions (N, 3) m in their own world at times (N,) s from the first frame."""
 
     t_s: Array

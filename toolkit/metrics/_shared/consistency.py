@@ -5,7 +5,7 @@ the normalised estimation error squared (NEES) e^T P^-1 e of a consistent estima
 """
 
 from dataclasses import dataclass
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -56,8 +56,7 @@ class BodyErrors:
         return BodyErrors(self.t_ns[kept], self.rows[kept], errors, poses, self.placed)
 
 
-@dataclass(frozen=True, eq=False)
-class StatedErrors:
+class StatedErrors(NamedTuple):
     """The n errors whose covariance the estimate states, and these covariances (n, d, d)."""
 
     errors: BodyErrors
