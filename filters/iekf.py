@@ -7,23 +7,146 @@ their depth (NEES of the pose 3 to 9 in flight and on the road, where one step h
 at first estimates even more. Landmarks move along their inverse depth from the camera that saw them first, as in
 `riekf`: in that a stereo sighting is linear. The covariance is that of the right-invariant error, reduced by Jacobians
 at the corrected estimate: global position and heading stay as unknown as they were.
+
+The update is Gauss-Newton to the most probable state given the prediction and one frame. An EKF update is the first
+step of that iteration; every further one linearises where the last one ended (Bell & Cathey 1993, "The iterated Kalman
+filter update as a Gauss-Newton method"; on a group Bourmaud, Mégret, Giremus & Berthoumieu 2016, "From intrinsic
+optimization to iterated extended Kalman filtering on Lie groups"). A correction ``delta`` is kept as ``P pull``: its
+cost under the prediction is ``delta . pull``, and the covariance P is never inverted.
 """
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
-from filters.kalman import iterated
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from filters.kalman import joint_landmarks
+from filters.kalman.gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief
+from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf
-from filters.kalman.linearisation import AtLatestEstimates
+from filters.kalman.joint_landmarks import LandmarkSightings
+from filters.kalman.linearisation import AtLatestEstimates, Linearisation
 from filters.kalman.online_output import OnlineOutput
 from toolkit.estimator import Estimator, Setup
+from toolkit.geometry import Array
+from toolkit.sequence import StereoFrame, StereoRig
 
 CITES = ("bell1993iterated", "barrau2017invariant")
 RUNG, CHANGE = 50, "+ iterated update"
 RULES = {"tracks": "a landmark in its state has no state for the error of its track"}
+# In standard deviations of what is known after the update.
+NEGLIGIBLE_STEP = 1e-4
+MOST_STEPS, MOST_HALVINGS = 10, 6
 
 
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(AnchoredBelief, T_imu_cam=setup.rig.T_imu_cam)
-    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, iterated.correct))
+    return OnlineOutput(JointEkf(setup, AtLatestEstimates(), belief, correct))
+
+
+class Iterate(NamedTuple):
+    """A correction (n,) with the pull (k,) that makes it, what is seen from there, and the cost of both."""
+
+    delta: Array
+    pull: Array
+    seen: LandmarkSightings
+    cost: float
+
+
+class PullStep(NamedTuple):
+    """A change of the pull (k,), and the length of what it changes in standard deviations after the update."""
+
+    pull: Array
+    length: float
+
+
+class IterationResult(NamedTuple):
+    """The best correction that was found, and whether it is the most probable one."""
+
+    best: Iterate
+    converged: bool
+
+
+def correct(joint: JointBelief, frame: StereoFrame, at: Linearisation, rig: StereoRig, gate: FrameGate) -> None:
+    """Correct everything by the landmarks of the state, every one of which the frame must show.
+
+    The gate tests once, at the prediction, and Huber's weights are those there. The covariance is reduced by Jacobians
+    at the corrected estimate. An iteration that does not converge ends at the lowest cost it has reached; where not
+    even the first step lowered it, the frame corrects nothing.
+    """
+    if not len(joint.landmark_ids):
+        return
+    seen = joint_landmarks.linearise_sightings(joint, frame, at, rig)
+    measurement = Measurement(joint, frame, at, rig, joint_landmarks.weighed(joint, seen, gate))
+    if not measurement.weights.any():
+        return
+    best, converged = most_probable(measurement)
+    gate.unconverged += not converged
+    if converged or best.pull.any():
+        joint.move(best.delta)
+        H, _ = measurement.stacked(best.seen)
+        joint.reduce_covariance(H, joint_landmarks.columns(joint))
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A prediction and what the landmarks (L,) of a frame count for in correcting it."""
+
+    prediction: JointBelief
+    frame: StereoFrame
+    at: Linearisation
+    rig: StereoRig
+    weights: Array
+
+    def after(self, pull: Array) -> Iterate:
+        """Return the correction of a pull (k,)."""
+        delta = self.prediction.cov[:, joint_landmarks.columns(self.prediction)] @ pull
+        seen = joint_landmarks.linearise_sightings(self.prediction.displaced(delta), self.frame, self.at, self.rig)
+        prior = delta[joint_landmarks.columns(self.prediction)] @ pull
+        in_front = (seen.depth_m[self.weights > 0.0] > 0.0).all()
+        cost = float(prior + self.weights @ np.square(seen.residuals).sum(axis=1)) if in_front else np.inf
+        return Iterate(delta, pull, seen, cost)
+
+    def step(self, now: Iterate) -> PullStep:
+        """Return the step to the minimum of the cost linearised at a correction."""
+        part = joint_landmarks.columns(self.prediction)
+        P = self.prediction.cov[part, part]
+        H_pose, H_point = self.prediction.pulled_back(now.delta, now.seen.H_pose, now.seen.H_point)
+        H, residuals = self.stacked(now.seen._replace(H_pose=H_pose, H_point=H_point))
+        carried = H @ P
+        innovation_cov = H @ carried.T
+        innovation_cov.flat[:: len(carried) + 1] += 1.0
+        pull = H.T @ cho_solve(cho_factor(innovation_cov), residuals + H @ now.delta[part]) - now.pull
+        # |step|^2 in the metric P^-1 + H^T H
+        return PullStep(pull, float(np.sqrt(max(pull @ P @ pull, 0.0) + np.square(carried @ pull).sum())))
+
+    def stacked(self, seen: LandmarkSightings) -> tuple[csr_array, Array]:
+        """Return the Jacobian (m, k) and the residuals (m,) of the landmarks that correct, under each other."""
+        return joint_landmarks.stacked(self.prediction, seen).weighed(self.weights)
+
+
+def most_probable(measurement: Measurement) -> IterationResult:
+    """Iterate from the prediction, taking only steps that lower the cost, until a step is negligible."""
+    part = joint_landmarks.columns(measurement.prediction)
+    now = measurement.after(np.zeros(part.stop - part.start))
+    for _ in range(MOST_STEPS):
+        step = measurement.step(now)
+        if step.length < NEGLIGIBLE_STEP:
+            return IterationResult(measurement.after(now.pull + step.pull), converged=True)
+        lower = next((then for then in _shortened(measurement, now, step.pull) if then.cost < now.cost), None)
+        if lower is None:
+            return IterationResult(now, converged=False)
+        now = lower
+    return IterationResult(now, converged=False)
+
+
+def _shortened(measurement: Measurement, now: Iterate, pull: Array) -> Iterator[Iterate]:
+    """Yield the correction after a step, after half of it, and so on."""
+    for halvings in range(MOST_HALVINGS + 1):
+        yield measurement.after(now.pull + 0.5**halvings * pull)

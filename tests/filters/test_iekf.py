@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from filters.kalman import iterated, joint_landmarks
+from filters import iekf
+from filters.kalman import joint_landmarks
 from filters.kalman.gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import JointBelief
@@ -52,8 +53,8 @@ class Scene(NamedTuple):
     frame: StereoFrame
     rig: StereoRig
 
-    def measurement(self) -> iterated.Measurement:
-        return iterated.Measurement(self.joint, self.frame, AT, self.rig, np.ones(len(self.joint.points), dtype=bool))
+    def measurement(self) -> iekf.Measurement:
+        return iekf.Measurement(self.joint, self.frame, AT, self.rig, np.ones(len(self.joint.points), dtype=bool))
 
 
 def scene(scenario, belief=anchored, frames: int = 6, disturbed: float = 2.0) -> Scene:
@@ -220,7 +221,7 @@ def test_its_mean_is_that_of_a_lag_zero_smoother_at_convergence(scenario) -> Non
     nothing = measurement.after(np.zeros(joint.cov.shape[0] - joint.clone_columns.start))
     single = joint.displaced(measurement.after(measurement.step(nothing).pull).delta)
     gate = FrameGate(probability=1.0)
-    iterated.correct(joint, frame, AT, rig, gate)
+    iekf.correct(joint, frame, AT, rig, gate)
 
     assert gate.unconverged == 0
     assert np.abs(joint.points - points).max() < 1e-6
@@ -234,22 +235,22 @@ def test_its_covariance_is_the_moved_predictions_and_the_sightings_at_convergenc
     """``(P^-1 + H^T H)^-1`` with GTSAM's Jacobians at the corrected estimate."""
     joint, frame, rig = given = scene(scenario)
     graph, measurement, part = LagZero(given), given.measurement(), joint_landmarks.columns(joint)
-    best, _ = iterated.most_probable(measurement)
+    best, _ = iekf.most_probable(measurement)
     moved = copy(joint)
     moved.move(best.delta)
     information = graph.sightings_information(moved.core.T_world_imu, moved.points)
     expected = np.linalg.inv(np.linalg.inv(moved.cov[part, part]) + information)
-    iterated.correct(joint, frame, AT, rig, FrameGate(probability=1.0))
+    iekf.correct(joint, frame, AT, rig, FrameGate(probability=1.0))
     sigma = np.sqrt(np.diag(expected))
     assert np.abs((joint.cov[part, part] - expected) / np.outer(sigma, sigma)).max() < 1e-6
     assert (sigma < 0.99 * np.sqrt(np.diag(moved.cov[part, part]))).any()
 
 
 def test_where_no_step_lowers_the_cost_the_frame_corrects_nothing(monkeypatch) -> None:
-    monkeypatch.setattr(iterated, "_shortened", lambda *_: iter([]))
+    monkeypatch.setattr(iekf, "_shortened", lambda *_: iter([]))
     joint, frame, rig = scene(FLIGHT, disturbed=0.3)
     before, gate = copy(joint), FrameGate(0.95)
-    iterated.correct(joint, frame, AT, rig, gate)
+    iekf.correct(joint, frame, AT, rig, gate)
     assert gate.accepted > 0
     assert gate.info()["unconverged"] == 1
     np.testing.assert_array_equal(joint.cov, before.cov)
@@ -258,10 +259,10 @@ def test_where_no_step_lowers_the_cost_the_frame_corrects_nothing(monkeypatch) -
 
 
 def test_an_iteration_that_is_broken_off_ends_at_its_lowest_cost(monkeypatch) -> None:
-    monkeypatch.setattr(iterated, "MOST_STEPS", 1)
+    monkeypatch.setattr(iekf, "MOST_STEPS", 1)
     measurement = scene(FLIGHT).measurement()
     start = measurement.after(np.zeros(measurement.prediction.cov.shape[0] - 15))
-    best, converged = iterated.most_probable(measurement)
+    best, converged = iekf.most_probable(measurement)
     assert not converged
     assert best.cost < start.cost
     assert best.cost == measurement.after(best.pull).cost
@@ -273,7 +274,7 @@ def test_sightings_that_make_no_sense_end_neither_in_nan_nor_in_endless_steps(sc
     sequence = recording(scenario, 1.0, tracks=12)
     open_gate = Settings(outliers=Outliers(gate_probability=1.0))
     setup, rng, unconverged = replace(setup_of(sequence), settings=open_gate), np.random.default_rng(0), 0.0
-    ekf = JointEkf(setup, AT, anchored(sequence.rig), iterated.correct)
+    ekf = JointEkf(setup, AT, anchored(sequence.rig), iekf.correct)
     for packet in sequence.packets():
         frame = packet.frame
         estimate = ekf.step(replace(packet, frame=replace(frame, uvs_px=rng.permutation(frame.uvs_px))))
@@ -290,7 +291,7 @@ def test_iterated_over_landmarks_in_metres_the_mean_would_be_biased() -> None:
     def nees(belief, seed: int) -> float:
         """Return the mean normalised error squared of the pose over a run."""
         sequence = recording(FLIGHT, 3.0, tracks=25, seed=seed)
-        ekf, errors = JointEkf(setup_of(sequence), AT, belief(sequence.rig), iterated.correct), []
+        ekf, errors = JointEkf(setup_of(sequence), AT, belief(sequence.rig), iekf.correct), []
         assert sequence.truth is not None
         for packet in sequence.packets():
             estimate = ekf.step(packet)

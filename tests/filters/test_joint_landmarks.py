@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman import iterated, joint_landmarks
+from filters import iekf
+from filters.kalman import joint_landmarks
 from filters.kalman.gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
@@ -37,7 +38,7 @@ def frame_of(joint: JointBelief, off_px: Array) -> StereoFrame:
     return StereoFrame(0, np.array([7]), uv_px, np.zeros(1, dtype=np.int64))
 
 
-@pytest.mark.parametrize("correct", [joint_landmarks.correct, iterated.correct], ids=["single", "iterated"])
+@pytest.mark.parametrize("correct", [joint_landmarks.correct, iekf.correct], ids=["single", "iterated"])
 @pytest.mark.parametrize(("depth_m", "accepted"), [(4.0, 1), (-4.0, 0)], ids=["in front", "behind"])
 def test_a_landmark_behind_the_camera_corrects_nothing_however_small_its_residual(correct, depth_m, accepted):
     """A residual of half a pixel passes the gate on either side: what differs is the side alone."""

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from filters.kalman import iterated, joint_landmarks
+from filters import iekf
+from filters.kalman import joint_landmarks
 from filters.kalman.gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief, InvariantBelief
 from filters.kalman.joint import JointBelief
@@ -233,7 +234,7 @@ def most_information_gained(scenario, belief, correct) -> float:
 
 BELIEFS = {
     "riekf": (lambda rig, core: InvariantBelief(core), joint_landmarks.correct),
-    "iekf": (lambda rig, core: AnchoredBelief(core, rig.T_imu_cam), iterated.correct),
+    "iekf": (lambda rig, core: AnchoredBelief(core, rig.T_imu_cam), iekf.correct),
 }
 
 
@@ -247,7 +248,7 @@ def test_no_information_about_global_position_and_heading_is_gained(scenario, na
 
 
 @both_kinds
-@pytest.mark.parametrize("correct", [joint_landmarks.correct, iterated.correct], ids=["single", "iterated"])
+@pytest.mark.parametrize("correct", [joint_landmarks.correct, iekf.correct], ids=["single", "iterated"])
 def test_the_plain_error_at_latest_estimates_does_gain_it(scenario, correct) -> None:
     """The test above can fail."""
     assert most_information_gained(scenario, lambda rig, core: JointBelief(core), correct) > 0.01
