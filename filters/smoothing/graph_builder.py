@@ -13,8 +13,7 @@ import numpy as np
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.alignment import aligned
 from filters.smoothing.discounted_tracks import DiscountedTracks, discounted_past, seen_often
-from filters.smoothing.outlier_check import OutlierCheck, relative_to_its_map
-from filters.smoothing.refused_tracks import RefusedTracks
+from filters.smoothing.outlier_check import OutlierCheck, RefusedTracks, relative_to_its_map
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray

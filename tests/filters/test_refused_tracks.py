@@ -7,8 +7,8 @@ import pytest
 
 from filters.fixed_lag import FixedLag
 from filters.isam2 import Isam2
-from filters.smoothing import refused_tracks
-from filters.smoothing.refused_tracks import FEWEST_REFUSED, RefusedTracks
+from filters.smoothing import outlier_check
+from filters.smoothing.outlier_check import FEWEST_REFUSED, RefusedTracks
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_exp, transform
 from toolkit.models import stereo
@@ -78,7 +78,7 @@ def test_a_landmark_that_begins_far_too_far_away_begins_anew(build, clean, begun
 
 
 def test_but_for_that_it_would_refuse_all_that_its_track_shows(clean, begun_far, monkeypatch):
-    monkeypatch.setattr(refused_tracks, "FEWEST_REFUSED", 1000)
+    monkeypatch.setattr(outlier_check, "FEWEST_REFUSED", 1000)
     (right,), _ = point_and_log(Isam2, clean)
     (point,), log = point_and_log(Isam2, begun_far)
     assert log == ()
