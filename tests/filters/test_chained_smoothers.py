@@ -9,7 +9,7 @@ import pytest
 from filters.batch import Batch
 from filters.fixed_lag import FixedLag
 from filters.isam2 import Isam2
-from filters.smoothing.alignment import aligned
+from filters.smoothing.graph_builder import aligned
 from toolkit.estimator import Setup
 from toolkit.geometry import se3_exp, se3_inverse, se3_log, transform
 from toolkit.models import stereo
