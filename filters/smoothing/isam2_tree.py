@@ -16,7 +16,7 @@ import numpy as np
 
 from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
 from filters.smoothing.chained_past import ChainedPast, Places
-from filters.smoothing.frozen_variables import FrozenVariables
+from filters.smoothing.frozen_variables import FrozenVariables, RetiredVariables, key_list
 from filters.smoothing.indeterminate import (
     LAST,
     Recovery,
@@ -27,7 +27,6 @@ from filters.smoothing.indeterminate import (
     without_gaps,
 )
 from filters.smoothing.linearisation_error import any_moved_beyond, state_thresholds
-from filters.smoothing.retired_variables import RetiredVariables, key_list
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array
 from toolkit.models.factors import L, kind_of
