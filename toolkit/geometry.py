@@ -107,11 +107,6 @@ def so3_left_jacobian(phi: Array) -> Array:
     return _IDENTITY + second * phi_x + third * (phi_x @ phi_x)
 
 
-def so3_right_jacobian(phi: Array) -> Array:
-    """Return J_r (..., 3, 3) with exp(phi + d) = exp(phi) exp(J_r d)."""
-    return so3_left_jacobian(-np.asarray(phi, dtype=float))
-
-
 def se3(rotation: Array, translation: Array) -> Array:
     """Assemble T (..., 4, 4) from a rotation (..., 3, 3) and a translation (..., 3)."""
     rotation, translation = np.asarray(rotation, dtype=float), np.asarray(translation, dtype=float)
