@@ -12,7 +12,7 @@ BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
 
 
 def figures() -> list[NamedFigure]:
-    figure = new_figure(3.0, 2.0)
+    figure = new_figure(2.0)
     figure.add_subplot().plot([0, 1], [1, 0], label="a line")
     return [NamedFigure("line", "A line.", figure)]
 

@@ -284,9 +284,11 @@ def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: s
     group.add_argument("--quiet", action="store_true", help=f"print nothing; {quiet}")
 
 
-def add_workers_argument(parser: argparse.ArgumentParser, what: str = "processes side by side") -> None:
+def add_workers_argument(parser: argparse.ArgumentParser) -> None:
     """Add the number of processes; None stands for one a CPU."""
-    parser.add_argument("--workers", metavar="N", type=at_least(1, MOST_WORKERS), help=f"{what} (default: one a CPU)")
+    parser.add_argument(
+        "--workers", metavar="N", type=at_least(1, MOST_WORKERS), help="processes side by side (default: one a CPU)"
+    )
 
 
 # Repeated from toolkit.datasets.io.bag_topics (a test compares them), which would cost the help a third of a second.

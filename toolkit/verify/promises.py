@@ -14,7 +14,6 @@ from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics._shared.consistency import POSE_DOF, chi2_quantile
 from toolkit.sequence import Packet, Sequence
-from toolkit.settings import DEFAULTS, Scalar, Settings
 
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
 COV_SIZES = (6, 9, 12, 15)
@@ -37,18 +36,10 @@ class Watched:
     finished: Finished
 
 
-def setup_of(sequence: Sequence, settings: Settings = DEFAULTS, options: dict[str, Scalar] | None = None) -> Setup:
+def setup_of(sequence: Sequence) -> Setup:
     """Return what an estimator is told of a recording that states its own prior, as a simulated one does."""
     assert sequence.prior is not None
-    return Setup(
-        sequence.rig,
-        sequence.noise,
-        sequence.prior,
-        sequence.gravity_world,
-        sequence.motion_kind,
-        settings,
-        options or {},
-    )
+    return Setup(sequence.rig, sequence.noise, sequence.prior, sequence.gravity_world, sequence.motion_kind)
 
 
 def watch(build: Build, sequence: Sequence) -> Watched:

@@ -76,9 +76,9 @@ def width_of(comparison: Comparison, estimator: str) -> float:
     return _WIDEST + (_THINNEST - _WIDEST) * order.index(estimator) / (len(order) - 1)
 
 
-def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+def new_figure(height_in: float) -> Figure:
     """Return an empty figure that arranges its own margins."""
-    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
 
 
 def style_axes(axes: Axes, title: str, x_label: str, y_label: str) -> None:
