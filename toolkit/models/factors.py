@@ -1,6 +1,6 @@
 """What graphs of every kind share: the keys, the stereo measurement as factors, priors, and marginal covariances."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from math import isnan
 from typing import Any, Protocol
@@ -24,6 +24,15 @@ _MOST_TERMS = 3
 def kind_of(key: int) -> str:
     """Return what a key names: "x" a pose, "v" a velocity, "b" a bias, "l" a landmark, "s" the scale."""
     return chr(key >> _INDEX_BITS)
+
+
+def latest_values(tree: gtsam.ISAM2, keys: Iterable[int], read_bias: Callable[[int], Any]) -> gtsam.Values:
+    """Return the latest values of some states' variables in a tree; ``read_bias`` is its method for their biases."""
+    readers = {"x": tree.calculateEstimatePose3, "v": tree.calculateEstimateVector, "b": read_bias}
+    values = gtsam.Values()
+    for key in keys:
+        values.insert(key, readers[kind_of(key)](key))
+    return values
 
 
 def huber_loss(sigma: float | None) -> gtsam.noiseModel.mEstimator.Base | None:

@@ -5,9 +5,8 @@ makes its ``CombinedImuFactor`` of the very same object, so both see the same re
 (Forster et al. 2017, eqs. 26-38). The state is pose, velocity and both biases.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, skew, so3_exp
 from toolkit.measured_motion import ImuMotion, ImuNoise, Motion
-from toolkit.models.factors import B, V, X, joint_prior, kind_of
+from toolkit.models.factors import B, V, X, joint_prior, latest_values
 from toolkit.models.state import POSE, POSITION, ROTATION, Belief, Layout, Prediction, with_velocity_turned
 from toolkit.sequence import Prior
 
@@ -196,15 +195,7 @@ class ImuModel:
 
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
-        readers: Mapping[str, Callable[[int], Any]] = {
-            "x": tree.calculateEstimatePose3,
-            "v": tree.calculateEstimateVector,
-            "b": tree.calculateEstimateConstantBias,
-        }
-        values = gtsam.Values()
-        for key in keys:
-            values.insert(key, readers[kind_of(key)](key))
-        return values
+        return latest_values(tree, keys, tree.calculateEstimateConstantBias)
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""

@@ -17,7 +17,7 @@ import numpy as np
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian, skew
 from toolkit.measured_motion import Motion, TwistChangeNoise, UnmeasuredMotion
-from toolkit.models.factors import B, V, X, joint_prior, kind_of
+from toolkit.models.factors import B, V, X, joint_prior, latest_values
 from toolkit.models.state import POSE, ROTATION, Belief, Layout, Prediction, with_velocity_turned
 from toolkit.sequence import Prior
 
@@ -160,11 +160,7 @@ class SmoothTwist:
 
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
-        values = gtsam.Values()
-        for key in keys:
-            read = tree.calculateEstimatePose3 if kind_of(key) == "x" else tree.calculateEstimateVector
-            values.insert(key, read(key))
-        return values
+        return latest_values(tree, keys, tree.calculateEstimateVector)
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""

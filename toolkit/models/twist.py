@@ -14,7 +14,7 @@ import numpy as np
 from toolkit.estimate import Estimate
 from toolkit.geometry import Array, se3_adjoint, se3_exp_and_right_jacobian, se3_inverse
 from toolkit.measured_motion import Motion, TwistMotion, TwistNoise
-from toolkit.models.factors import B, X, joint_prior, kind_of
+from toolkit.models.factors import B, X, joint_prior, latest_values
 from toolkit.models.state import POSE, Belief, Layout, Prediction
 from toolkit.sequence import Prior
 
@@ -192,11 +192,7 @@ class TwistModel:
 
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
-        values = gtsam.Values()
-        for key in keys:
-            read = tree.calculateEstimatePose3 if kind_of(key) == "x" else tree.calculateEstimateVector
-            values.insert(key, read(key))
-        return values
+        return latest_values(tree, keys, tree.calculateEstimateVector)
 
     def insert(self, values: gtsam.Values, estimate: Estimate, k: int) -> None:
         """Add state k at an estimate."""
