@@ -52,7 +52,7 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
 
 
 def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = None) -> str | None:
-    """Return why an estimator with these diagnostics of N frames has diverged, or None.
+    """Return why an estimator with these diagnostics (N,), by name, of N frames has diverged, or None.
 
     Its gate has collapsed where it rejects nearly all measurements: the covariance no longer covers the error, or the
     noise of tracks that it was told is less than theirs.

@@ -209,7 +209,7 @@ def are_of_one_kind(samples: MotionSamples, noise: MotionNoise) -> bool:
 
 
 def motions_between(samples: MotionSamples, frames_t_ns: IntArray, bridges: Bridges | None) -> Iterator[Motion]:
-    """Yield the motion of each interval between frames, cut and interpolated at the frame times."""
+    """Yield the motion of each interval between frames (K,) ns, cut and interpolated at the frame times."""
     if isinstance(samples, NoSamples):
         for dt_s in np.diff(frames_t_ns) / NS_PER_S:
             yield UnmeasuredMotion(read_only([dt_s]))

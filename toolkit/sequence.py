@@ -134,7 +134,7 @@ class Observations:
 
     @classmethod
     def sorted(cls, frame: IntArray, track_id: IntArray, uv_px: Array) -> "Observations":
-        """Build from rows in any order."""
+        """Build from frames (N,), track ids (N,) and sightings (N, 3) px in any order."""
         order = np.lexsort((track_id, frame))
         return cls(frame[order], track_id[order], uv_px[order])
 

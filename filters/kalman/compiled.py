@@ -204,7 +204,7 @@ def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], Corr
 
 
 def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
-    """Return what integrates motion of some noise: a :class:`toolkit.models.motion.MotionModel`."""
+    """Return what integrates motion of some noise under gravity (3,) m/s^2, as a motion model does."""
     model = motion_model(noise, gravity_world)
     kernel = _kernel(compilation, "preintegration") if isinstance(noise, ImuNoise) else None
     if kernel is None:

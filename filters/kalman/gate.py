@@ -46,13 +46,16 @@ class FrameGate:
         return _table(self.probability, most.bit_length())
 
     def accepts(self, nis: Array, dof: IntArray | int, in_front: BoolArray | bool = True) -> BoolArray:
-        """Test N innovations, count them, and return which pass: those of points in front of the camera alone."""
+        """Test innovations of NIS (N,) and ``dof`` (N,), and count them; return which pass (N,).
+
+        Only those of points in front of the camera do.
+        """
         accepted = np.asarray((nis < self._table(dof).bound[dof]) & in_front)
         self.count(nis, dof, accepted)
         return accepted
 
     def count(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> None:
-        """Count N innovations, some of which have passed."""
+        """Count innovations of NIS (N,) and ``dof`` (N,), of which the ``accepted`` (N,) have passed."""
         table, count = self._table(dof), int(np.count_nonzero(accepted))
         self.nis += float(nis[accepted].sum())
         if isinstance(dof, int):
@@ -70,7 +73,10 @@ class FrameGate:
         return self.huber is not None or self.share != 1.0
 
     def weights(self, nis: Array, dof: IntArray | int, accepted: BoolArray) -> Array:
-        """Return what N innovations count for: 0 where not accepted, else Huber's weight in (0, 1] times the share."""
+        """Return what innovations of NIS (N,) count for (N,): 0 where not ``accepted`` (N,).
+
+        Else it is Huber's weight, in (0, 1] and 1 without that loss, times the share.
+        """
         if self.huber is None:
             return self.share * accepted.astype(float)
         return np.where(accepted, self.share * huber_weights(nis, huber_threshold(dof, self.huber)), 0.0)

@@ -27,7 +27,7 @@ class LandmarkAnchors(JointBelief):
         self.anchors: Array = np.empty((0, 4, 4))
 
     def add_landmarks(self, track_ids: IntArray, points: Array, jacobian: Array | csr_array, cov: Array) -> None:
-        """Add landmarks as every joint belief does, anchored in the newest clone."""
+        """Add N landmarks as :meth:`JointBelief.add_landmarks` does, anchored in the newest clone."""
         super().add_landmarks(track_ids, points, jacobian, cov)
         anchor = self.clones[-1] @ self._T_imu_cam
         self.anchors = np.concatenate([self.anchors, np.tile(anchor, (len(track_ids), 1, 1))])

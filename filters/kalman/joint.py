@@ -55,7 +55,7 @@ class JointBelief:
 
     @property
     def cov(self) -> Array:
-        """Return the whole covariance; do not write to it."""
+        """Return the whole covariance (n, n); do not write to it."""
         return self._cov
 
     @property
@@ -70,7 +70,7 @@ class JointBelief:
         return slice(self.clone_columns.stop, self._cov.shape[0])
 
     def propagate(self, prediction: Prediction, transition: Array) -> None:
-        """Carry the IMU over an interval; its end is the first estimate of the new instant."""
+        """Carry the IMU over an interval by its transition (d, d); the end is the first estimate of the new instant."""
         d = self._core.layout.size
         self._core = replace(self._core, T_world_imu=prediction.T_world_imu, v_world=prediction.v_world)
         self.first_core = self._core
@@ -170,7 +170,7 @@ class JointBelief:
         self._displace(delta)
 
     def displaced(self, delta: Array) -> Self:
-        """Return the estimates as a move would leave them; the covariance is still that before it."""
+        """Return the estimates as :meth:`move` by an error (n,) would leave them, with the covariance before it."""
         result = copy(self)
         result._displace(delta)
         return result

@@ -135,7 +135,7 @@ def _pose_and_landmark_cov(joint: JointBelief) -> Array:
 
 
 def add_tracks(joint: JointBelief, track_ids: IntArray, points: Array, linearised: Linearised) -> None:
-    """Put N tracks seen from the clones into the state, with the correlations their sightings give them.
+    """Put N tracks seen from the clones into the state at points (N, 3) m, correlated as their sightings have it.
 
     A landmark's error is that which its measurements' errors and the poses' errors give its best point:
     ``-(H_f^T H_f)^-1 H_f^T (H_x x + n)``.

@@ -39,7 +39,7 @@ class LandmarkMap:
         return slots[rows], rows
 
     def select(self, slots: IntArray | BoolArray) -> "LandmarkMap":
-        """Return the landmarks at the given rows, which must keep the ids ascending."""
+        """Return the landmarks at some rows (m,), or of a mask (M,), which must keep the ids ascending."""
         return LandmarkMap(self.track_ids[slots], self.points[slots], self.covs[slots])
 
     def merged(self, other: "LandmarkMap") -> "LandmarkMap":
@@ -77,7 +77,10 @@ def started(uvs_px: Array, T_world_imu: Array, rig: StereoRig) -> tuple[Array, A
 def first_sighting(
     frame: StereoFrame, rows: IntArray, T_world_imu: Array, rig: StereoRig, start: Start = started
 ) -> LandmarkMap:
-    """Start the landmarks of the given rows of a frame; those of too little disparity are left for a later frame."""
+    """Start the landmarks of rows (m,) of a frame from its pose (4, 4).
+
+    Those of too little disparity are left for a later frame.
+    """
     uvs_px = frame.uvs_px[rows]
     near = stereo.disparity_px(uvs_px) > LEAST_DISPARITY_PX
     return LandmarkMap(frame.track_ids[rows][near], *start(uvs_px[near], T_world_imu, rig))
@@ -100,7 +103,7 @@ class TrackedMap:
         return self._in_view.select(slots), frame.uvs_px[rows]
 
     def keep(self, seen: LandmarkMap, frame: StereoFrame, T_world_imu: Array) -> None:
-        """Keep the landmarks seen again, with their new values, and start the frame's other tracks."""
+        """Keep the landmarks seen again, with their new values; start the frame's other tracks from its pose (4, 4)."""
         new = np.flatnonzero(~is_among(frame.track_ids, seen.track_ids))
         self._in_view = seen.merged(first_sighting(frame, new, T_world_imu, self._rig, self._start))
 

@@ -32,15 +32,15 @@ class AtLatestEstimates:
     """The standard EKF."""
 
     def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
-        """Return the transition as it was predicted."""
+        """Return the transition (d, d) as it was predicted."""
         return prediction.transition
 
     def clones(self, joint: JointBelief) -> Array:
-        """Return the clones as estimated now."""
+        """Return the poses (C, 4, 4) of the clones as estimated now."""
         return joint.clones
 
     def points(self, joint: JointBelief) -> Array:
-        """Return the landmarks as estimated now."""
+        """Return the landmarks (L, 3) as estimated now."""
         return joint.points
 
 
@@ -48,15 +48,15 @@ class AtFirstEstimates:
     """First-estimate Jacobians."""
 
     def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
-        """Return the transition between the first estimates of both instants."""
+        """Return the transition (d, d) between the first estimates of both instants."""
         return increment.transition_between(joint.first_core, prediction)
 
     def clones(self, joint: JointBelief) -> Array:
-        """Return the clones as first estimated."""
+        """Return the poses (C, 4, 4) of the clones as first estimated."""
         return joint.first_clones
 
     def points(self, joint: JointBelief) -> Array:
-        """Return the landmarks as first estimated."""
+        """Return the landmarks (L, 3) as first estimated."""
         return joint.first_points
 
 

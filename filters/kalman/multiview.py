@@ -41,7 +41,7 @@ class TrackSightings(NamedTuple):
         return np.asarray(3 * self.seen.sum(axis=1) - self.left_only.sum(axis=1) - 3)
 
     def select(self, rows: BoolArray | IntArray) -> "TrackSightings":
-        """Return some of the tracks, themselves where a mask has all."""
+        """Return the tracks of a mask (F,) or of some rows; all of them unchanged where a mask has all."""
         if rows.dtype == np.bool_:
             rows = rows.nonzero()[0]  # places are found once for all four arrays; a mask has them found for each
             if rows.size == self.track_ids.size:
@@ -81,7 +81,7 @@ class Linearised(NamedTuple):
     decorrelation: Array | None = None
 
     def select(self, rows: BoolArray | IntArray) -> "Linearised":
-        """Return those of some tracks."""
+        """Return those of the tracks of a mask (F,) or of some rows."""
         mixing = None if self.decorrelation is None else self.decorrelation[rows]
         residuals, H_pose, H_point, depth_m = (array[rows] for array in self._arrays())
         return Linearised(residuals, H_pose, H_point, depth_m, mixing)
@@ -171,7 +171,7 @@ class Constraints(NamedTuple):
     dof: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "Constraints":
-        """Return those of some tracks."""
+        """Return those of the tracks of a mask (F,) or of some rows."""
         return Constraints(self.residuals[rows], self.H[rows], self.dof[rows])
 
     def scaled(self, factors: Array) -> "Constraints":

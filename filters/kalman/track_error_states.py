@@ -140,12 +140,12 @@ class Started(NamedTuple):
 
 
 def add_tracks(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> None:
-    """Put N tracks seen from the clones, the newest among them, into the state with the errors they have by now."""
+    """Put N tracks, seen from the newest clone and others, into the state: points (N, 3) m, and their errors by now."""
     joint.add_landmarks_with_errors(started(joint, sightings, points, linearised), sightings.ages[:, -1])
 
 
 def started(joint: TrackErrorBelief, sightings: TrackSightings, points: Array, linearised: Linearised) -> Started:
-    """Return what the window's sightings say of N landmarks and of the errors of their tracks at the newest pose.
+    """Return what a window's sightings say of N points (N, 3) m and of their tracks' errors at the newest pose.
 
     With residuals, Jacobians and noise e decorrelated, ``r = H_x x + H p + e``, the best point errs by
     ``-V H^T (H_x x + e)``, V being ``(H^T H)^-1``, and the best error of the track by ``b - K Q (H_x x + e)``: K is its

@@ -77,7 +77,10 @@ class AcceptedTracks(NamedTuple):
 
 
 def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
-    """Triangulate tracks, free them of their landmarks and test them: the definition, in NumPy, all tracks at once."""
+    """Triangulate tracks, free them of their landmarks and test them, all at once in NumPy: the definition.
+
+    ``bounds`` (n,) is the NIS that is just accepted at each number of degrees of freedom.
+    """
     poses, P = window.poses, window.cov
     points, reliable = triangulate(sightings.uvs_px, sightings.seen, poses, rig)
     sightings, points = sightings.select(reliable), points[reliable]
@@ -159,7 +162,7 @@ class TrackGate:
         return accepted.joined(self._tested(again, gate)[0]) if len(again.track_ids) else accepted
 
     def linearised(self, tracks: AcceptedTracks, rows: IntArray) -> Linearised:
-        """Return some of the accepted tracks linearised, landmarks included, with their weights."""
+        """Return the accepted tracks of some rows (m,) linearised, landmarks included, with their weights."""
         sightings, points = tracks.sightings.select(rows), tracks.points[rows]
         linearised = _linearised(sightings, points, self._window, self._rig, self._images)
         return linearised.scaled(np.sqrt(tracks.weights[rows]))

@@ -27,7 +27,7 @@ LANDMARK_BEYOND_SIGMA = 0.1
 
 
 def state_thresholds(motion: MotionModel, baseline_m: float) -> dict[str, Array]:
-    """Return how far the variables of a state may move, by their kind, in GTSAM's tangent spaces."""
+    """Return how far a state's variables may move, (6,) or (3,) by their kind, in GTSAM's tangent spaces."""
     pose = np.repeat([ROTATION_THRESHOLD_RAD, POSITION_THRESHOLD_BASELINES * baseline_m], 3)
     at_most = {"x": pose, "v": np.repeat(VELOCITY_THRESHOLD, 6), "b": np.repeat(BIAS_THRESHOLD, 3)}
     return {kind: at_most[kind][-size:] for kind, size in motion.variable_sizes.items()}

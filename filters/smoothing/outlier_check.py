@@ -43,7 +43,7 @@ class OutlierCheck:
     policy: Outliers
 
     def without_outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> StereoFrame:
-        """Return the frame without its outliers."""
+        """Return the frame without its outliers; see :meth:`outliers`."""
         return frame.select(~self.outliers(frame, points, expected))
 
     def outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> BoolArray:

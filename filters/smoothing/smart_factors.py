@@ -106,7 +106,7 @@ class Vision:
 
     @classmethod
     def at(cls, poses: Array, points: Array, sightings: Sightings, camera: RobustCamera) -> "Vision":
-        """Evaluate sightings at poses of the IMU in the world and points in the world."""
+        """Evaluate sightings at poses (K, 4, 4) of the IMU in the world and points (M, 3) m in the world."""
         seen = seen_from(poses, points, sightings, camera.rig)
         kind = cls if camera.rig.track_noise is None else ChainedVision
         return kind((len(poses), len(points)), sightings, seen, camera)

@@ -84,7 +84,10 @@ class TrackedWindow:
         return dict(zip(self.track_ids.tolist(), self.window.points, strict=True))
 
     def seeing(self, frame: StereoFrame, T_world_imu: Array, rig: StereoRig) -> "TrackedWindow":
-        """Add what the newest state sees: tracks known go on, new ones near enough start where stereo puts them."""
+        """Add what the newest state, at a pose (4, 4), sees: known tracks go on, new ones start where stereo puts them.
+
+        Of new tracks those of enough disparity alone.
+        """
         known = np.isin(frame.track_ids, self.track_ids)
         new = frame.select(~known & (stereo.disparity_px(frame.uvs_px) > LEAST_DISPARITY_PX))
         used = frame.select(known | np.isin(frame.track_ids, new.track_ids))
@@ -111,7 +114,7 @@ class TrackedWindow:
         )
 
     def in_front(self, rig: StereoRig) -> tuple["TrackedWindow", IntArray]:
-        """Let the points go that are behind a camera that saw them; return the rest and the ids of those that went."""
+        """Let the points go that are behind a camera that saw them; return the rest, and the ids (n,) of those gone."""
         seen = self.window.sightings
         in_front = seen_from(self.window.poses, self.window.points, seen, rig).in_front
         behind = np.unique(seen.point[~in_front])
@@ -135,7 +138,7 @@ class System:
         return _lower_factor(self.information)
 
     def damped_root(self, damping: float) -> Array:
-        """Return the lower Cholesky factor with a share of the diagonal added; raises LinAlgError as ``root``."""
+        """Return the lower Cholesky factor (D, D), a share of the diagonal added; raises LinAlgError as ``root``."""
         if damping == 0.0:
             return self.root
         damped = self.information.copy()

@@ -82,7 +82,7 @@ class Patches:
         return np.asarray(np.clip(places, -_FARTHEST_PX, _FARTHEST_PX))
 
     def select(self, rows: BoolArray | IntArray) -> "Patches":
-        """Return the patches of some tracks."""
+        """Return the patches of the tracks of a mask or of some rows."""
         return Patches(self.values[rows], self.solvers[rows], self.warps[rows])
 
     def joined(self, others: "Patches") -> "Patches":

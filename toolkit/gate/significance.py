@@ -68,7 +68,7 @@ class Pairs(Compared):
 
 
 def log_of(values: Array) -> Array:
-    """Return logarithms of values that are not negative."""
+    """Return the logarithms (...) of values (...) that are not negative."""
     return np.log(np.maximum(values, _LEAST))
 
 
@@ -155,7 +155,7 @@ def percent_text(change: float) -> str:
 
 
 def geometric_mean(values: Array) -> float:
-    """Return the geometric mean, whose ratio is the mean change."""
+    """Return the geometric mean of values (n,), whose ratio is the mean change."""
     return float(np.exp(log_of(values).mean()))
 
 

@@ -127,7 +127,7 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
 
 
 def time_coverage_percent(t_ns: IntArray, truth_t_ns: IntArray, gap_s: float) -> float:
-    """Return how much of the truth's time lies between poses that are no farther apart than ``gap_s``, in percent.
+    """Return the percentage of the truth's time (N,) ns that lies between stamps (n,) ns at most ``gap_s`` apart.
 
     Keyframes that are seconds apart cover the time between them; a lost track does not. What precedes the first pose
     and follows the last one is not covered.

@@ -67,7 +67,10 @@ class LastError(NamedTuple):
 def error_of_the_last(
     noise: TrackNoise, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
 ) -> LastError:
-    """Return what the walk and the offset have come to in F tracks at the last of W places, where all are seen."""
+    """Return what walk and offset have come to in F tracks at the last of W places, where all are seen.
+
+    ``ages`` (F, W) in frames; ``seen`` and ``left_only`` (F, W).
+    """
     tracks, window = seen.shape
     walk, offset = np.square(noise.walk_px), np.square(noise.offset_px)
     shared = np.where(seen[:, None, :], walk[:, None] * ages[:, None, :] + offset[:, None], 0.0)

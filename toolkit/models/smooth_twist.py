@@ -150,7 +150,7 @@ class SmoothTwist:
         return Belief.of_prior(prior, self.layout)
 
     def integrate(self, motion: Motion, bias: Array) -> SmoothIncrement:
-        """Return the interval between two frames; nothing was measured in it."""
+        """Return the interval between two frames; nothing was measured in it, and its bias (6,) is not used."""
         assert isinstance(motion, UnmeasuredMotion)
         return SmoothIncrement(float(motion.dt_s.sum()), self._noise)
 

@@ -213,5 +213,5 @@ class TwistModel:
         return joint_prior(at, {X(k): POSE, B(k): self.layout.gyro_bias}, belief.cov)
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
-        """Return the covariance, made exactly symmetric: both sides use the same errors."""
+        """Return the covariance (9, 9), made exactly symmetric: both sides use the same errors."""
         return np.asarray(0.5 * (cov + cov.T))

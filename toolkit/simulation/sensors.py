@@ -44,7 +44,7 @@ class MotionMeasurements:
 
 
 def stamps_ns(start_ns: int, rate_hz: float, duration_s: float) -> IntArray:
-    """Return the stamps of a periodic sensor from the start to the end of a recording, both included."""
+    """Return the stamps (S,) ns of a periodic sensor from the start to the end of a recording, both included."""
     count = int(np.floor(duration_s * rate_hz + 1e-9)) + 1
     return start_ns + np.round(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
@@ -151,7 +151,7 @@ def measure_twist(
 ) -> MotionMeasurements:
     """Measure the exact mean body twist of each interval between stamps: log(T_k^-1 T_k+1) / dt, plus noise.
 
-    Takes S + 1 stamps and poses and gives S samples; sample k describes the motion from k to k + 1.
+    Takes stamps (S + 1,) and poses (S + 1, 4, 4) and gives S samples; sample k is of the motion from k to k + 1.
     """
     dt_s = np.diff(t_ns)[:, None] / NS_PER_S
     exact = se3_log(se3_inverse(T_world_imu[:-1]) @ T_world_imu[1:]) / dt_s

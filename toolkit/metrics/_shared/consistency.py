@@ -51,7 +51,7 @@ class BodyErrors:
         return np.asarray(np.linalg.norm(self.T_estimate_truth[:, :3, 3], axis=1))
 
     def select(self, kept: BoolArray) -> "BodyErrors":
-        """Return some of the errors."""
+        """Return the errors of a mask (n,)."""
         errors, poses = self.T_estimate_truth[kept], self.T_world_imu[kept]
         return BodyErrors(self.t_ns[kept], self.rows[kept], errors, poses, self.placed)
 

@@ -292,7 +292,7 @@ def _series(drawn: DrawnOverSeeds, t_s: tuple[float, ...]) -> Json:
 
 
 def evenly(count: int, most: int) -> IntArray:
-    """Return at most ``most`` of the indices 0 ... count - 1, evenly spread, the first and the last among them."""
+    """Return at most ``most`` indices (n,) of 0 ... count - 1, evenly spread, the first and the last among them."""
     if count <= most:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
