@@ -11,7 +11,7 @@ from toolkit.geometry import Array, IntArray, read_only
 Status = Literal["ok", "diverged", "failed"]
 Output = Literal["causal", "final"]
 Arithmetic = Literal["compiled", "numpy"]
-# Of several runs together.
+# What several runs of an estimator computed with: "both" where they differ.
 ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
 
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-# What numeric libraries go by when they are loaded: the number of their threads in a process that is started.
+# Environment variables that set the number of threads of numeric libraries when these are loaded.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

@@ -40,7 +40,7 @@ class Silent:
 
 
 SILENT = Silent()
-# Begins a piece of work of some name; what it gives is told of its progress, and the work ends with the context.
+# Begins a named piece of work: a context, at whose end the work ends, that gives the Progress to report to.
 ProgressFor = Callable[[str], AbstractContextManager[Progress]]
 
 

@@ -18,8 +18,8 @@ from scipy.sparse import csr_array
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_right_jacobian
 from toolkit.models.state import POSE, Belief, Prediction
 
-# Of its own every error has at least this share of its variance: less is lost in rounding, and without it a pose that
-# two clones agree on to sixteen digits leaves their covariance without a root.
+# Of each variance at least this share is taken to be independent of all other errors: less is lost in rounding, and
+# without it the covariance of two clones of one pose, equal to sixteen digits, has no root.
 _LEAST_INDEPENDENT = 1e-12
 
 

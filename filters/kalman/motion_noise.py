@@ -27,9 +27,9 @@ from toolkit.sequence import Packet
 
 # The corrections of a sound filter's window are beyond this quantile once in a million.
 BY_CHANCE = 1e-6
-# An IMU that errs a hundred times as much as it says is none: what lies behind is for status to tell.
+# Of the variance: an IMU that errs a hundred times as much as it states has another fault, of which the status tells.
 _MOST = 1e4
-# What rounds to 1.0 times the stated noise is none to speak of.
+# Less rounds to 1.0 times the stated noise and is not logged.
 _LEAST_TOLD = 1.05
 
 

@@ -24,7 +24,7 @@ Order = Callable[[gtsam.NonlinearFactorGraph, list[StereoFrame]], gtsam.Ordering
 _MOST_TIED = 50
 # With no landmark that more states saw than this, nothing is counted.
 _FEWEST_STANDING = 150
-# Rows of each kind of variable. A twist's bias has half of an IMU's, which decides nothing.
+# Rows of each kind of variable. A twist's bias has half of an IMU's, which does not change the choice.
 _SIZES = {"x": 6, "v": 3, "b": 6, "l": 3, "s": 1}
 
 

@@ -25,7 +25,7 @@ _FROM_CHANNELS = np.linalg.inv(CHANNELS)
 # The logarithm of the depth grows by this much in a step at most: disparities stay positive.
 _MOST_FARTHER = 2.0
 _SMALL_DISPARITY_PX = 1.0
-# px^-2: what is said of a landmark that no sighting says anything of.
+# px^-2: by which a landmark is damped that sightings give less information.
 _LEAST_INFORMATION = 1e-6
 
 

@@ -27,13 +27,13 @@ from toolkit.models.factors import kind_of
 from toolkit.progress import SILENT, Progress
 
 _FIRST_DAMPING, _MOST_DAMPING, _DAMPING_FACTOR = 1e-3, 1e8, 10.0
-# Half a sum of squares of standard deviations: exact measurements have next to none, of which no share is little.
+# Of the error, half a sum of squared sigmas: with exact measurements it is near zero, and no share of it is small.
 _LEAST_DECREASE = 1e-12
-# Shares of landmarks' own information. Beyond the last all else is damped too: by then landmarks are held, nearly.
+# Landmarks are damped by shares of their own information. Beyond the last, which nearly holds them, so is all else.
 _FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
 # A step that keeps less than this of what the linear system promises is shortened.
 _KEPT = 0.5
-# One that gains little under more damping than this, or shortened to less, is not the last.
+# A step that gains little is the last one only if it was damped by no more than this, and shortened to no less.
 _FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
 

@@ -28,10 +28,10 @@ from toolkit.settings import Outliers
 
 # Huber first brings every landmark near, mismatched or not; Cauchy then lets the mismatched ones go. The last solve
 # starts where these end.
-# Along the tracks: jumps are found near the solution. The scale of the world hangs on differences of small residuals,
-# and to the last solve what is gained counts in itself, not by the whole.
+# Solves along the tracks begin near the solution. The scale of the world depends on differences of small residuals, so
+# that the last of them stops by how much the error falls, not by which share of it.
 _JUMPS_STOPPING, CHAIN_STOPPING = Stopping(1e-3, 60), Stopping(0.0, 120, decrease=0.01)
-# A scale that white noise has hangs on such differences too, but is soon found; far landmarks creep on for long.
+# A scale of disparities under white noise depends on them too, but converges soon; far landmarks take long.
 _SCALE_STOPPING = Stopping(1e-5, 60)
 _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping(1e-3, 60), Stopping(1e-4, 60)
 

@@ -21,7 +21,7 @@ from toolkit.sequence import StereoRig, is_left_only
 
 # A point behind the camera has no gradient, and must not cost less than one in front: it counts as a gross mismatch.
 _BEHIND_NORM = 100.0
-# Further off than any sighting is in standard deviations: a loss that begins here is none.
+# A threshold of Huber's loss, in standard deviations, that no sighting reaches: no loss.
 _NO_LOSS = 1e6
 # Keeps a landmark that no sighting determines from making its 3x3 block singular, far below any pixel's information.
 _LEAST_INFORMATION_PER_M2 = 1e-12

@@ -36,7 +36,7 @@ from toolkit.sequence import Sequence as Recording
 from toolkit.settings import DEFAULTS, Frontend
 
 HAS_TOPICS = True
-# Of images that are rectified already so many times as many corners have the same row as they are.
+# Images are rectified already where so many times as many corners meet their row as once the calibration is applied.
 _CLEARLY = 2
 _NAME_ANOTHER = "another topic with --topics imu=TOPIC, or an odometry with --topics twist=TOPIC"
 

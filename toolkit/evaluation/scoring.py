@@ -68,9 +68,9 @@ METRICS: tuple[Metric, ...] = (
     _PAIRS,
 )
 _OVER_A_SECOND = ("rpe_1s_m", "rpe_1s_deg")
-# What stamps are needed for.
+# Metrics that need stamps.
 _OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRICS))
-# What depends on the body's axes, and not on where the body is alone.
+# Metrics that depend on the body's axes, and not on its position alone.
 _OF_THE_BODY = (
     *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
     *("end_drift_percent", *_NEES_KEYS),
@@ -78,7 +78,7 @@ _OF_THE_BODY = (
 # Frames without stamps are taken to be so far apart where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
-# More poses than these, evenly spread, say nothing more of how a body turns.
+# So many poses, evenly spread, are enough to compare how a body turns.
 _ENOUGH_TURNS = 1000
 _NONE = "the file states no covariance"
 

@@ -35,13 +35,13 @@ from toolkit.progress import Progress
 T = TypeVar("T")
 R = TypeVar("R")
 Work = Callable[[T, Progress], R]
-# What a process keeps ready for the units for which this is equal; None where it is nothing.
+# Equal for units that use what a process keeps ready of one for the next; None where it keeps nothing.
 Needs = Callable[[T], Hashable]
 
-# A recording in memory and a smoother's graph are no leak: loky takes 300 MB for one, and begins the process anew.
+# Loky takes growth by 300 MB for a leak and begins the process anew; a recording and a smoother's graph are none.
 _ENVIRONMENT = dict.fromkeys(THREAD_VARIABLES, "1") | {"LOKY_MAX_MEMORY_LEAK_SIZE": str(4 * 2**30)}
 _PARENT_POLL_S, _POLL_S = 1.0, 0.1
-# What a terminal sends to every process of its group, and the parent alone is to meet.
+# Signals that a terminal sends to every process of its group, and that the parent alone handles.
 _OF_A_TERMINAL = (signal.SIGINT, signal.SIGHUP)
 # How far a unit has come, as its process writes it and the parent reads it.
 _ENTRY = np.dtype([("done", np.int64), ("total", np.int64), ("stages", np.int64), ("stage", "S64")])

@@ -74,7 +74,7 @@ DEFAULT_BOUNDS = Bounds(
     speed_ratio=1.3,
 )
 COVERAGE, SPEED = "coverage_percent", "speed"
-# Of all statistical tests together that are made at once.
+# The chance of any false alarm among all statistical tests of one check.
 FALSE_ALARM_RATE = 0.05
 
 

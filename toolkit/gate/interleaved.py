@@ -35,7 +35,7 @@ from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress, ProgressFor
 from toolkit.settings import changes_of
 
-# Slower by 5 % is nobody's concern; slower by 15 % must be seen.
+# Slower by 5 % is accepted; slower by 15 % must be found.
 MARGIN, TO_SEE = 0.05, 0.15
 FEWEST_PAIRS, MOST_PAIRS = 16, 60
 # Enough to be timed; a batch smoother's whole drive takes seconds.

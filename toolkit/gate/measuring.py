@@ -113,7 +113,7 @@ def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int
 def timed(unit: Unit, progress: Progress) -> TimedOutcome:
     """Run and score the estimator of a unit between two reference workloads."""
     prepared = prepared_of(unit)
-    reference_s()  # warms up what every later one finds warm
+    reference_s()  # the first one finds cold caches and is not counted
     before_s = reference_s()
     run = run_estimator(unit, prepared, progress)
     reference = (before_s + reference_s()) / 2.0
@@ -176,7 +176,7 @@ def _series(found: Several[TimedOutcome], metrics: Several[str]) -> Series:
     values: dict[Output, dict[str, Values]] = {
         output: {key: tuple(one.get(output, {}).get(key) for one in outputs) for key in metrics} for output in given
     }
-    # A metric without any value, as a NEES without a covariance, is none that could get lost.
+    # A metric without any value, as a NEES without a covariance, is not kept: no check can find it missing.
     kept = {o: {key: v for key, v in by_key.items() if any(x is not None for x in v)} for o, by_key in values.items()}
     status, speed = tuple(one.status for one in outcomes), tuple(one.speed for one in found)
     why = next((one.why for one in outcomes if one.why), "")

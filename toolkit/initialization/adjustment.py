@@ -19,9 +19,9 @@ from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, MOS
 from toolkit.models.motion import Increment, MotionModel, motion_model
 from toolkit.sequence import Sequence, StereoFrame
 
-# What the gauge is held to (rad, m), and the biases' before any measurement (m/s^2, rad/s).
+# Standard deviations: of the pose that fixes the gauge (rad, m), and of biases before any measurement (m/s^2, rad/s).
 GAUGE_SIGMA, ACCEL_BIAS_SIGMA, GYRO_BIAS_SIGMA = 1e-4, 0.05, 0.02
-# What a turn rate that nobody measured may be at first (rad/s).
+# Standard deviation of a turn rate that is not measured (rad/s).
 TURN_SIGMA = 2.0
 # The estimators read the window's measurements again: in the start they count for a ninth.
 INFLATION = 9.0

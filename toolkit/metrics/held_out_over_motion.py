@@ -20,9 +20,9 @@ from toolkit.sequence import Sequence
 
 ORDER = 61
 RATIO, ERROR = "heldout_over_motion", "heldout_over_motion_error"
-# Below a tenth of a pixel a difference is none to speak of, as where tracks have no noise.
+# Added to both errors, in squares: differences far below a tenth of a pixel, as without noise, do not count.
 _FLOOR_PX = 0.1
-# So many tracks, drawn evenly, tell the ratio to a few percent; fewer than the second tell nothing.
+# So many tracks, drawn evenly, give the ratio to a few percent; of fewer than the second it is not computed.
 _MOST_TRACKS, _FEWEST_TRACKS = 1000, 30
 # A run does harm that is worse by this factor, or by that one in the worst of ten stretches, both beyond so many
 # standard errors. Of 365 sound simulated runs the first bound is 1.03 at most beside twists and 2.0 beside an IMU,

@@ -20,13 +20,13 @@ from toolkit.models.factors import X
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import StereoFrame
 
-# As many intervals the measured twists' own scatter counts for before anything was seen of the change itself.
+# The scatter of the measured twists, a first guess of the change, counts for as many intervals of its own.
 _STATED_FOR = 10
-# A change of so many standard deviations counts for no more: where an answer was revised it is no motion.
+# Larger changes count for so many standard deviations: they are revisions of the answer, not motion.
 _MOST_SIGMAS = 3.0
 # Measured twists that change by less than so many times the mean square of what the body's does are not noisy.
 _NOISY = 2.0
-# A share of the stated noise that is rounding where twists do not change at all.
+# Share of the stated noise that is taken for rounding, where twists do not change at all.
 _ROUNDING = 1e-6
 
 

@@ -40,8 +40,8 @@ from toolkit.models.motion import MotionModel
 _MOST_ROUNDED = 0.01
 # A landmark that ties more states than this is eliminated among them and not before.
 _MOST_TIED = 50
-# A direction of a variable of which less is said than this share of what is said of the best is lost in the sixteen
-# digits of the Jacobians: a landmark's depth beyond ten thousand million baselines.
+# A direction of a variable with less than this share of the information on its best one is lost in the sixteen digits
+# of the Jacobians: a landmark's depth beyond ten thousand million baselines.
 _LEAST_TOLD = 1e-10
 # So many rows may be added to a joint covariance before it is copied, without those that are not needed any more.
 _ROOM = 100

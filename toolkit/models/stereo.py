@@ -8,7 +8,7 @@ import numpy as np
 from toolkit.geometry import Array, se3_inverse, skew, transform, transposed
 from toolkit.sequence import StereoRig
 
-# What a depth is divided by at least.
+# The least depth to divide by.
 _LEAST_DIVISIBLE_M = 1e-3
 # (uL, uR) of a disparity that is added: half of it on either side.
 _OF_A_DISPARITY = np.array([0.5, -0.5, 0.0])

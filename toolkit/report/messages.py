@@ -29,7 +29,7 @@ _TAILS = (
 # An estimator that repairs something in every frame must not bury the rest; metrics.json has its whole log.
 _LOG_ENTRIES = 4
 
-# A difference that takes more seeds than these to find is none that matters.
+# Estimators whose difference takes more seeds than these to find count as equal.
 _MOST_SEEDS = 10_000
 
 # Remarks on these stand beside the table, the others at the end of the report only.

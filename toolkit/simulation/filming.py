@@ -32,7 +32,7 @@ from toolkit.simulation.sensors import Imu
 from toolkit.simulation.surfaces import Floats, Surfaces, atlas, furnished_hall
 from toolkit.simulation.trajectory import SmoothTrajectory
 
-# Says that a folder in the layout of real recordings is none, and what was simulated.
+# The file that marks a folder in the layout of real recordings as simulated, and says what was simulated.
 ABOUT, SCHEMA = "simulation.json", "vislam.simulation/1"
 _CAMERAS = ("cam0", "cam1")
 _TRUTH = "state_groundtruth_estimate0"
@@ -54,7 +54,7 @@ _EUROC_NAMES: dict[LensModel, str] = {
     "radtan": "radial-tangential",
     "equidistant": "equidistant",
 }
-# Scatter is told as the median deviation of a normal variable's sigma, which mismatches do not move.
+# From a median absolute deviation, which mismatches do not move, to the sigma of a normal variable.
 _TO_SIGMA = 1.4826
 _MISMATCH_PX = 3.0
 

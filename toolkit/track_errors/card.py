@@ -26,9 +26,9 @@ from toolkit.track_noise import CHANNELS, TrackNoise
 LAGS = 8
 # Beyond so many robust standard deviations a residual is in the tails, and so many times the usual is a track at odds.
 _TAIL, _ODDS = 4.0, 4.0
-# Of the fewest pairs of a lag whose statistic is worth a figure.
+# A lag with fewer pairs has no statistic.
 _FEWEST_PAIRS = 30
-# With fewer common tracks an interval says nothing of the scale; a scale that is not known to this is none.
+# Intervals with fewer common tracks are not used for the scale; one with a larger error than this is not given.
 _FEWEST_COMMON, _FEWEST_INTERVALS, _SCALE_ERROR = 8, 30, 0.05
 QUANTILES = (0.1, 0.5, 0.9)
 

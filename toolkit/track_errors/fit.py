@@ -18,9 +18,9 @@ from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joine
 from toolkit.track_errors.tracklets import Tracklets, tracklets
 from toolkit.track_noise import TrackNoise
 
-# With fewer tracks of three sightings a noise of seven parameters and its choice are not to be had.
+# Fewer tracks of three sightings cannot tell a noise of seven parameters, or which kind it is.
 FEWEST_TRACKS = 100
-# Where poses take up a quarter of what tracks say, what is left tells of too few.
+# Where poses take up more than a quarter of the residuals' degrees of freedom there are too few tracks.
 LEAST_FREEDOM = 0.75
 # Rounds of poses and noise; they end earlier where a round gains less than this log-likelihood a track.
 _ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
@@ -28,7 +28,7 @@ _ROUNDS, _STEPS, _ENOUGH = 12, 2, 0.02
 _LEAST_PX = np.repeat([[0.02], [0.002], [0.01]], 3, axis=1)
 _MOST_PX = 100.0
 _DEGREES = (2.0, 200.0)
-# Walks and offsets below so many times their smallest are none.
+# Walks and offsets below so many times their smallest count as zero.
 _NONE = 2.5
 # Where the search begins, of no effect on where it ends.
 _START_PX = np.array([[0.3, 0.5, 0.3], [0.1, 0.1, 0.1], [0.5, 0.5, 0.5]])

@@ -17,8 +17,8 @@ from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import Sequence
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# Chosen by looking at recordings: told the noise that was drawn or fitted they have 0.6 to 1.1, told one that is none
-# of theirs 4.3 and 4.5.
+# Chosen by looking at recordings: they scatter 0.6 to 1.1 times as much as the noise that was drawn or fitted says, and
+# 4.3 and 4.5 times as much as one that is not theirs.
 MOST_SCATTER = 2.0
 # A median of fewer neighbouring sightings says little.
 FEWEST_PAIRS = 30

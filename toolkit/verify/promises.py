@@ -19,7 +19,7 @@ from toolkit.sequence import Packet, Sequence
 COV_SIZES = (6, 9, 12, 15)
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12
-# Of the verdict on honesty: how often a consistent estimator is called otherwise.
+# How often the test of mean NEES calls a consistent estimator inconsistent.
 _FALSE_ALARM = 1e-3
 
 

@@ -12,7 +12,7 @@ from toolkit.geometry import Array, IntArray, quaternion_from_rotation, rotation
 
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
 UNIT_TOLERANCE = 1e-2
-# The Moon is nearer. Squares of 1e200 m are no numbers any more, and a metric without a value would say nothing.
+# Farther than the Moon. Squares of 1e200 m overflow, and a metric would have no value without saying why.
 FARTHEST_M = 1e9
 TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
 # A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.

@@ -36,7 +36,7 @@ from toolkit.models.state import Belief, Layout
 from toolkit.models.state_covariances import state_covs
 from toolkit.sequence import Packet, Prior, Sequence, StereoFrame, StereoRig, is_left_only
 
-# A sighting whose residual at the truth is this improbable is a mismatch and informs nobody.
+# A sighting whose residual at the truth is this improbable is a mismatch and adds no information.
 _MISMATCH_PROBABILITY = 1e-6
 _POINT_ITERATIONS = 5
 # The motion's chi-square at an exact truth, over its degrees of freedom: 1, and 0.85 to 1.15 for 20 steps of an IMU.

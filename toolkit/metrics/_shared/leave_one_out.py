@@ -33,7 +33,7 @@ _MOST_VIEWS_SOLVED_AGAIN = 40
 # So many views are solved again at a time: what is computed of them fits a processor's cache, which halves the time.
 _VIEWS_AT_A_TIME = 10_000
 _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
-# Where the shares of a robust problem have the upper half of H, row by row, and its symmetric whole; then g and cost.
+# Rows of a robust problem's sums: the upper half of H row by row, g, and the cost. _WHOLE are the rows of all of H.
 _H, _G, _COST = slice(0, 6), slice(6, 9), 9
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _WHOLE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

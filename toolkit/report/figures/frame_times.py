@@ -44,7 +44,7 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         entries.append(Entry(told, (median,)))
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least: jitter shall not look like drama
+    widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least, so that jitter alone does not fill the axis
     axes.set_ylim(low / widened, high * widened)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-# An error over half a recording is not half an error: rows that answered less than the best by more are left out.
+# Rows that answered less than the best by more than this are left out: their errors are of a part of the recording.
 _COVERAGE_MARGIN_PERCENT = 5.0
 
 Row = dict[str, Any]
