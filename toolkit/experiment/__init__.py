@@ -2,7 +2,8 @@
 
 Reading order: recording (what is read) -> units (what is run) -> workers, cluster (where) -> outcome_store (what is
 kept of it, under a key that code_version is part of) -> references (what other systems estimated) -> pipeline ->
-comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics. configuration: all as a file.
+comparison (what comes of it, and whose stated uncertainty cannot be right) -> statistics; disagreement (which
+estimators dispute the measured motion). configuration: a comparison as a file.
 What the package offers is imported when first used: its statistics need neither estimators nor GTSAM.
 """
 

@@ -47,7 +47,7 @@ class Parted(NamedTuple):
 class Dispute:
     """Estimators that rest on the measured motion ``alone``, ``witnesses`` of it, and what disputes it.
 
-    That are rows that ``parted`` from it, and estimators whose corrections are ``leaning`` one way.
+    The ``parted`` are rows that are too far from it, the ``leaning`` estimators whose corrections lean one way.
     """
 
     alone: tuple[str, ...]

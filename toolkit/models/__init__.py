@@ -1,7 +1,12 @@
 """Measurement and motion models that filters and smoothers share, each fact once: arrays in, arrays and Jacobians out.
 
-Read ``stereo`` (the measurement, linearised), ``state`` (layout, belief, prediction), ``motion`` (what a motion model
-offers filters and graphs) with its implementations ``twist`` and ``imu``, then ``factors`` (keys, stereo factors,
-priors, marginals), ``state_covariances`` (of all states of a graph), ``gating`` (thresholds and their sources) and
-``noise`` (for files that state none).
+Read ``stereo`` (the measurement, linearised) with ``left_only`` (where the right image is missing), ``state`` (layout,
+belief, prediction), ``motion`` (what a motion model offers filters and graphs) with its implementations ``twist``,
+``imu`` and ``smooth_twist`` (nothing measured), then ``factors`` (keys, stereo factors, priors, marginals),
+``state_covariances`` (of all states of a graph), ``gating`` (thresholds and their sources) and ``noise`` (for files
+that state none).
+
+For some settings and recordings: ``correlated_noise`` (errors along tracks), ``gap_bridge`` (no common tracks),
+``moving_tracks`` (vehicles). From the tracks alone: ``camera_motion``. What judges an estimate: ``predicted_steps``
+(its steps beside the measured motion) and ``corrections`` (against what they take of the covariance).
 """
