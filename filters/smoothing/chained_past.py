@@ -3,7 +3,7 @@
 The graph has their linearisations: residuals about estimates, and Jacobians where the tree linearises the variables at
 the same time. What neither motion nor vision tells, such as how a tilt and the accelerometer's bias share an error, is
 in the null space of both only at one place; with Jacobians at the estimates, less than 0.01 rad away, a tilt was told
-to a seventh of the standard deviation it had (:class:`ChainedWindow` of fixed-lag has the same rule).
+to a seventh of the standard deviation it had (:mod:`~filters.smoothing.chained_window` of fixed-lag has the same rule).
 
 Recent states are therefore linearised anew together. A linearisation of a recent frame is replaced once what is new in
 its sighting is no longer what it says, once that weighs something else by the loss, and when the tree linearises one of

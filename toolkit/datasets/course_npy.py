@@ -1,8 +1,9 @@
 """Course recordings since 2025 (UC San Diego, ECE 276A): datasetNN.npy, a pickled dict, and datasetNN_imgs.npy.
 
 The dict has ``v_t`` and ``w_t`` (T, 3), ``timestamps`` (T,) s, ``features`` (4, M, T) of uL vL uR vR with -1 where not
-seen, ``K_l``, ``K_r``, ``extL_T_imu`` and ``extR_T_imu``. It is read, never unpickled (:mod:`io.plain_pickle`). Where
-there are no features, or images are asked for, the tracks are made of ``cam_imgs_L`` and ``cam_imgs_R``.
+seen, ``K_l``, ``K_r``, ``extL_T_imu`` and ``extR_T_imu``. It is read, never unpickled
+(:mod:`~toolkit.datasets.io.plain_pickle`). Where there are no features, or images are asked for, the tracks are made of
+``cam_imgs_L`` and ``cam_imgs_R``.
 
 The extrinsics are called IMU to camera, and files are about that hold camera to IMU, in axes x forward, y left, z up.
 A sequence has them as they are called; the audit decides (:mod:`toolkit.audit.extrinsic_convention`).
