@@ -19,7 +19,7 @@ from toolkit.cli.arguments import (
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
-    from toolkit.evaluation.standings import Evaluation
+    from toolkit.evaluation.standings import EvaluatedSystems
     from toolkit.metrics import Metric
 
 _FORMATS = ("text", "markdown", "csv", "latex")
@@ -119,7 +119,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0 if found.all_ok else 1
 
 
-def _print(found: Evaluation, columns: tuple[Metric, ...], options: argparse.Namespace) -> None:
+def _print(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argparse.Namespace) -> None:
     from toolkit.documents import to_text
     from toolkit.evaluation.document import evaluation_document
     from toolkit.report import evaluation_text as texts

@@ -19,7 +19,7 @@ import numpy as np
 from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, observations, stamps_ns
 from toolkit.datasets.io.image_pairs import facts_of, rig_of
 from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
-from toolkit.datasets.io.sparse import Layout, Named, corners_of, sightings, sparse_array
+from toolkit.datasets.io.sparse import ArrayLayout, Named, corners_of, sightings, sparse_array
 from toolkit.errors import DataError
 from toolkit.frontend import (
     Camera,
@@ -186,7 +186,7 @@ def _turned(fields: Fields) -> Iterator[str]:
 
 
 def _sightings(parts: _Parts, features: StoredArray) -> Observations:
-    layout = Layout(features.shape, features.fortran_order, features.dtype)
+    layout = ArrayLayout(features.shape, features.fortran_order, features.dtype)
     with features.opened() as stream:
         sparse = sparse_array(
             Named(parts.path, _FEATURES), layout, (4, None, parts.t_ns.size), stream, filler=_NOT_SEEN

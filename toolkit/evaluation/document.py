@@ -17,7 +17,7 @@ from toolkit.documents import Count, Value, of_attributes
 from toolkit.errors import DataError
 from toolkit.estimate import Status
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, EvaluatedRun, Evaluation, PairedTest, Standing
+from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import Values
 from toolkit.gate.trajectory_baseline import ScoredSequence
@@ -133,7 +133,7 @@ class EvaluationRecord(Struct, frozen=True, kw_only=True):
                 raise ValueError(f"runs[{i}].sequence is none of sequences")
 
 
-def evaluation_document(evaluation: Evaluation) -> EvaluationRecord:
+def evaluation_document(evaluation: EvaluatedSystems) -> EvaluationRecord:
     """Return an evaluation as a record."""
     metrics = evaluation.scored_metrics
     return EvaluationRecord(

@@ -126,7 +126,7 @@ class PairedTest:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class EvaluatedSystems:
     """Every run of every system, the truths, and by which metric systems are ranked."""
 
     truths: Mapping[str, TruthFile]
@@ -236,7 +236,7 @@ def _cost(value: float, metric: Metric) -> float:
 
 def evaluate(
     gathered: Gathered, terms: Terms, ranked_by: str = RANKED_BY, progress: Progress = SILENT, workers: int = 1
-) -> Evaluation:
+) -> EvaluatedSystems:
     """Score every run, in so many processes where they are many.
 
     Raises DataError where a truth cannot be used, or not one of the runs can. A run that cannot is failed, with the
@@ -255,7 +255,7 @@ def evaluate(
     runs = tuple(scored[item] for item in gathered.items)
     if not any(run.values for run in runs):
         raise DataError(next(run.log[0] for run in runs if run.log))
-    return Evaluation(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
+    return EvaluatedSystems(truths, terms, runs, METRIC_BY_KEY[ranked_by], gathered.notes)
 
 
 @dataclass(frozen=True)

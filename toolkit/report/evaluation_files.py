@@ -5,7 +5,7 @@ from pathlib import Path
 from toolkit.documents import to_text
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
-from toolkit.evaluation.standings import Evaluation
+from toolkit.evaluation.standings import EvaluatedSystems
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.report.evaluation_text import evaluation_csv, evaluation_markdown
 from toolkit.report.html.leaderboard import leaderboard_page
@@ -19,7 +19,7 @@ def check_evaluation_directory(target: Path) -> None:
     check_replaceable(target, _written_by_us)
 
 
-def write_evaluation(evaluation: Evaluation, target: Path) -> None:
+def write_evaluation(evaluation: EvaluatedSystems, target: Path) -> None:
     """Write the directory, in the place of an earlier one; raises OutputError where that cannot be."""
     texts = (
         to_text(evaluation_document(evaluation)),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from toolkit.evaluation.scoring import METRICS
-from toolkit.evaluation.standings import Cell, Evaluation, PairedTest
+from toolkit.evaluation.standings import Cell, EvaluatedSystems, PairedTest
 from toolkit.experiment.statistics import QuantilesOfAll
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.metrics import Metric
@@ -22,7 +22,7 @@ _USUAL = (
 _MOST_FAILURES, _MOST_REMARKS = 20, 8
 
 
-def shown_metrics(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -> tuple[Metric, ...]:
+def shown_metrics(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> tuple[Metric, ...]:
     """Return the metrics that have a column: those asked for, or the one that ranks and the usual ones with values."""
     if columns:
         return columns
@@ -30,7 +30,7 @@ def shown_metrics(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -> t
     return (evaluation.ranked_by, *usual)
 
 
-def leaderboard_table(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -> Table:
+def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> Table:
     """Return a row a system, the lowest mean rank first: how many runs ended well, and the median of each metric.
 
     Over several sequences it is the median of the sequences' medians, with rank and wins before it; on a single one
@@ -54,7 +54,7 @@ def leaderboard_table(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) 
     return Table(tuple(heads), tuple(rows), labels=1, best=best)
 
 
-def _of(evaluation: Evaluation, system: str, metric: Metric, *, several: bool) -> QuantilesOfAll | None:
+def _of(evaluation: EvaluatedSystems, system: str, metric: Metric, *, several: bool) -> QuantilesOfAll | None:
     if several:
         standing = next(one for one in evaluation.leaderboard if one.system == system)
         return standing.quantiles.get(metric.key)
@@ -62,7 +62,7 @@ def _of(evaluation: Evaluation, system: str, metric: Metric, *, several: bool) -
 
 
 def _best_rows(
-    evaluation: Evaluation, metrics: tuple[Metric, ...], before: int, *, several: bool
+    evaluation: EvaluatedSystems, metrics: tuple[Metric, ...], before: int, *, several: bool
 ) -> frozenset[tuple[int, int]]:
     """Return row and column of the best of each metric; none where there is one system only."""
     if len(evaluation.systems) < 2:
@@ -81,7 +81,7 @@ def _best(medians: list[float | None], metric: Metric) -> set[int]:
     return {i for cost, i in known if cost == least}
 
 
-def sequences_table(evaluation: Evaluation) -> Table:
+def sequences_table(evaluation: EvaluatedSystems) -> Table:
     """Return a row a sequence and a column a system: the median over the runs of the metric that ranks."""
     metric, systems = evaluation.ranked_by, [standing.system for standing in evaluation.leaderboard]
     heads = (("sequence", "", ""), *((system, "", metric.unit) for system in systems))
@@ -114,7 +114,7 @@ def _quartiles(found: QuantilesOfAll | None, metric: Metric) -> str:
     return " .. ".join(ends)
 
 
-def header_lines(evaluation: Evaluation) -> Iterator[str]:
+def header_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what is evaluated and on which terms."""
     truths = evaluation.truths
     if len(truths) == 1:
@@ -133,7 +133,7 @@ def header_lines(evaluation: Evaluation) -> Iterator[str]:
     )
 
 
-def paired_lines(evaluation: Evaluation) -> Iterator[str]:
+def paired_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield how the systems differ over the sequences, the leader against each other, and what is more than chance."""
     tests = evaluation.paired
     leader = evaluation.leaderboard[0].system
@@ -153,7 +153,7 @@ def _paired_line(test: PairedTest, pairs: int, metric: Metric) -> str:
     return f"{test.system} against {test.other}: {counts} of the sequences{ratio}; p = {test.p:.2g}{corrected}{verdict}"
 
 
-def failure_lines(evaluation: Evaluation, most: int | None = _MOST_FAILURES) -> Iterator[str]:
+def failure_lines(evaluation: EvaluatedSystems, most: int | None = _MOST_FAILURES) -> Iterator[str]:
     """Yield each run that failed, with the reason; no more than ``most``."""
     failed = [run for run in evaluation.runs if run.status != "ok"]
     shown = failed if most is None else failed[:most]
@@ -163,7 +163,7 @@ def failure_lines(evaluation: Evaluation, most: int | None = _MOST_FAILURES) -> 
         yield f"{len(failed) - len(shown)} more runs failed; evaluation.json and --format csv have all"
 
 
-def note_lines(evaluation: Evaluation) -> Iterator[str]:
+def note_lines(evaluation: EvaluatedSystems) -> Iterator[str]:
     """Yield what a reader must know: what was left out, why values are missing, remarks on values, each once."""
     yield from evaluation.notes
     scored = {metric.key for metric in evaluation.scored_metrics}
@@ -187,7 +187,7 @@ class _About(NamedTuple):
     whose: dict[str, None]
 
 
-def evaluation_text(evaluation: Evaluation, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
+def evaluation_text(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = (), width: Width = WIDTH) -> str:
     """Return an evaluation as plain text: the leaderboard, the sequences, the tests, what failed and what to know."""
     lines = [filled(line, width) for line in header_lines(evaluation)]
     lines += ["", as_text(leaderboard_table(evaluation, columns)), ""]
@@ -199,7 +199,7 @@ def evaluation_text(evaluation: Evaluation, columns: tuple[Metric, ...] = (), wi
     return "\n".join(lines).rstrip()
 
 
-def evaluation_markdown(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -> str:
+def evaluation_markdown(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
     """Return the same as Markdown, the best of each column in bold."""
     parts = ["## Leaderboard", *(f"{in_markdown(line)}." for line in header_lines(evaluation))]
     parts.append(as_markdown(leaderboard_table(evaluation, columns)))
@@ -211,7 +211,7 @@ def evaluation_markdown(evaluation: Evaluation, columns: tuple[Metric, ...] = ()
     return "\n\n".join(parts) + "\n"
 
 
-def evaluation_latex(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -> str:
+def evaluation_latex(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] = ()) -> str:
     """Return the tables for a paper, after a comment that says on which terms; the package booktabs is needed."""
     parts = ["\n".join(f"% {line}" for line in (*header_lines(evaluation), *paired_lines(evaluation)))]
     parts.append(as_latex(leaderboard_table(evaluation, columns)))
@@ -220,7 +220,7 @@ def evaluation_latex(evaluation: Evaluation, columns: tuple[Metric, ...] = ()) -
     return "\n\n".join(parts) + "\n"
 
 
-def evaluation_csv(evaluation: Evaluation) -> str:
+def evaluation_csv(evaluation: EvaluatedSystems) -> str:
     """Return a line a run, failed ones too, with every metric; the last column says why a run failed."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.datasets.io.fields import Fields
-from toolkit.datasets.io.sparse import Layout, Named, SparseArray, sparse_array
+from toolkit.datasets.io.sparse import ArrayLayout, Named, SparseArray, sparse_array
 from toolkit.errors import DataError
 from toolkit.inputs import is_regular, open_input
 
@@ -64,17 +64,17 @@ class NpzArchive:
                 raise DataError(f"{self.path}: {key} cannot be read: {why}; save it as plain numbers") from error
         return array
 
-    def _header(self, key: str, stream: IO[bytes]) -> Layout:
+    def _header(self, key: str, stream: IO[bytes]) -> ArrayLayout:
         try:
             version = np.lib.format.read_magic(stream)
             # Version 3 differs from 2 in the encoding of field names only, and plain numbers have none.
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            header = Layout(*read(stream))
+            header = ArrayLayout(*read(stream))
         except (ValueError, TypeError, SyntaxError, OverflowError) as error:
             raise DataError(f"{self.path}: {key} has no valid .npy header: {_first_line(error)}") from error
         return header
 
-    def _check_size(self, key: str, header: Layout) -> None:
+    def _check_size(self, key: str, header: ArrayLayout) -> None:
         """Raise DataError where a header asks for more memory than its array fills, or than is sensible."""
         size = math.prod(header.shape) * header.dtype.itemsize
         stored = self.archive.getinfo(f"{key}.npy").file_size

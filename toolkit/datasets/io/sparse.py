@@ -23,7 +23,7 @@ class Named(NamedTuple):
     key: str
 
 
-class Layout(NamedTuple):
+class ArrayLayout(NamedTuple):
     """What must be known of an array to read its bytes."""
 
     shape: tuple[int, ...]
@@ -40,7 +40,7 @@ class SparseArray(NamedTuple):
 
 
 def sparse_array(
-    named: Named, layout: Layout, shape: tuple[int | None, ...], stream: IO[bytes], filler: float
+    named: Named, layout: ArrayLayout, shape: tuple[int | None, ...], stream: IO[bytes], filler: float
 ) -> SparseArray:
     """Read an array of a shape (None = any) from a stream, in either memory order; keep what is not the filler.
 

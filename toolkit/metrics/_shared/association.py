@@ -63,7 +63,7 @@ def associate(estimate: Trajectory, truth: Truth, frame_period_ns: float) -> Mat
     return Matched(truth_t_ns[scored], truth_poses[scored], estimates, path_m[scored])
 
 
-def truth_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple[BoolArray, Array]:
+def true_poses_at(t_ns: IntArray, truth: Truth, frame_period_ns: float) -> tuple[BoolArray, Array]:
     """Return which of the stamps (N,) the truth reaches, and the true poses (n, 4, 4) there, by the rule above.
 
     The same rule with the roles exchanged: here the truth is interpolated, for what is stated about an estimate

@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
 from toolkit.metrics._shared.alignment import place_pose, place_yaw
-from toolkit.metrics._shared.association import finite_poses, median_period_ns, truth_at
+from toolkit.metrics._shared.association import finite_poses, median_period_ns, true_poses_at
 from toolkit.metrics._shared.evaluation import Evaluation
 from toolkit.metrics._shared.scores import Unavailable
 from toolkit.models.gating import mahalanobis_squared
@@ -171,7 +171,7 @@ def body_errors(evaluation: Evaluation) -> BodyErrors:
         raise Unavailable("the sequence has no ground truth")
     usable = np.flatnonzero(finite_poses(estimate.T_world_imu))
     frame_period_ns = median_period_ns(evaluation.sequence.frames_t_ns)
-    reached, true_poses = truth_at(estimate.t_ns[usable], truth, frame_period_ns)
+    reached, true_poses = true_poses_at(estimate.t_ns[usable], truth, frame_period_ns)
     rows = usable[reached]
     if not rows.size:
         raise Unavailable(NOT_MET)
@@ -189,7 +189,7 @@ def starts_in_the_truths_world(sequence: Sequence) -> bool:
     truth, prior = sequence.truth, sequence.prior
     if truth is None or prior is None:
         return False
-    reached, true_poses = truth_at(sequence.frames_t_ns[:1], truth, median_period_ns(sequence.frames_t_ns))
+    reached, true_poses = true_poses_at(sequence.frames_t_ns[:1], truth, median_period_ns(sequence.frames_t_ns))
     if not reached.any():
         return False
     error = se3_log(se3_inverse(prior.T_world_imu) @ true_poses[0])

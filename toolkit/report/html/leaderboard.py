@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from importlib.resources import files
 
 from toolkit.errors import printable
-from toolkit.evaluation.standings import EvaluatedRun, Evaluation
+from toolkit.evaluation.standings import EvaluatedRun, EvaluatedSystems
 from toolkit.report.evaluation_text import (
     failure_lines,
     header_lines,
@@ -57,7 +57,7 @@ _PAGE = """<!doctype html>
 """
 
 
-def leaderboard_page(evaluation: Evaluation) -> str:
+def leaderboard_page(evaluation: EvaluatedSystems) -> str:
     """Return the page: leaderboard, a table by sequence, every run as a dot, tests, failures and notes."""
     title = f"{' / '.join(evaluation.systems)} on {', '.join(evaluation.sequences[:3])}"
     if len(evaluation.sequences) > 3:
@@ -118,7 +118,7 @@ def _text(text: str) -> str:
     return html.escape(printable(text))
 
 
-def _figure(evaluation: Evaluation) -> str:
+def _figure(evaluation: EvaluatedSystems) -> str:
     """Return every run as a dot, a row a sequence and system, on a logarithmic scale; a cross is one that failed."""
     rows = [(sequence, system) for sequence in evaluation.sequences for system in evaluation.systems]
     values = [v for run in evaluation.runs if run.status == "ok" and (v := _value(run, evaluation)) is not None]
@@ -158,7 +158,7 @@ def _figure(evaluation: Evaluation) -> str:
     return f'<figure>{keys}{drawing}<figcaption class="fine">{_text(label)}</figcaption></figure>'
 
 
-def _value(run: EvaluatedRun, evaluation: Evaluation) -> float | None:
+def _value(run: EvaluatedRun, evaluation: EvaluatedSystems) -> float | None:
     value = run.values.get(evaluation.ranked_by.key)
     return value if value is not None and value > 0.0 else None
 
