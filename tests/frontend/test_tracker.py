@@ -12,7 +12,7 @@ import pytest
 from toolkit.errors import DataError
 from toolkit.frontend import StampedPair, motion, track_images
 from toolkit.frontend.corners import corners, count_in_cells
-from toolkit.frontend.tracker import Sightings, Tracker
+from toolkit.frontend.tracker import TrackedCorners, Tracker
 from toolkit.geometry import Array
 from toolkit.settings import DEFAULTS, Frontend
 
@@ -21,14 +21,14 @@ WALL_M, BOARD_M = 3.0, 1.6
 FRAMES = 10
 
 
-def tracked(filmed: Filmed, settings: Frontend = DEFAULTS.frontend) -> list[Sightings]:
+def tracked(filmed: Filmed, settings: Frontend = DEFAULTS.frontend) -> list[TrackedCorners]:
     tracker = Tracker(filmed.rig, settings)
     found = [tracker.step(left, right) for left, right in filmed.images]
     assert all(one is not None for one in found)
     return [one for one in found if one is not None]
 
 
-def off_px(filmed: Filmed, seen: Sightings, k: int) -> Array:
+def off_px(filmed: Filmed, seen: TrackedCorners, k: int) -> Array:
     """Return by how much disparities are off those of the wall or the board, whichever is nearer."""
     depth = filmed.depths_m(seen.corners_px, k)
     off_m = np.minimum(np.abs(depth - WALL_M), np.abs(depth - BOARD_M))
@@ -187,7 +187,7 @@ def with_intruder(filmed: Filmed, step_px: tuple[float, float] = (0.0, 5.0), fra
     return replace(filmed, images=images)
 
 
-def followed_on_it(found: list[Sightings]) -> int:
+def followed_on_it(found: list[TrackedCorners]) -> int:
     """Return how many tracks of the moving patch live for three frames or more."""
     inside: dict[int, int] = {}
     for k, seen in enumerate(found):
@@ -226,7 +226,7 @@ def test_a_patch_that_is_no_longer_what_it_was_ends_its_track(papered: Filmed) -
     strict = tracked(papered)
     loose = tracked(papered, msgspec.structs.replace(DEFAULTS.frontend, patch_correlation=0.01, patch_px=20.0))
 
-    def survivors(found: list[Sightings]) -> int:
+    def survivors(found: list[TrackedCorners]) -> int:
         return int(np.isin(found[0].track_ids, found[-1].track_ids).sum())
 
     assert survivors(strict) < 0.6 * survivors(loose)

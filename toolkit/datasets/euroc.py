@@ -48,7 +48,7 @@ from toolkit.sequence import Observations, Provenance, Sequence, StereoRig
 from toolkit.settings import Frontend, Tracks
 from toolkit.simulation import sensors, world
 from toolkit.simulation.filming import is_simulated, with_scene_errors
-from toolkit.simulation.world import Camera
+from toolkit.simulation.world import CameraLimits
 
 CITES = ("burri2016euroc",)
 REAL = "real IMU, stereo tracks from the images"
@@ -164,7 +164,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
     truth = truth_at(choice.truth, frames_t_ns)
-    camera = Camera(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
+    camera = CameraLimits(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
     return Sequence(
         name=f"{layout.root.name} (simulated stereo)",
         rig=calibration.rig,
@@ -282,7 +282,7 @@ class _RoomTracks:
     points: Array
 
 
-def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: Camera, seed: int) -> _RoomTracks:
+def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, seed: int) -> _RoomTracks:
     """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance.
 
     The room belongs to the trajectory; the seed draws the chance ends of tracks, what is followed, and the

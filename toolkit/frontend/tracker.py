@@ -28,7 +28,7 @@ _LEVELS_RIGHT = 1
 _LEAST_DISPARITY_PX = 0.5
 
 
-class Sightings(NamedTuple):
+class TrackedCorners(NamedTuple):
     """The tracks of one pair: ids (N,) and corners (N, 4) px: uL, vL, uR, vR."""
 
     track_ids: IntArray
@@ -98,7 +98,7 @@ class Tracker:
         self._seen = self.rig.seen(0), self.rig.seen(1)
         self._grid = grid_of(self.rig.size_px, asked.max_tracks)
 
-    def step(self, left: Image, right: Image) -> Sightings | None:
+    def step(self, left: Image, right: Image) -> TrackedCorners | None:
         """Follow the tracks into the next pair and begin new ones.
 
         Return None, and stay at the pair before, where the right image is not of the same instant as the left one.
@@ -118,7 +118,7 @@ class Tracker:
         self._tracks, self._before = tracks, left
         seen = tracks.ids[tracks.sound], tracks.left_px[tracks.sound], tracks.right_px[tracks.sound]
         self._rigidity = self._rigidity.after(*seen[1:], seen[0])
-        return Sightings(seen[0], np.hstack(seen[1:]))
+        return TrackedCorners(seen[0], np.hstack(seen[1:]))
 
     def _followed(self, left: Image, floats: Floats) -> tuple[_Tracks, StereoMotion]:
         """Return the tracks that are found in the left image, still paired as before, and how the camera moved."""

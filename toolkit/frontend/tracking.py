@@ -14,7 +14,7 @@ from toolkit.errors import DataError
 from toolkit.frontend import cache
 from toolkit.frontend.cameras import Image, RectifiedPair
 from toolkit.frontend.images import StampedPair, Unusable, bit_depth, read_ahead, read_image
-from toolkit.frontend.tracker import Sightings, Tracker
+from toolkit.frontend.tracker import TrackedCorners, Tracker
 from toolkit.geometry import Array, IntArray
 from toolkit.progress import SILENT, Progress
 from toolkit.settings import Frontend
@@ -113,7 +113,7 @@ def _tracked(
     pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int, progress: Progress
 ) -> ImageTracks:
     tracker, skipped = Tracker(rig, settings), list[Unusable]()
-    seen: list[tuple[int, Sightings]] = []
+    seen: list[tuple[int, TrackedCorners]] = []
     stalled = 0
     for i, images in enumerate(_without_repeats(read_ahead(pairs, lambda pair: read_pair(pair, rig, bits)), pairs)):
         stalled += isinstance(images, Unusable) and images.reason == _REPEATED

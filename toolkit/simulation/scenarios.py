@@ -25,7 +25,7 @@ from toolkit.simulation import sensors, world
 from toolkit.simulation.scenes import Scene, SceneOf, hall, road
 from toolkit.simulation.sensors import Imu, ImuStamps, MotionMeasurements, Odometer
 from toolkit.simulation.trajectory import Kinematics, SmoothTrajectory
-from toolkit.simulation.world import Camera
+from toolkit.simulation.world import CameraLimits
 from toolkit.track_noise import TrackNoise
 
 START_NS = 1_600_000_000 * NS_PER_S
@@ -53,7 +53,7 @@ class Scenario:
     name: str
     scene: SceneOf
     rig: StereoRig
-    camera: Camera
+    camera: CameraLimits
     motion: Odometer | Imu
     duration_s: float = 60.0
     noise_scale: float = 1.0
@@ -131,12 +131,12 @@ def _view(scenario: Scenario, world_rng: np.random.Generator) -> _View:
 
 
 @lru_cache(maxsize=2)
-def _viewed_once(scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: Camera) -> _View:
+def _viewed_once(scene_of: SceneOf, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
     """Return what all seeds of a scenario share: it takes longer than what each of them draws."""
     return _viewed(scene_of(duration_s), duration_s, rig, camera)
 
 
-def _viewed(scene: Scene, duration_s: float, rig: StereoRig, camera: Camera) -> _View:
+def _viewed(scene: Scene, duration_s: float, rig: StereoRig, camera: CameraLimits) -> _View:
     frames_t_ns = sensors.stamps_ns(START_NS, camera.rate_hz, duration_s)
     motion = scene.trajectory.at((frames_t_ns - START_NS) / NS_PER_S)
     return _View(scene, frames_t_ns, motion, world.visibility(scene.points, motion.T_world_imu, rig, camera))
@@ -255,7 +255,7 @@ DRIVE = Scenario(
     name="drive",
     scene=road,
     rig=_drive_rig(),
-    camera=Camera(rate_hz=10.0, size_px=(1241, 376), depth_m=(3.0, 40.0), max_tracks=100, loss_per_frame=0.05),
+    camera=CameraLimits(rate_hz=10.0, size_px=(1241, 376), depth_m=(3.0, 40.0), max_tracks=100, loss_per_frame=0.05),
     motion=_WHEEL_ODOMETER,
     audited_s=30.0,
 )
@@ -265,7 +265,7 @@ FLIGHT = Scenario(
     name="flight",
     scene=hall,
     rig=_flight_rig(),
-    camera=Camera(rate_hz=20.0, size_px=(752, 480), depth_m=(0.8, 7.0), max_tracks=100, loss_per_frame=0.02),
+    camera=CameraLimits(rate_hz=20.0, size_px=(752, 480), depth_m=(0.8, 7.0), max_tracks=100, loss_per_frame=0.02),
     motion=_EUROC_IMU,
     has_surfaces=True,
     audited_s=40.0,

@@ -14,7 +14,7 @@ from toolkit.models.stereo import project
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, StereoRig
 from toolkit.simulation.trajectory import SmoothTrajectory
-from toolkit.simulation.world import Camera, Tracks
+from toolkit.simulation.world import CameraLimits, Tracks
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 
@@ -105,7 +105,7 @@ def with_track_noise(clean: Observations, noise: TrackNoise, rng: np.random.Gene
     return Observations(clean.frame, clean.track_id, uv_px)
 
 
-def with_outliers(clean: Observations, camera: Camera, rng: np.random.Generator) -> Observations:
+def with_outliers(clean: Observations, camera: CameraLimits, rng: np.random.Generator) -> Observations:
     """Displace a share of the sightings, both images alike, as a tracker that has slipped to another corner.
 
     The displacement points towards the middle of the image, so that the sighting stays inside it.

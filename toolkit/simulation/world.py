@@ -13,7 +13,7 @@ _POSES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraLimits:
     """The limits of a stereo pair and of its tracker.
 
     A landmark is seen where its true projection lies ``border_px`` or more inside both images and its depth
@@ -73,7 +73,7 @@ def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
     return np.asarray(squared.min(axis=1) < radius_m**2)
 
 
-def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: Camera) -> BoolArray:
+def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
     """Say for each of K poses (K, 4, 4) and M landmarks (M, 3) whether the pair sees it, (K, M)."""
     T_cam_world = se3_inverse(T_world_imu @ rig.T_imu_cam)
     seen = np.empty((len(T_world_imu), len(points)), dtype=bool)
@@ -84,7 +84,7 @@ def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: Camera
     return seen
 
 
-def _in_view(points_cam: Array, rig: StereoRig, camera: Camera) -> BoolArray:
+def _in_view(points_cam: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:
     depth = points_cam[..., 2]
     in_depth = (depth >= camera.depth_m[0]) & (depth <= camera.depth_m[1])
     result = np.zeros(depth.shape, dtype=bool)
@@ -104,7 +104,7 @@ class Tracks:
     landmark: IntArray
 
 
-def follow(seen: BoolArray, camera: Camera, rng: np.random.Generator) -> Tracks:
+def follow(seen: BoolArray, camera: CameraLimits, rng: np.random.Generator) -> Tracks:
     """Follow landmarks through frames as a KLT tracker does, given what is visible (K, M).
 
     A track ends where its landmark leaves the view or by chance; free places are filled at random from the
