@@ -51,7 +51,7 @@ def silent(_label: str) -> Iterator[Progress]:
 
 
 def on_stream(stream: TextIO) -> ProgressFor:
-    """Return what shows progress on a stream: one line that redraws itself on a terminal, else a line now and then."""
+    """Return a display of progress on a stream: one line, drawn anew, on a terminal, else a line now and then."""
 
     @contextmanager
     def shown(named: str) -> Iterator[Progress]:
@@ -120,7 +120,7 @@ class _Log:
 
 
 def of_this_process() -> ProgressFor:
-    """Return what shows progress on standard error."""
+    """Return a display of progress on standard error."""
     return on_stream(sys.stderr)
 
 

@@ -70,7 +70,7 @@ def share_windowed(noise: MotionNoise, compilation: Compilation) -> None:
 
 
 def track_test(compilation: Compilation) -> TrackTest:
-    """Return what tests tracks against a window: :func:`filters.kalman.track_gate.tested`."""
+    """Return the function that tests tracks against a window: :func:`filters.kalman.track_gate.tested`."""
     kernel = _kernel(compilation, "track_gate")
     if kernel is None:
         return track_gate.tested
@@ -96,7 +96,7 @@ def track_test(compilation: Compilation) -> TrackTest:
 
 
 def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
-    """Return what finds the landmarks of tracks in view and says what they tell: those of ``tracks_in_view``."""
+    """Return the two functions of ``tracks_in_view``, which find landmarks of tracks in view and say what they tell."""
     kernel = _kernel(compilation, "tracks_in_view")
     if kernel is None:
         return tracks_in_view.NUMPY
@@ -139,7 +139,7 @@ Learn = Callable[[ResidualCorrelation, TrackSightings, Array, Array, StereoRig],
 
 
 def learning(compilation: Compilation) -> Learn:
-    """Return what has a correlation learn of tracks: :meth:`ResidualCorrelation.learn`."""
+    """Return the function by which a correlation learns of tracks: :meth:`ResidualCorrelation.learn`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return lambda correlation, sightings, points, poses, rig: correlation.learn(sightings, points, poses)
@@ -160,7 +160,7 @@ def learning(compilation: Compilation) -> Learn:
 
 
 def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
-    """Return what makes motions (N, 4, 4) of twists (N, 6): :func:`toolkit.geometry.se3_exp`."""
+    """Return the function that makes motions (N, 4, 4) of twists (N, 6): :func:`toolkit.geometry.se3_exp`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return se3_exp
@@ -168,7 +168,7 @@ def exponentials(compilation: Compilation) -> Callable[[Array], Array]:
 
 
 def images(compilation: Compilation) -> multiview.Images:
-    """Return what predicts images: :data:`filters.kalman.multiview.NUMPY`."""
+    """Return the functions that predict images: :data:`filters.kalman.multiview.NUMPY`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return multiview.NUMPY
@@ -188,7 +188,7 @@ def images(compilation: Compilation) -> multiview.Images:
 
 
 def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], CorrectionTest]:
-    """Return what tests what measurements made of a belief: :func:`toolkit.models.corrections.correction_test`."""
+    """Return the function that tests a correction of a belief: :func:`toolkit.models.corrections.correction_test`."""
     kernel = _kernel(compilation, "corrections")
     if kernel is None:
         return corrections.correction_test
@@ -204,7 +204,7 @@ def correction_test(compilation: Compilation) -> Callable[[Belief, Belief], Corr
 
 
 def integrator(noise: MotionNoise, gravity_world: Array, compilation: Compilation) -> Integrator:
-    """Return what integrates motion of some noise under gravity (3,) m/s^2, as a motion model does."""
+    """Return an integrator of motion of some noise under gravity (3,) m/s^2: a motion model, or the same compiled."""
     model = motion_model(noise, gravity_world)
     kernel = _kernel(compilation, "preintegration") if isinstance(noise, ImuNoise) else None
     if kernel is None:
@@ -303,7 +303,7 @@ def _predicted_by(model: MotionModel) -> Callable[[Belief, Motion], Belief]:
 
 
 def _predicted_along_twists(noise: MotionNoise, kernel: ModuleType) -> Callable[[Belief, Motion], Belief]:
-    """Return what carries the belief of pose and gyro bias over twists of some noise."""
+    """Return the function that carries the belief of pose and gyro bias over twists of some noise."""
     assert isinstance(noise, TwistNoise)
     densities = np.concatenate([noise.gyro_noise_density, noise.velocity_noise_density, noise.gyro_random_walk]) ** 2
 

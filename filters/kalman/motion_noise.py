@@ -47,7 +47,7 @@ class MatchedNoise:
 
     @classmethod
     def of(cls, setup: Setup, test: Test = correction_test) -> Self:
-        """Return that of an estimator; twists, whose noise is measured from their own scatter, are believed."""
+        """Return the matched noise of an estimator; twists, whose noise is measured from their own scatter, keep it."""
         kind, settings = setup.motion_kind, setup.settings
         return cls(settings.window.seconds(kind), settings.noise.match_imu and kind == "imu", test)
 
@@ -58,12 +58,12 @@ class MatchedNoise:
 
     @property
     def info(self) -> dict[str, float]:
-        """Return that of the packet that it was last applied to, by the name an Estimate's info has."""
+        """Return the scale of the latest packet's motion, by the name an Estimate's info has."""
         return {"motion_noise_scale": self._applied}
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Return what a user should know, a line, where the stated noise did not hold."""
+        """Return a line for the log where the stated noise did not hold, else nothing."""
         most, usual = np.sqrt([max(self._scales), np.median(self._scales)])
         if most < _LEAST_TOLD:
             return ()

@@ -49,7 +49,7 @@ class TrackSightings(NamedTuple):
         return TrackSightings(self.track_ids[rows], self.uvs_px[rows], self.seen[rows], self.ages[rows])
 
     def joined(self, other: "TrackSightings") -> "TrackSightings":
-        """Return both together."""
+        """Return the tracks of both in one."""
         track_ids, uvs_px = (
             np.concatenate([self.track_ids, other.track_ids]),
             np.concatenate([self.uvs_px, other.uvs_px]),
@@ -81,7 +81,7 @@ class Linearised(NamedTuple):
     decorrelation: Array | None = None
 
     def select(self, rows: BoolArray | IntArray) -> "Linearised":
-        """Return those of the tracks of a mask (F,) or of some rows."""
+        """Return what belongs to the tracks of a mask (F,) or of some rows."""
         mixing = None if self.decorrelation is None else self.decorrelation[rows]
         residuals, H_pose, H_point, depth_m = (array[rows] for array in self._arrays())
         return Linearised(residuals, H_pose, H_point, depth_m, mixing)
@@ -94,7 +94,7 @@ class Linearised(NamedTuple):
         )
 
     def joined(self, other: "Linearised") -> "Linearised":
-        """Return both together."""
+        """Return the tracks of both in one."""
         pairs = zip(self._arrays(), other._arrays(), strict=True)
         residuals, H_pose, H_point, depth_m = (np.concatenate(pair) for pair in pairs)
         mixings = [mixing for mixing in (self.decorrelation, other.decorrelation) if mixing is not None]
@@ -171,7 +171,7 @@ class Constraints(NamedTuple):
     dof: IntArray
 
     def select(self, rows: BoolArray | IntArray) -> "Constraints":
-        """Return those of the tracks of a mask (F,) or of some rows."""
+        """Return what belongs to the tracks of a mask (F,) or of some rows."""
         return Constraints(self.residuals[rows], self.H[rows], self.dof[rows])
 
     def scaled(self, factors: Array) -> "Constraints":
@@ -179,7 +179,7 @@ class Constraints(NamedTuple):
         return Constraints(factors[:, None] * self.residuals, factors[:, None, None] * self.H, self.dof)
 
     def joined(self, other: "Constraints") -> "Constraints":
-        """Return both together."""
+        """Return the constraints of both in one."""
         residuals, H = np.concatenate([self.residuals, other.residuals]), np.concatenate([self.H, other.H])
         return Constraints(residuals, H, np.concatenate([self.dof, other.dof]))
 

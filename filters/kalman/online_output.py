@@ -18,7 +18,7 @@ class Filter(Protocol):
         """Return every landmark the filter ever had, as last known."""
 
     def log(self) -> tuple[str, ...]:
-        """Return what a user should know of the run, in lines."""
+        """Return the lines that a user should read of the run."""
         return ()
 
 
@@ -50,5 +50,5 @@ class LandmarkMemory:
         self.points.update(zip(track_ids.tolist(), points, strict=True))
 
     def landmarks(self) -> Landmarks:
-        """Return them all."""
+        """Return every landmark, as last known."""
         return Landmarks.of(self.points)

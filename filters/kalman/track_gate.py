@@ -31,7 +31,7 @@ class Window(NamedTuple):
 
     @classmethod
     def of(cls, joint: JointBelief, at: Linearisation) -> "Window":
-        """Return that of a joint belief, linearised as chosen."""
+        """Return the window of a joint belief, linearised as chosen."""
         columns = joint.clone_columns
         return cls(joint.clones, at.clones(joint), joint.cov[columns, columns])
 
@@ -71,7 +71,7 @@ class AcceptedTracks(NamedTuple):
     residuals: Array
 
     def joined(self, other: "AcceptedTracks") -> "AcceptedTracks":
-        """Return both together."""
+        """Return the tracks of both in one."""
         pairs = zip(self[1:], other[1:], strict=True)
         return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
 

@@ -80,7 +80,7 @@ class RootedWindow(NamedTuple):
 
     @classmethod
     def of(cls, window: Window) -> "RootedWindow":
-        """Return that of a window's covariance."""
+        """Return a window with the root of its covariance."""
         return cls(window.poses, window.poses_at, regular_root(window.cov))
 
 
@@ -189,7 +189,7 @@ class _Rows(NamedTuple):
     depth_m: Array
 
     def select(self, tracks: BoolArray) -> "_Rows":
-        """Return those of some tracks (F,)."""
+        """Return the rows of the tracks of a mask (F,)."""
         return _Rows(self.residuals[tracks], self.H_point[tracks], self.H_pose[tracks], self.depth_m[tracks])
 
     def scaled(self, factors: Array) -> "_Rows":
@@ -239,7 +239,7 @@ class _Normals(NamedTuple):
 
     @classmethod
     def of(cls, rows: _Rows) -> "_Normals":
-        """Return those of rows."""
+        """Return the normal equations of some rows."""
         H_transposed = np.swapaxes(rows.H_point, 2, 3)
         right = (H_transposed @ rows.residuals[..., None])[..., 0]
         return cls(rows, H_transposed @ rows.H_point, right, H_transposed @ rows.H_pose)

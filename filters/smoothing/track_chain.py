@@ -112,7 +112,7 @@ class SightingRows:
         return [*map(X, np.unique(self.pose).tolist()), *map(L, np.unique(self.track_id).tolist())]
 
     def chained(self, noise: TrackNoise) -> ChainedSightings:
-        """Return all of them as one chain a track; what is new counts where it is known what came before."""
+        """Return all sightings as one chain a track; what is new counts where it is known what came before."""
         ids, point = np.unique(self.track_id, return_inverse=True)
         chain = Chain.of(noise, point.astype(np.int64), self.age, is_left_only(self.uv_px))
         counted = self.begins | (chain.before >= 0)
@@ -174,13 +174,13 @@ class ChainedFactors:
         return cls(sightings, rig, Huber(huber), FREEDOM_OF_TRACKS)
 
     def in_front(self, values: gtsam.Values) -> "ChainedFactors":
-        """Return them without sightings of landmarks behind the camera, or behind that of the sighting before."""
+        """Return the chains without sightings of landmarks behind the camera, or behind that of the sighting before."""
         seen, in_front = self.sightings, self.predicted(values).depth_m > 0.0
         in_front &= in_front[seen.chain.before] | (seen.chain.before < 0)
         return replace(self, sightings=replace(seen, counted=seen.counted & in_front))
 
     def held(self, values: gtsam.Values) -> "ChainedFactors":
-        """Return them as least squares: every innovation for good with the weight it has at the values."""
+        """Return the chains as least squares: each innovation keeps the weight that it has at the values."""
         seen = self.sightings
         sigma_px = seen.chain.sigma_px / np.sqrt(self.weights(self.innovations(values)))[:, None]
         return ChainedFactors(replace(seen, chain=replace(seen.chain, sigma_px=sigma_px)), self.rig, Squares())

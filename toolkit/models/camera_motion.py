@@ -90,7 +90,7 @@ class _TwoViews(NamedTuple):
     first: IntArray
 
     def over(self, intervals: slice) -> "_TwoViews":
-        """Return those of some intervals, counted from the first of them."""
+        """Return the views of some intervals, counted from the first of them."""
         first = self.first[intervals.start : intervals.stop + 1]
         pairs = slice(first[0], first[-1])
         pixels = (self.uv_before_px[:, pairs], self.uv_after_px[:, pairs])

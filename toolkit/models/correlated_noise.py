@@ -35,9 +35,9 @@ def walked_variance(noise: TrackNoise, ages: IntArray) -> Array:
 def decorrelation(
     noise: TrackNoise, rig: StereoRig, ages: IntArray, seen: BoolArray, left_only: BoolArray | None = None
 ) -> Array:
-    """Return what makes the residuals of F tracks independent, (F, 3 W, 3 W), of sightings (F, W) of given ages.
+    """Return matrices (F, 3 W, 3 W) that make residuals of F tracks independent, of sightings (F, W) of given ages.
 
-    It applies to residuals that are whitened as if each sighting stood for itself (``StereoRig.whitener``), stacked
+    They apply to residuals that are whitened as if each sighting stood for itself (``StereoRig.whitener``), stacked
     by sighting, and to their Jacobians. Rows of what was not seen mix with no others, nor does uR of what is
     ``left_only`` (F, W), in which no channel but v is measured: there C is that of uL, uR and v together.
     """

@@ -210,7 +210,7 @@ class ImuModel:
         return Estimate(t_ns, pose.matrix(), v_world=velocity, bias=bias.vector())
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what holds state k at a belief."""
+        """Return the factors that hold state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)

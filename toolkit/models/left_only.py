@@ -56,15 +56,15 @@ def noise_px2(uvs_px: Array, rig: StereoRig) -> Array:
 
 
 def whitener(uvs_px: Array, rig: StereoRig) -> Array:
-    """Return what whitens residuals and Jacobians of sightings, (3, 3) or (..., 3, 3), and makes a missing row zero.
+    """Return the matrices, (3, 3) or (..., 3, 3), that whiten residuals and Jacobians and make a missing row zero.
 
-    It does not make a row zero that is NaN: residuals are those of :func:`residuals_px`.
+    They do not make a row zero that is NaN: residuals are those of :func:`residuals_px`.
     """
     return _each(uvs_px, rig.whitener, left_whitener, rig)
 
 
 def left_whitener(rig: StereoRig) -> Array:
-    """Return what whitens a sighting that lacks the right image (3, 3), the row and column of uR zero."""
+    """Return the matrix (3, 3) that whitens a sighting without the right image, the row and column of uR zero."""
     result = np.zeros((3, 3))
     result[_SEEN] = np.linalg.inv(np.linalg.cholesky(left_noise_px2(rig)[_SEEN]))
     return result

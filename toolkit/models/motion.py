@@ -37,7 +37,7 @@ class Increment(Protocol):
         """
 
     def factors(self, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what ties state k - 1 to state k in a graph."""
+        """Return the factors between states k - 1 and k in a graph."""
 
 
 class MotionModel(Protocol):
@@ -70,7 +70,7 @@ class MotionModel(Protocol):
         """Return state k, without a covariance."""
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what holds state k at a belief: one linear factor on all its variables."""
+        """Return the factors that hold state k at a belief: one linear factor on all its variables."""
 
     def estimate_cov(self, cov: Array, R_world_imu: Array) -> Array:
         """Return the covariance (d, d) of a state's variables in GTSAM's tangent spaces as that of an Estimate.

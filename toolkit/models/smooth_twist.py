@@ -175,7 +175,7 @@ class SmoothTwist:
         return Estimate(t_ns, values.atPose3(X(k)).matrix(), v_world=values.atVector(V(k)), bias=bias)
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what holds state k at a belief."""
+        """Return the factors that hold state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(V(k), belief.v_world)

@@ -264,7 +264,7 @@ class _Joint:
         return np.asarray(self._matrix[np.ix_(rows, rows)])
 
     def only(self, keys: Sequence[int], room: int) -> "_Joint":
-        """Return that of some of the variables, with room for so many rows beside them."""
+        """Return the covariance of some of the variables, with room for so many rows beside them."""
         return _Joint(_rows({key: len(self._rows[key]) for key in keys}), self.of(keys), room)
 
     def has_room(self, clique: _Clique) -> bool:

@@ -206,7 +206,7 @@ class TwistModel:
         return Estimate(t_ns, values.atPose3(X(k)).matrix(), bias=bias)
 
     def hold(self, belief: Belief, k: int) -> gtsam.NonlinearFactorGraph:
-        """Return what holds state k at a belief."""
+        """Return the factors that hold state k at a belief."""
         at = gtsam.Values()
         at.insert(X(k), gtsam.Pose3(belief.T_world_imu))
         at.insert(B(k), belief.bias[3:])
