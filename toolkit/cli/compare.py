@@ -169,7 +169,7 @@ def compare(options: argparse.Namespace) -> int:
             finally:  # after the files, which a reader that goes away must not cost; also where they cannot be written
                 if not (options.json or options.quiet):
                     print_above(comparison_text(comparison, columns, width_of_output()))
-            found = _found(comparison, stores.get(directory))
+            found = _runs_found(comparison, stores.get(directory))
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())
             elif not options.quiet:
@@ -207,7 +207,7 @@ def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None
             store.close()
 
 
-def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
+def _runs_found(comparison: Comparison, store: OutcomeStore | None) -> str:
     """Return how many runs did not have to be made, nothing where all had."""
     if store is None or not store.found:
         return ""
@@ -241,7 +241,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
         "trajectories": {name: str(file) for name, file in options.trajectory} or None,
         "max_frames": options.max_frames,
         **{"from_s": options.from_s, "to_s": options.to_s, "every": options.every},
-        "keep": _kept(options),
+        "keep": _faults_kept(options),
         "keep_trajectories": options.keep_trajectories,
     }
     named = {"start": options.start, "first_seed": options.seed, "seeds": options.seeds, "vary": options.vary}
@@ -254,7 +254,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     return configuration(request, settings, place)
 
 
-def _kept(options: argparse.Namespace) -> tuple[str, ...] | None:
+def _faults_kept(options: argparse.Namespace) -> tuple[str, ...] | None:
     """Return the faults not to be repaired, or None where the command line says nothing of them."""
     if not options.no_repair and not options.keep:
         return None

@@ -218,7 +218,7 @@ def _motion_of(path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree) ->
     Raises DataError where nothing measures the motion, or what was chosen does not measure all of it.
     """
     if chosen.imu is not None:
-        messages = _given(path, chosen.imu, held)
+        messages = _messages_of(path, chosen.imu, held)
         t_ns, gyro = _stamps_ns(messages), _vectors([m.value.angular_velocity for m in messages])
         _check_measured(path, chosen.imu, gyro, messages[0].value.angular_velocity_covariance, "angular velocity")
         if chosen.accel is not None:
@@ -228,7 +228,7 @@ def _motion_of(path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree) ->
         return ImuSamples(t_ns, accel, gyro), ()
     if chosen.twist is None:
         raise DataError(f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion")
-    messages = _given(path, chosen.twist, held)
+    messages = _messages_of(path, chosen.twist, held)
     # A twist is wrapped once more where it has a covariance.
     twists = [getattr(message.value.twist, "twist", message.value.twist) for message in messages]
     linear, angular = (_vectors([getattr(twist, name) for twist in twists]) for name in ("linear", "angular"))
@@ -243,7 +243,7 @@ def _joined(
     """Return the samples of a gyro with the accelerometer's, which has other stamps, interpolated at its own."""
     assert chosen.imu is not None
     assert chosen.accel is not None
-    messages = _given(path, chosen.accel, held)
+    messages = _messages_of(path, chosen.accel, held)
     order = np.argsort(_stamps_ns(messages), kind="stable")
     t_ns, (accel, stated) = _stamps_ns(messages)[order], _accel(messages)
     _check_measured(path, chosen.accel, accel, stated, "acceleration")
@@ -261,7 +261,7 @@ def _joined(
     return ImuSamples(at_ns, at_gyro, gyro[1][within]), (fact,)
 
 
-def _given(path: Path, topic: Topic, held: Held) -> list[Message]:
+def _messages_of(path: Path, topic: Topic, held: Held) -> list[Message]:
     messages = held.of(topic)
     if not messages:
         raise DataError(f"{path}: {topic.name} has no message; name another topic with --topics")

@@ -237,7 +237,7 @@ def _distance(before: float, after: float) -> float:
 def judge_coverage(case: Case, estimator: str, before: Series, now: Series, bounds: Bounds) -> Iterator[Verdict]:
     """Fail where any seed lost more of its frames than allowed; a good score over fewer frames is no good score."""
     for output, metrics in before.outputs.items():
-        pairs = _both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
+        pairs = _values_of_both(metrics.get(COVERAGE, ()), now.outputs.get(output, {}).get(COVERAGE, ()))
         if not pairs:
             continue
         lost = max(was - is_ for was, is_ in pairs)
@@ -248,7 +248,7 @@ def judge_coverage(case: Case, estimator: str, before: Series, now: Series, boun
         yield Verdict(case.source, estimator, output, COVERAGE, finding, words if too_much else "", was, is_)
 
 
-def _both(before: Values, now: Values) -> list[tuple[float, float]]:
+def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
     """Return the values before and now of the runs that have both; a lost one has a verdict of its own."""
     return [(was, is_) for was, is_ in zip(before, now, strict=False) if was is not None and is_ is not None]
 

@@ -72,7 +72,7 @@ def _adjusted(packets: list[Packet], sequence: Sequence) -> AdjustedStart:
     guess = guess_with_imu(seen, measured) if measured else guess_from_vision(seen)
     if guess.contradiction is not None:
         raise NoSoundStartError(guess.contradiction)
-    return adjusted([_only(packet.frame, tracks) for packet in packets], motions, guess, sequence)
+    return adjusted([_with_tracks_alone(packet.frame, tracks) for packet in packets], motions, guess, sequence)
 
 
 def _visible(sequence: Sequence, frames: int) -> Observations:
@@ -146,7 +146,7 @@ def _tracks_worth_using(frames: list[StereoFrame]) -> IntArray:
     return ids[counts >= 2]
 
 
-def _only(frame: StereoFrame, tracks: IntArray) -> StereoFrame:
+def _with_tracks_alone(frame: StereoFrame, tracks: IntArray) -> StereoFrame:
     kept = np.isin(frame.track_ids, tracks) & (stereo.disparity_px(frame.uvs_px) > _LEAST_DISPARITY_PX)
     return frame.select(kept)
 

@@ -314,7 +314,7 @@ def diff_text(found: Differences, columns: tuple[Metric, ...] = (), width: Width
     moved = [one for one in found.metrics if one.moved and one.metric in keys]
     if moved:
         lines += ["metrics", "", as_text(_table(moved, keys)), ""]
-    lines += [filled(line, width) for line in _words(found, len(moved), len(shown))]
+    lines += [filled(line, width) for line in _summary_lines(found, len(moved), len(shown))]
     return "\n".join(lines)
 
 
@@ -349,7 +349,7 @@ def _table(moved: list[MetricChange], metrics: dict[str, Metric]) -> Table:
     return Table(tuple((head, "%" if head == "change" else "") for head in heads), rows, labels=3)
 
 
-def _words(found: Differences, moved: int, shown: int) -> Iterator[str]:
+def _summary_lines(found: Differences, moved: int, shown: int) -> Iterator[str]:
     if found.same_results:
         yield "the results are the same, to a millionth; time and memory never are"
     elif not moved:

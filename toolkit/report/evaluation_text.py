@@ -47,14 +47,16 @@ def leaderboard_table(evaluation: EvaluatedSystems, columns: tuple[Metric, ...] 
         spread = standing.quantiles.get(evaluation.ranked_by.key)
         if not several:
             spread = evaluation.cells[standing.system, evaluation.sequences[0]].quantiles(evaluation.ranked_by)
-        values = [_median(_of(evaluation, standing.system, metric, several=several), metric) for metric in metrics]
+        values = [
+            _median(_quartiles_of(evaluation, standing.system, metric, several=several), metric) for metric in metrics
+        ]
         ends = f"{standing.ok} of {standing.runs}"
         rows.append((standing.system, ends, *counts, _quartiles(spread, evaluation.ranked_by), *values))
     best = _best_rows(evaluation, metrics, len(heads) - len(metrics), several=several)
     return Table(tuple(heads), tuple(rows), labels=1, best=best)
 
 
-def _of(evaluation: EvaluatedSystems, system: str, metric: Metric, *, several: bool) -> QuantilesOfAll | None:
+def _quartiles_of(evaluation: EvaluatedSystems, system: str, metric: Metric, *, several: bool) -> QuantilesOfAll | None:
     if several:
         standing = next(one for one in evaluation.leaderboard if one.system == system)
         return standing.quantiles.get(metric.key)
@@ -69,7 +71,7 @@ def _best_rows(
         return frozenset()
     best: set[tuple[int, int]] = set()
     for j, metric in enumerate(metrics):
-        found = [_of(evaluation, one.system, metric, several=several) for one in evaluation.leaderboard]
+        found = [_quartiles_of(evaluation, one.system, metric, several=several) for one in evaluation.leaderboard]
         best |= {(i, before + j) for i in _best([None if q is None else q.median for q in found], metric)}
     return frozenset(best)
 

@@ -130,7 +130,7 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
         if found is not None:
             ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
             median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
-            told.append(f"{_of(row)} {median} ({ended})")
+            told.append(f"{_name_of(row)} {median} ({ended})")
     if told:
         what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
         yield f"{what}: {'; '.join(told)}"
@@ -143,10 +143,10 @@ def _marks(comparison: Comparison) -> Iterator[str]:
         if found is not None and row.mark:
             name = metrics_called((found.metric,))[0].name
             if row.mark == "contradicted":
-                yield f"{_of(row)} is contradicted: {_trend_in_words(found.mean, found.high)}"
+                yield f"{_name_of(row)} is contradicted: {_trend_in_words(found.mean, found.high)}"
                 continue
             yield (
-                f"{_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
+                f"{_name_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
                 f"{_figure(found.high)} holds 95 % of consistent estimators however correlated their errors"
                 f"{_TAILS if row.mark == 'heavy-tailed' else ''}"
             )
@@ -178,15 +178,15 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
         harmed = [(o.seed, note) for o in row.outcomes if (note := _remark_on(RATIO, o.outputs.get(row.output)))]
         if harmed and comparison.over_seeds:
             seeds = _seeds(seed for seed, _ in harmed)
-            yield f"{_of(row)} explains withheld tracks worse than dead reckoning under {seeds}"
+            yield f"{_name_of(row)} explains withheld tracks worse than dead reckoning under {seeds}"
         elif harmed:
-            yield f"{_of(row)} {harmed[0][1]}"
+            yield f"{_name_of(row)} {harmed[0][1]}"
 
 
 def dispute_lines(dispute: Dispute) -> Iterator[str]:
     """Yield a line for those who part from the measured motion, and one for who rests on a motion that is disputed."""
     if dispute.parted:
-        told = "; ".join(f"{_of(one.row)} by {_parted_in_words(one)}" for one in dispute.parted)
+        told = "; ".join(f"{_name_of(one.row)} by {_parted_in_words(one)}" for one in dispute.parted)
         yield (
             "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
             f"which squared is at most {_figure(FARTHEST)} times what they state: {told}"
@@ -211,7 +211,7 @@ def _remark_on(key: str, scored: Scored | None) -> str:
     return scored.scores.notes.get(key, "")
 
 
-def _of(row: Row) -> str:
+def _name_of(row: Row) -> str:
     """Name a row: by its estimator alone where one line serves for both outputs."""
     return row.estimator if row.label == "both" else f"{row.estimator} {row.output}"
 
@@ -267,7 +267,7 @@ def paired_lines(comparison: Comparison) -> Iterator[str]:
         for row in rows[1:]:
             found = paired(row.good_values(metric.key), rows[0].good_values(metric.key))
             if found is not None:
-                yield f"{_of(row)}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
+                yield f"{_name_of(row)}: {metric.name} {_difference(found, metric, rows[0].estimator)}"
 
 
 def _difference(found: Paired, metric: Metric, best: str) -> str:

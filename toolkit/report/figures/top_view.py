@@ -158,7 +158,7 @@ def draw_all(comparison: Comparison) -> Iterator[NamedFigure]:
     """Yield all trajectories in one figure, where any run has one."""
     drawable = [run for run in comparison.runs if run.trajectory(shown_output(run)) is not None]
     if drawable:
-        yield _all(comparison, drawable)
+        yield _figure_of_all(comparison, drawable)
 
 
 def draw_each(comparison: Comparison) -> Iterator[NamedFigure]:
@@ -180,7 +180,7 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
     return NamedFigure(f"top_{plain_name(run.estimator)}", caption, figure)
 
 
-def _all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
+def _figure_of_all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
     truth = true_track(comparison)
     tracks = {run.estimator: track_of(comparison, run) for run in runs}
     mapping = [run for run in runs if run.status == "ok" and len(run.landmarks)]
