@@ -103,7 +103,7 @@ def _run(given: list[str]) -> int:
 
 
 def _check_current_directory() -> None:
-    """Raise SystemLimitError where the current directory was removed: no relative path and no process can be had."""
+    """Raise SystemLimitError where the current directory was removed: relative paths and new processes need it."""
     try:
         os.getcwd()  # noqa: PTH109
     except FileNotFoundError as error:

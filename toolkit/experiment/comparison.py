@@ -74,7 +74,7 @@ def consistency_of(runs: Iterable[Scored]) -> Consistency | None:
     """Judge one kind of output of an estimator over one run or several: by NEES where there is one, else by NIS.
 
     Unless these tell of too much certainty, corrections that lean one way beyond their limit decide. Returns None where
-    none of it can be had: no covariance stated, or a final output without an independent truth.
+    there is none of it: no covariance stated, or a final output without an independent truth.
     """
     scored = list(runs)
     by_errors = _by_errors(scored)

@@ -195,7 +195,7 @@ def comparisons(
     """Run and score every estimator; yield each case's comparison, in their order, as soon as it is complete.
 
     What the ``stores``, one a case, have already is not run again. An estimator that fails is a row that says so.
-    Raises DataError where a recording cannot be had under a seed.
+    Raises DataError where a recording cannot be used under a seed.
     """
     entries = find_all(plan.estimators)
     kept_in = stores or [NOWHERE] * len(cases)

@@ -92,7 +92,7 @@ def arithmetic_of(outcomes: Iterable[Outcome]) -> ArithmeticOfRuns | None:
 def run_unit(unit: Unit, progress: Progress) -> Outcome:
     """Run the estimator of a unit and score what it gave.
 
-    Raises DataError where the recording cannot be had, EstimatorError where the estimator cannot be used.
+    Raises DataError where the recording cannot be used, EstimatorError where the estimator cannot be used.
     """
     prepared = prepared_of(unit)
     requested = unit.settings.metrics.requested()

@@ -113,7 +113,7 @@ class Series:
 class Measured:
     """What came of a case: hash and fingerprint of what the estimators read by seed, and the series by estimator.
 
-    ``absent`` says why an estimator has no series, ``unreadable`` why the sequence itself could not be had.
+    ``absent`` says why an estimator has no series, ``unreadable`` why the sequence itself could not be read.
     """
 
     hashes: tuple[str, ...]

@@ -61,7 +61,7 @@ def new_baseline(
 def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) -> Check:
     """Measure again what a baseline lists, and judge it. Whatever is missing is a verdict, not an error.
 
-    Raises BaselineError where another version of the code is asked for and cannot be had or timed.
+    Raises BaselineError where another version of the code is asked for and cannot be found or timed.
     """
     began, how = time.monotonic(), replace(how, settings=baseline.settings)
     judged = CaseVerdicts()

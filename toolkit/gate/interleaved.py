@@ -77,7 +77,7 @@ class Speeds:
 def compare_speed(baseline: Baseline, version: str, rate: float, progress_for: ProgressFor) -> Speeds:
     """Judge the time of a baseline's estimators, the installed code's against another version's.
 
-    Raises BaselineError where the version cannot be had or cannot be timed.
+    Raises BaselineError where the version cannot be found or cannot be timed.
     """
     turns = timed_in_turn(baseline, version, progress_for)
     return Speeds(tuple(judge_speeds(turns.timed, version, rate)), turns.notes)

@@ -91,7 +91,7 @@ def place_of(path: str) -> Path | None:
 def measure(case: Case, metrics: Iterable[str], settings: Settings, workers: int, progress: Progress) -> Measured:
     """Run every estimator of a case under every seed.
 
-    An estimator that is not there is ``absent``, a sequence that cannot be had ``unreadable``; nothing of that is
+    An estimator that is not there is ``absent``, a sequence that cannot be read ``unreadable``; nothing of that is
     raised, for a check has to say all that is missing.
     """
     absent = {name: why for name in case.estimators if (why := _why_absent(name))}

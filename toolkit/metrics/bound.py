@@ -1,9 +1,9 @@
 """How close to the limit: the Cramér-Rao bound of the recording, and what the estimator loses against it.
 
 Van Trees, "Detection, estimation and modulation theory", part I (1968), section 2.4; how bound and efficient estimate
-are had is in :mod:`toolkit.metrics._shared.cramer_rao`. The error of an unbiased estimator is that of the efficient one
-on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P and that of
-d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
+are computed is in :mod:`toolkit.metrics._shared.cramer_rao`. The error of an unbiased estimator is that of the
+efficient one on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P
+and that of d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
 
 A recording without an exact truth has the bound that the model claims, linearised at the run's own last answer. The
 error over it is then a test of the model: where both are honest, it is about 1.

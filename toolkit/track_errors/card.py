@@ -44,7 +44,7 @@ class Card:
     autocorrelation of residuals along a track and half the mean square of their difference, ``fitted_px2`` (L, 3) the
     latter as the fitted noise has it. ``left_right`` is the correlation of residuals in uL and uR, ``tails`` the share
     beyond four robust sigmas, ``at_odds`` the share of tracks whose residuals are four times the usual and more, and
-    ``scale`` vision's translation over the measured one, None where that cannot be had. ``left_out`` is the share of
+    ``scale`` vision's translation over the measured one, None where that is not known. ``left_out`` is the share of
     visible sightings that estimators were not given for moving against the rest, None where that was not asked for.
     """
 

@@ -1,4 +1,4 @@
-"""Every promise of one estimator, one after the other: passed, failed with what to do, or not to be had.
+"""Every promise of one estimator, one after the other: passed, failed with what to do, or not applicable.
 
 Among them: it goes on through what a recording may hold, planted by :mod:`toolkit.simulation.faults`.
 """

@@ -3,8 +3,8 @@
 No unbiased estimator has a smaller covariance than the inverse of Fisher's information (Van Trees, "Detection,
 estimation and modulation theory", part I, 1968, section 2.4). For Gaussian measurements that is the information of
 all factors linearised at the truth: the factors, the noise, the prior and the tracks are those the estimators have.
-Here it is had without any of them: the causal bound by a forward information filter over the state and the landmarks
-that are still to be seen (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao bounds for discrete-time
+Here it is computed without any of them: the causal bound by a forward information filter over the state and the
+landmarks that are still to be seen (Tichavsky, Muravchik & Nehorai 1998, "Posterior Cramér-Rao bounds for discrete-time
 nonlinear filtering"), the final one by eliminating the whole graph.
 
 Beside the bound stands the efficient estimate, one linear step from the truth on the same measurements. The error of
@@ -12,7 +12,7 @@ any unbiased estimator is that of the efficient one plus a part that is not corr
 efficient error is taken off is the estimator's own loss, without the draw of noise that both share.
 
 That needs a truth with every state, exact: the motion measured between its states must be as far from them as the
-stated noise says. Where a recording has none, the bound that the model claims is had at an estimate of the states.
+stated noise says. Where a recording has none, the bound that the model claims is taken at an estimate of the states.
 """
 
 from dataclasses import dataclass, replace

@@ -54,7 +54,7 @@ def line_of(output: Output) -> _Dashes:
 
 
 def line_of_estimator(comparison: Comparison, estimator: str, output: Output) -> _Dashes:
-    """Return the line style of one kind of output of an estimator: other dashes where its colour is had already.
+    """Return the line style of one kind of output of an estimator: other dashes where its colour is another's too.
 
     Both outputs keep the estimator's colour, so that twice as many estimators as there are colours are told apart.
     """
