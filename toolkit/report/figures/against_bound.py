@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array
@@ -61,10 +60,10 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
     style_axes(rotation, "rotation beyond the efficient estimate", "time [s]", "rotation [deg]")
     figure.align_ylabels()
     bounds = [
-        Entry(f"bound {output}", (Line2D([], [], color=TRUTH_COLOUR, linestyle=line_of(output), linewidth=2.0),))
+        Entry.of_line(f"bound {output}", TRUTH_COLOUR, line_of(output), 2.0)
         for output in dict.fromkeys(row.output for row, _ in found)
     ]
-    stated = Entry("thin: stated", (Line2D([], [], color=MUTED_COLOUR, linewidth=_STATED_WIDTH),))
+    stated = Entry.of_line("thin: stated", MUTED_COLOUR, width=_STATED_WIDTH)
     estimators = entries_of(comparison, [(row.estimator, shown_as(row)) for row, _ in found])
     legend_below(figure, [*bounds, *estimators, stated])
     return NamedFigure("against_bound", _CAPTION, figure)

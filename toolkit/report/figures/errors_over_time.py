@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterator
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from toolkit.estimate import Output
@@ -159,7 +158,7 @@ def _entries(found: dict[Output, Components], both: bool, what: str) -> list[Ent
     for output, one in found.items():
         shown_as: Output = "final" if both else output
         name, colour = "causal = final" if both else output, COLOUR_OF[shown_as]
-        entries.append(Entry(f"{name}: {what}", (Line2D([], [], color=colour, linestyle=line_of(shown_as)),)))
+        entries.append(Entry.of_line(f"{name}: {what}", colour, line_of(shown_as)))
         if one.sigma is not None:
             band = Patch(facecolor=to_rgba(colour, _BAND_ALPHA if shown_as == "final" else 0.0), edgecolor=colour)
             band.set(linestyle=line_of(shown_as), linewidth=0.6)

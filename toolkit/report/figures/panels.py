@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
 
@@ -144,10 +143,7 @@ def annotate(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
 def output_entries(outputs: Collection[Output]) -> list[Entry]:
     """Return the legend's entries for the outputs that are drawn; where both agree, one line stands for them."""
     words: dict[Output, str] = {"causal": "causal", "final": "final, or both"}
-    return [
-        Entry(words[output], (Line2D([], [], color=COLOUR_OF[output], linestyle=line_of(output)),))
-        for output in sorted(outputs)
-    ]
+    return [Entry.of_line(words[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
 
 
 def band_entry() -> Entry:

@@ -4,7 +4,7 @@ Figures are as wide as two columns of a paper and are to be set at that width: l
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -26,8 +26,8 @@ LANDMARK_COLOUR = "#8a949f"
 
 # Okabe & Ito (2008), in the order in which neighbours differ most; more estimators start over with it, in other dashes.
 _COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F5F3F")
-_Dashes = Literal["-", "--", ":"] | tuple[float, tuple[float, ...]]
-_LINE_OF: dict[Output, tuple[_Dashes, ...]] = {
+Dashes = Literal["-", "--", ":"] | tuple[float, tuple[float, ...]]
+_LINE_OF: dict[Output, tuple[Dashes, ...]] = {
     "causal": ("--", ":"),
     "final": ("-", (0.0, (7.0, 1.5, 1.0, 1.5, 1.0, 1.5))),
 }
@@ -48,12 +48,12 @@ def colour_of(comparison: Comparison, estimator: str) -> str:
     return _COLOURS[order.index(estimator) % len(_COLOURS)]
 
 
-def line_of(output: Output) -> _Dashes:
+def line_of(output: Output) -> Dashes:
     """Return the line style of a kind of output: dashed while it knew the past only, solid at the end."""
     return _LINE_OF[output][0]
 
 
-def line_of_estimator(comparison: Comparison, estimator: str, output: Output) -> _Dashes:
+def line_of_estimator(comparison: Comparison, estimator: str, output: Output) -> Dashes:
     """Return the line style of one kind of output of an estimator: other dashes where its colour is another's too.
 
     Both outputs keep the estimator's colour, so that twice as many estimators as there are colours are told apart.
@@ -97,6 +97,11 @@ class Entry(NamedTuple):
 
     label: str
     samples: tuple[Artist, ...]
+
+    @classmethod
+    def of_line(cls, label: str, colour: str, dashes: Dashes = "-", width: float = 1.5) -> Self:
+        """Return the entry of a single line."""
+        return cls(label, (Line2D([], [], color=colour, linestyle=dashes, linewidth=width),))
 
 
 def entries_of(comparison: Comparison, drawn: Iterable[tuple[str, Output]]) -> list[Entry]:

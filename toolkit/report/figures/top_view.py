@@ -230,11 +230,10 @@ def _entries(
     comparison: Comparison, runs: dict[str, Run], truth: PathFromAbove | None, mapper: Run | None
 ) -> list[Entry]:
     """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
-    entries = [] if truth is None else [Entry("truth", (Line2D([], [], color=TRUTH_COLOUR, lw=_TRUTH_WIDTH),))]
+    entries = [] if truth is None else [Entry.of_line("truth", TRUTH_COLOUR, width=_TRUTH_WIDTH)]
     for name, run in runs.items():
         line = line_of_estimator(comparison, name, shown_output(run))
-        sample = Line2D([], [], color=colour_of(comparison, name), linestyle=line, linewidth=1.8)
-        entries.append(Entry(f"{name}{_trouble(run)}", (sample,)))
+        entries.append(Entry.of_line(f"{name}{_trouble(run)}", colour_of(comparison, name), line, 1.8))
     if mapper is not None and len(mapper.landmarks):
         dot = Line2D([], [], color=LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
         entries.append(Entry(f"landmarks of {mapper.estimator}", (dot,)))
