@@ -28,7 +28,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.models.motion import motion_model
+from toolkit.models.motion import motion_model, state_keys
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Packet, StereoFrame
 
@@ -110,7 +110,7 @@ class Smart:
         self._motion.insert(new, estimate, k)
         values = gtsam.Values(window.values)
         values.insert(new)
-        keys = (*window.keys, tuple(self._motion.keys(k)))
+        keys = (*window.keys, tuple(state_keys(self._motion, k)))
         longer = replace(window, keys=keys, values=values, motion=(*window.motion, factors))
         return replace(tracked, window=longer).seeing(frame, estimate.T_world_imu, self._rig)
 

@@ -14,7 +14,7 @@ from toolkit.measured_motion import NoSamples
 from toolkit.metrics import score_run
 from toolkit.models import stereo
 from toolkit.models.factors import SCALE, L, StereoFactors, X, joint_cov, kind_of
-from toolkit.models.motion import motion_model, state_cov
+from toolkit.models.motion import motion_model, state_cov, state_keys
 from toolkit.models.noise import unmeasured_motion
 from toolkit.models.state_covariances import covs_beside
 from toolkit.models.stereo import scaled_rig
@@ -96,7 +96,7 @@ def test_states_and_scale_have_the_covariance_of_gtsams_marginals():
     """The states' is that with the scale known, widened by what its own uncertainty moves them."""
     motion = motion_model(DRIVE.motion.noise, DRIVE.gravity_world)
     rng, graph, poses = np.random.default_rng(4), gtsam.GaussianFactorGraph(), np.tile(np.eye(4), (12, 1, 1))
-    unit, keys = gtsam.noiseModel.Unit.Create(20), [motion.keys(k) for k in range(len(poses))]
+    unit, keys = gtsam.noiseModel.Unit.Create(20), [state_keys(motion, k) for k in range(len(poses))]
     graph.add(SCALE, 100.0 * np.eye(1), np.zeros(1), gtsam.noiseModel.Unit.Create(1))
     for k, (pose, bias) in enumerate(keys):
         at = [(pose, rng.standard_normal((20, 6))), (bias, rng.standard_normal((20, 3))), (SCALE, np.ones((20, 1)))]

@@ -17,7 +17,7 @@ from filters.smoothing.smart_solver import SolvedWindow, without_oldest
 from filters.smoothing.smart_window import MarginalPrior, SmartWindow
 from toolkit.errors import EstimatorError
 from toolkit.estimator import Setup
-from toolkit.models.motion import motion_model, state_cov
+from toolkit.models.motion import motion_model, state_cov, state_keys
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
@@ -77,7 +77,7 @@ def test_fixed_lag_states_leave_with_gtsams_marginals_of_the_windows_factors(sce
         marginals = gtsam.Marginals(without_gaps(tree.getFactorsUnsafe()), tree.getLinearizationPoint())
         for k, stamp_ns in enumerate(sequence.frames_t_ns.tolist()):
             if t_ns - round(LAG_S * NS_PER_S) <= stamp_ns <= t_ns:
-                R_world_imu = window.values().atPose3(motion.keys(k)[0]).rotation().matrix()
+                R_world_imu = window.values().atPose3(state_keys(motion, k)[0]).rotation().matrix()
                 last[k] = state_cov(motion, marginals, k, R_world_imu)
         return recovery
 

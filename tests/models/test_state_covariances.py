@@ -14,8 +14,8 @@ from toolkit.estimate import Run, Trajectory
 from toolkit.geometry import Array
 from toolkit.measured_motion import TwistNoise
 from toolkit.models import state_covariances
-from toolkit.models.factors import L, joint_cov, linear_factor
-from toolkit.models.motion import MotionModel, state_cov
+from toolkit.models.factors import L, X, joint_cov, linear_factor
+from toolkit.models.motion import MotionModel, state_cov, state_keys
 from toolkit.models.state_covariances import RoundingError, state_covs
 from toolkit.models.twist import TwistModel
 from toolkit.settings import Settings, Window
@@ -133,11 +133,11 @@ def _walking_states(step_sigma: float) -> gtsam.GaussianFactorGraph:
     """Return states of which the first has unit covariance, and each follows from the one before it."""
     graph = gtsam.GaussianFactorGraph()
     for k in range(STATES):
-        for key, size in zip(TWIST.keys(k), SIZES.values(), strict=True):
+        for key, size in zip(state_keys(TWIST, k), SIZES.values(), strict=True):
             if k == 0:
                 graph.add(linear_factor([(key, np.eye(size))], np.zeros(size)))
                 continue
-            before = TWIST.keys(k - 1)[TWIST.keys(k).index(key)]
+            before = state_keys(TWIST, k - 1)[state_keys(TWIST, k).index(key)]
             step = np.eye(size) / step_sigma
             graph.add(linear_factor([(before, -step), (key, step)], np.zeros(size)))
     return graph
@@ -146,9 +146,9 @@ def _walking_states(step_sigma: float) -> gtsam.GaussianFactorGraph:
 def test_a_world_far_looser_than_the_steps_in_it_has_covariances():
     """As behind hundreds of frames. GTSAM refuses the clique of two states by its condition; rounding is 1e-5 here."""
     graph, poses = _walking_states(1e-4), np.tile(np.eye(4), (STATES, 1, 1))
-    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, TWIST.keys(0))
+    last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, state_keys(TWIST, 0))
     with pytest.raises(RuntimeError, match="Indeterminate"):
-        joint_cov(graph.eliminateMultifrontal(last), TWIST.keys(0))
+        joint_cov(graph.eliminateMultifrontal(last), state_keys(TWIST, 0))
     covs = state_covs(graph, TWIST, poses)
     expected = 1.0 + 1e-8 * np.arange(STATES)
     np.testing.assert_allclose(covs[:, range(9), range(9)], np.tile(expected[:, None], 9), rtol=1e-4)
@@ -164,10 +164,10 @@ def test_a_landmark_at_infinity_leaves_the_states_their_covariances(told):
     for k in range(0, STATES, 5):
         of_pose, of_landmark = rng.standard_normal((3, 6)), rng.standard_normal((3, 3))
         if told < 1e-10:  # two directions of the landmark, and nothing of a third
-            near.add(linear_factor([(TWIST.keys(k)[0], of_pose), (L(0), of_landmark @ turned[:, :2])], np.zeros(3)))
+            near.add(linear_factor([(X(k), of_pose), (L(0), of_landmark @ turned[:, :2])], np.zeros(3)))
         else:
-            near.add(linear_factor([(TWIST.keys(k)[0], of_pose), (L(0), of_landmark)], np.zeros(3)))
-        far.add(linear_factor([(TWIST.keys(k)[0], of_pose), (L(0), of_landmark @ in_metres)], np.zeros(3)))
+            near.add(linear_factor([(X(k), of_pose), (L(0), of_landmark)], np.zeros(3)))
+        far.add(linear_factor([(X(k), of_pose), (L(0), of_landmark @ in_metres)], np.zeros(3)))
     with pytest.raises(RuntimeError, match="Indeterminate"):
         far.eliminateSequential(gtsam.Ordering.ColamdGaussianFactorGraph(far))
     # The Jacobian in metres has the depth's share of sixteen digits: 1e-9 of them at 1e-7.

@@ -189,10 +189,6 @@ class ImuModel:
         )
         return preintegration_params(scaled, self._gravity_world)
 
-    def keys(self, k: int) -> list[int]:
-        """Return the keys of pose, velocity in the world (3,) and biases."""
-        return [X(k), V(k), B(k)]
-
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
         return latest_values(tree, keys, tree.calculateEstimateConstantBias)

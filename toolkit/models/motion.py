@@ -53,12 +53,9 @@ class MotionModel(Protocol):
     def integrate(self, motion: Motion, bias: Array) -> Increment:
         """Integrate the motion between two frames about a bias (6,) [accel m/s^2, gyro rad/s]."""
 
-    def keys(self, k: int) -> list[int]:
-        """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""
-
     @property
     def variable_sizes(self) -> Mapping[str, int]:
-        """Return the dimensions of a state's variables by the kind that their keys name."""
+        """Return the dimensions of a state's variables by the kind that their keys name, in the error state's order."""
 
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some states' variables, without copying all others out of the tree."""
@@ -78,6 +75,11 @@ class MotionModel(Protocol):
         A velocity is a vector in the world to GTSAM and an error in the body frame to an Estimate; ``R_world_imu``
         (3, 3) is the state's own attitude.
         """
+
+
+def state_keys(model: MotionModel, k: int) -> list[int]:
+    """Return the keys of state k in a graph, in the order of the error state: pose, (velocity,) bias."""
+    return [gtsam.symbol(kind, k) for kind in model.variable_sizes]
 
 
 def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
@@ -101,7 +103,7 @@ def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Ar
 
     Raises RuntimeError, as GTSAM does, where the graph does not determine it.
     """
-    return model.estimate_cov(joint_cov(tree, model.keys(k)), R_world_imu)
+    return model.estimate_cov(joint_cov(tree, state_keys(model, k)), R_world_imu)
 
 
 def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:

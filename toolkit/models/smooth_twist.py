@@ -154,10 +154,6 @@ class SmoothTwist:
         assert isinstance(motion, UnmeasuredMotion)
         return SmoothIncrement(float(motion.dt_s.sum()), self._noise)
 
-    def keys(self, k: int) -> list[int]:
-        """Return the keys of pose, velocity in the world (3,) and turn rate (3,)."""
-        return [X(k), V(k), B(k)]
-
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
         return latest_values(tree, keys, tree.calculateEstimateVector)

@@ -34,7 +34,7 @@ import numpy as np
 
 from toolkit.geometry import Array
 from toolkit.models.factors import linear_factor
-from toolkit.models.motion import MotionModel
+from toolkit.models.motion import MotionModel, state_keys
 
 # A standard deviation may be off by so much of itself: a tenth of what anybody reads in it.
 _MOST_ROUNDED = 0.01
@@ -67,7 +67,7 @@ def covs_beside(
 
     Those are of no frame, as the scale of disparities is: they are eliminated after all states.
     """
-    states = [motion.keys(k) for k in range(len(poses))]
+    states = [state_keys(motion, k) for k in range(len(poses))]
     try:
         covs = _of_groups(linear, states, beside)
     except RuntimeError:

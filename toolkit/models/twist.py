@@ -186,10 +186,6 @@ class TwistModel:
         steps = integrate_each(twists, np.array(biases)[:, 3:], self._noise)
         return [TwistIncrement(step, bias[3:], self._noise) for step, bias in zip(steps, biases, strict=True)]
 
-    def keys(self, k: int) -> list[int]:
-        """Return the keys of pose and gyro bias (3,)."""
-        return [X(k), B(k)]
-
     def latest(self, tree: gtsam.ISAM2, keys: list[int]) -> gtsam.Values:
         """Return the latest values of some variables of a tree."""
         return latest_values(tree, keys, tree.calculateEstimateVector)
