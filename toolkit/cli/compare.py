@@ -169,7 +169,7 @@ def compare(options: argparse.Namespace) -> int:
             finally:  # after the files, which a reader that goes away must not cost; also where they cannot be written
                 if not (options.json or options.quiet):
                     print_above(comparison_text(comparison, columns, width_of_output()))
-            found = _runs_found(comparison, stores.get(directory))
+            found = _found(comparison, stores.get(directory))
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())
             elif not options.quiet:
@@ -207,7 +207,7 @@ def _kept_when_interrupted(stores: Mapping[Path, OutcomeStore]) -> Iterator[None
             store.close()
 
 
-def _runs_found(comparison: Comparison, store: OutcomeStore | None) -> str:
+def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
     """Return how many runs did not have to be made, nothing where all had."""
     if store is None or not store.found:
         return ""
