@@ -1,9 +1,8 @@
 """What one packet adds to an incremental smoother's graph: new factors, first values, and the variables they are on.
 
-Sightings of tracks that have gone over to another point are left out. Where errors along tracks are correlated, a new
-state begins where its sightings of known landmarks put it, not where the measured motion alone does: the motion may be
-off by many times what is new in a sighting of a track, and linearised there a loss would weigh every sighting down as
-an outlier.
+Sightings of tracks that have gone over to another point are left out. A new state begins where its sightings of known
+landmarks put it, not where the measured motion alone does: the motion may be off by many times what is new in a
+sighting of a track, and linearised there a loss would weigh every sighting down as an outlier.
 """
 
 from collections.abc import Mapping
@@ -16,26 +15,21 @@ import numpy as np
 from filters.kalman.motion_noise import MatchedNoise
 from filters.smoothing.discounted_tracks import DiscountedTracks, discounted_past, seen_often
 from filters.smoothing.outlier_check import OutlierCheck, RefusedTracks, relative_to_its_map
-from filters.smoothing.robust_loss import Cauchy
 from toolkit.estimate import Estimate
 from toolkit.estimator import Setup
-from toolkit.geometry import Array, BoolArray, se3_exp
-from toolkit.models import left_only, stereo
+from toolkit.geometry import Array, BoolArray
+from toolkit.models import stereo
 from toolkit.models.factors import L, StereoFactors, huber_loss
 from toolkit.models.gap_bridge import gap_bridge_for, kept_twist
 from toolkit.models.gating import LEAST_DISPARITY_PX
 from toolkit.models.motion import MotionModel, motion_model
-from toolkit.models.state import POSE, Belief
-from toolkit.sequence import Packet, StereoFrame, StereoRig
+from toolkit.models.state import Belief
+from toolkit.sequence import Packet, StereoFrame
 
 # A frame tells what tracks count for once so many more have come: its landmarks are seen from enough by then.
 LEARNT_AFTER_FRAMES = 5
 # Sightings in the graph may count for so many times as much as they are known to by now, or for so much less.
 _MOST_OUTDATED = 1.25
-# Gauss-Newton with weights of the step before: a turn of three pixels is within a tenth of one after these.
-_ALIGNING_STEPS = 5
-# As batch has it, between its first solve and its last.
-_ALIGNING_LOSS = Cauchy(2.0)
 
 
 @dataclass
@@ -62,11 +56,13 @@ class GraphBuilder:
         self._stereo, self._share = StereoFactors(setup.rig, huber_loss(outliers.smoother_huber)), 1.0
         # What the sightings counted for that are longest in the graph, and whether all others count for that too.
         self._share_in_graph, self._count_alike = 1.0, True
+        # What is new in a sighting of a track whose noise is stated has the filters' gate, as their tracks have.
+        if setup.rig.track_noise is not None:
+            outliers = msgspec.structs.replace(outliers, smoother_gate_factor=1.0)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
             self._bridge = gap_bridge_for(setup.noise, setup.settings.window.seconds(setup.motion_kind))
-        self._aligned_check = OutlierCheck(setup.rig, msgspec.structs.replace(outliers, smoother_gate_factor=1.0))
         self._refused_tracks = RefusedTracks(setup.rig, outliers.gate_probability)
         self._refused: tuple[StereoFrame, BoolArray] | None = None
         self._points: dict[int, Array] = {}
@@ -78,9 +74,8 @@ class GraphBuilder:
         """Return what a packet adds, the new state being predicted from the latest known."""
         extension = GraphExtension()
         expected = self._add_state(self._noise.applied(packet), extension)
-        sound = self._outlier_check.without_outliers(packet.frame, self._points, expected)
-        if self._rig.track_noise is not None:
-            sound = self._aligned(sound, expected)
+        there, sound = self._outlier_check.placed(expected, packet.frame, self._points, self._tracks.share)
+        self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
         self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
         self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
@@ -162,15 +157,6 @@ class GraphBuilder:
             extension.factors.push_back(increment.factors(packet.index))
         return expected
 
-    def _aligned(self, frame: StereoFrame, expected: Belief) -> StereoFrame:
-        """Begin the new state where the frame puts it; return the frame without what is an outlier there.
-
-        There the gate is the filters': what the motion is off by is none of its business any more.
-        """
-        there = aligned(expected, frame, self._points, self._rig)
-        self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
-        return self._aligned_check.without_outliers(frame, self._points, relative_to_its_map(there))
-
     def _add_values(self, packet: Packet, extension: GraphExtension) -> None:
         self.motion.insert(extension.values, self.belief.estimate(packet.frame.t_ns), packet.index)
         extension.state_keys = list(extension.values.keys())
@@ -199,25 +185,3 @@ class GraphBuilder:
             self._stereo, self._share = StereoFactors(rig, huber_loss(huber)), self._tracks.share
             self._count_alike = False
         return self._stereo
-
-
-def aligned(expected: Belief, frame: StereoFrame, points: Mapping[int, Array], rig: StereoRig) -> Belief:
-    """Return the belief at the pose that a frame's sightings of points (3,) m and the expected pose agree on.
-
-    Each sighting counts by itself, with the noise of the pixels; the covariance stays as it is.
-    """
-    seen = frame.select(np.array([i in points for i in frame.track_ids.tolist()], dtype=bool))
-    if not seen.track_ids.size:
-        return expected
-    landmarks = np.array([points[i] for i in seen.track_ids.tolist()])
-    held = np.linalg.inv(expected.cov[POSE, POSE])
-    T_world_imu, off, whitener = expected.T_world_imu, np.zeros(6), left_only.whitener(seen.uvs_px, rig)
-    for _ in range(_ALIGNING_STEPS):
-        predicted = stereo.predict(landmarks, T_world_imu, rig)
-        residual = left_only.whitened_residuals(seen.uvs_px, predicted.uv_px, rig)
-        weights = np.where(predicted.depth_m > 0.0, _ALIGNING_LOSS.weight(np.linalg.norm(residual, axis=1)), 0.0)
-        H = (whitener @ predicted.d_uv_d_pose).reshape(-1, 6)
-        weighed = H * np.repeat(weights, 3)[:, None]
-        step = np.linalg.solve(held + weighed.T @ H, weighed.T @ residual.ravel() - held @ off)
-        off, T_world_imu = off + step, T_world_imu @ se3_exp(step)
-    return replace(expected, T_world_imu=T_world_imu)

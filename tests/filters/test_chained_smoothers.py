@@ -9,15 +9,11 @@ import pytest
 from filters.batch import Batch
 from filters.fixed_lag import FixedLag
 from filters.isam2 import Isam2
-from filters.smoothing.graph_builder import aligned
 from toolkit.estimator import Setup
-from toolkit.geometry import se3_exp, se3_inverse, se3_log, transform
-from toolkit.models import stereo
+from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.models.factors import L, X, kind_of
-from toolkit.models.motion import motion_model
-from toolkit.sequence import StereoFrame
 from toolkit.settings import POLICIES, Settings
-from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.simulation import DRIVE, FLIGHT
 from toolkit.track_noise import TrackNoise
 
 NOISE = TrackNoise(np.full(3, 0.02), np.array([0.09, 0.13, 0.11]), np.array([0.0, 0.9, 0.0]))
@@ -153,27 +149,6 @@ def test_the_slots_of_isam2_are_those_of_its_chained_sightings_whatever_was_drop
 def any_landmark(factor):
     keys = factor.keys()
     return any(kind_of(key) == "l" for key in keys)
-
-
-def test_a_state_begins_where_its_sightings_put_it_though_the_motion_is_off_and_some_are_mismatched():
-    """Noise of half a pixel on 40 points: a tenth of a pixel of the pose, where the motion is off by eight."""
-    rng, rig = np.random.default_rng(1), DRIVE.rig
-    ids = np.arange(40)
-    points = transform(rig.T_imu_cam, np.column_stack([rng.uniform(-4.0, 4.0, (40, 2)), rng.uniform(8.0, 25.0, 40)]))
-    uvs_px = stereo.predict(points, np.eye(4), rig).uv_px + 0.5 * rng.standard_normal((40, 3))
-    uvs_px[:10] += rng.uniform(20.0, 60.0, (10, 3))
-    off = se3_exp(np.array([0.008, -0.01, 0.01, 0.05, 0.05, -0.05]))
-    expected = replace(belief_at(off), cov=np.eye(9) * 0.02**2)
-    frame = StereoFrame(0, ids, uvs_px, np.zeros_like(ids))
-    found = aligned(expected, frame, dict(zip(ids.tolist(), points, strict=True)), rig)
-    moved_px = stereo.predict(points, found.T_world_imu, rig).uv_px - stereo.predict(points, np.eye(4), rig).uv_px
-    assert np.sqrt(np.square(moved_px).mean()) < 0.3
-    assert aligned(expected, frame, {}, rig) is expected
-
-
-def belief_at(pose):
-    belief = motion_model(DRIVE.motion.noise, DRIVE.gravity_world).initial_belief(simulate(SHORT_DRIVE, 0).prior)
-    return replace(belief, T_world_imu=pose)
 
 
 def test_a_landmark_behind_every_camera_that_saw_it_does_not_come_into_a_tree_built_anew(oracle):

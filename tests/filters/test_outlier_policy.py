@@ -133,8 +133,8 @@ def test_online_smoothers_hold_a_sighting_from_the_gates_bound_on_and_drop_what_
 
 
 @pytest.mark.parametrize("name", ["fixed-lag", "isam2", "smart"])
-def test_what_the_measured_motion_leaves_open_is_no_slip(scene, run_estimator, name):
-    """Off by 9.5 sigma: slipped after the motion as measured, possible after one known half as well."""
+def test_what_the_other_tracks_deny_is_a_slip_though_the_motion_leaves_it_open(scene, run_estimator, name):
+    """Off by 9.5 sigma: after a motion that is known half as well the gate alone would let it pass."""
     sequence = scene.with_error(9.5)
     noise = sequence.noise
     doubtful = replace(
@@ -143,9 +143,8 @@ def test_what_the_measured_motion_leaves_open_is_no_slip(scene, run_estimator, n
         gyro_noise_density=2.0 * noise.gyro_noise_density,
     )
     settings = Settings(outliers=POLICIES["classic"])
-    assert scene.error_m(run_estimator(name, sequence, settings=settings)) < NOTHING_M
-    known_half_as_well = replace(sequence, noise=doubtful)
-    assert scene.error_m(run_estimator(name, known_half_as_well, settings=settings)) > 100.0 * NOTHING_M
+    for known_so_well in (sequence, replace(sequence, noise=doubtful)):
+        assert scene.error_m(run_estimator(name, known_so_well, settings=settings)) < NOTHING_M
 
 
 @pytest.mark.parametrize(("share", "believed"), [(0.4, False), (0.6, True)])
