@@ -80,6 +80,18 @@ def test_a_few_jumps_are_not(scenario, run_on):
     assert contradiction(jumping(run_on("ekf", scenario).causal, 0.02, JUMP_M), sequence) is None
 
 
+@pytest.mark.parametrize(("jump_m", "is_one"), [(0.1, False), (5.0, True)])
+def test_jumps_of_half_a_hundredth_of_what_the_pose_is_uncertain_by_are_no_contradiction(jump_m, is_one, run_on):
+    """Twenty metres: a state far from its start, which jumps as the whole way behind it turns a little."""
+    causal = run_on("dead-reckoning", "drive").causal
+    vague = causal.cov.copy()
+    vague[:, 3:6, 3:6] += 20.0**2 * np.eye(3)
+    poses = causal.T_world_imu.copy()
+    poses[1::2, 1, 3] += jump_m
+    found = contradiction(replace(causal, T_world_imu=poses, cov=vague), recording("drive"))
+    assert (found is not None) == is_one
+
+
 def test_the_reason_counts_the_far_steps(run_on):
     sequence = recording("drive")
     run = run_on("dead-reckoning", "drive")

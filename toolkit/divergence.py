@@ -36,6 +36,10 @@ LEAST_ACCEPTED, _FEWEST_TESTED = 0.3, 200
 # rad/s of turn rate and m/s of velocity.
 _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
 
+# Covariances are linearised anew at every frame: what a correction takes away shows in their difference down to such a
+# share of a standard deviation. Of a position that is uncertain by 20 m that is 0.2 m: a turn of the whole way behind.
+_TOLD_APART = 0.01
+
 
 def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     """Return why the trajectory cannot be right, or None. Its stamps must be the sequence's frames."""
@@ -92,6 +96,7 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
     cov = _LUMP_FRAMES * noise
     if trajectory.cov is not None:
         cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], transition, noise)
+        cov = cov + _TOLD_APART**2 * _finite(trajectory.cov[end][:, POSE, POSE])
     return mahalanobis_squared(deviation, cov)
 
 
@@ -119,6 +124,10 @@ def _taken_away(cov_start: Array, cov_end: Array, transition: Array, noise: Arra
     if cov_start.shape[-1] != transition.shape[-1]:
         return np.zeros_like(noise)
     taken = transition @ cov_start @ np.swapaxes(transition, 1, 2) + noise - cov_end[:, :6, :6]
-    taken[~np.isfinite(taken).all(axis=(1, 2))] = 0.0
-    size, axes = np.linalg.eigh(taken)
+    size, axes = np.linalg.eigh(_finite(taken))
     return np.asarray((axes * np.maximum(size, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+
+
+def _finite(covs: Array) -> Array:
+    """Return covariances (S, 6, 6), zero where one is not a number."""
+    return np.where(np.isfinite(covs).all(axis=(1, 2), keepdims=True), covs, 0.0)
