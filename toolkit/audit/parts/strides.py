@@ -40,6 +40,16 @@ class ImuStrides(NamedTuple):
     d_moved: Array
     whitener: Array
 
+    @property
+    def state_size(self) -> int:
+        """How many unknowns of a state the equations depend on: turn, position and velocity."""
+        return 9
+
+    @property
+    def gravity_size(self) -> int:
+        """How many unknowns of gravity they depend on."""
+        return 3
+
     def biased(self, bias: Array) -> "ImuStrides":
         """Return what the strides are where the biases (6,) are these."""
         return self._replace(
@@ -88,22 +98,32 @@ class TwistStrides(NamedTuple):
     d_moved: Array
     whitener: Array
 
+    @property
+    def state_size(self) -> int:
+        """How many unknowns of a state the equations depend on: turn and position."""
+        return 6
+
+    @property
+    def gravity_size(self) -> int:
+        """How many unknowns of gravity they depend on: none."""
+        return 0
+
     def equations(
         self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
     ) -> tuple[Array, Array]:
-        """Return what states lack (m, 6), turn and position, and its change (m, 6, 27) by the same unknowns.
+        """Return what states lack (m, 6), turn and position, and its change (m, 6, 18) by the unknowns.
 
-        Velocities and gravity are not among what odometry tells of states.
+        Unknowns are the poses at both ends (6 each) and the biases (6,).
         """
         R_first_a, R_first_b, one = R_first_imu[:-1], R_first_imu[1:], np.eye(3)
         R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
         R_a_b, way = self.R_a_b @ so3_exp(self.d_turn @ bias), self.moved + self.d_moved @ bias
         turn = so3_log(R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
         moved = position[1:] - position[:-1] - _applied(R_first_a, way)
-        d = np.zeros((len(way), 6, 27))
-        d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -self.d_turn
-        d[:, 3:, :3], d[:, 3:, 3:6], d[:, 3:, 12:15] = R_first_a @ skew(way), -one, one
-        d[:, 3:, 21:] = -R_first_a @ self.d_moved
+        d = np.zeros((len(way), 6, 18))
+        d[:, :3, :3], d[:, :3, 6:9], d[:, :3, 12:] = -R_b_a, one, -self.d_turn
+        d[:, 3:, :3], d[:, 3:, 3:6], d[:, 3:, 9:12] = R_first_a @ skew(way), -one, one
+        d[:, 3:, 12:] = -R_first_a @ self.d_moved
         return -np.concatenate([turn, moved], axis=1), d
 
 
