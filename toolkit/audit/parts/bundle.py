@@ -8,6 +8,7 @@ al. (2017), as in `strides`.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -231,8 +232,11 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     first, poses = np.searchsorted(track, np.arange(points)), POSE * n
     d_both = weight @ np.concatenate([seen.d_pose, seen.d_camera], axis=2)
     information, gradients = np.zeros((poses + _CAMERA, poses + _CAMERA)), np.zeros((points, poses + _CAMERA))
-    for k in range(n):
-        rows, pose = d_both[key == k].reshape(-1, POSE + _CAMERA), slice(POSE * k, POSE * (k + 1))
+    by_key = np.argsort(key, kind="stable")
+    in_order = d_both[by_key].reshape(-1, POSE + _CAMERA)
+    edges = 3 * np.searchsorted(key[by_key], np.arange(n + 1))
+    for k, (begin, end) in enumerate(pairwise(edges.tolist())):
+        rows, pose = in_order[begin:end], slice(POSE * k, POSE * (k + 1))
         squared = rows.T @ rows
         information[pose, pose], information[pose, poses:] = squared[:POSE, :POSE], squared[:POSE, POSE:]
         information[poses:, pose] = squared[POSE:, :POSE]
@@ -243,13 +247,12 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     gradients[:, :poses], gradients[:, poses:] = by_pose.reshape(points, -1), np.add.reduceat(pulled[:, POSE:], first)
     to_point = d_point.swapaxes(1, 2)
     of_point, cross = np.add.reduceat(to_point @ d_point, first), to_point @ d_both
-    point_cross, crossed = np.empty((points, 3, poses + _CAMERA)), np.zeros((points, 3, n, POSE))
-    crossed[track, :, key] = cross[:, :, :POSE]
-    point_cross[:, :, :poses] = crossed.reshape(points, 3, -1)
-    point_cross[:, :, poses:] = np.add.reduceat(cross[:, :, POSE:], first)
     ridge = _RIDGE * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(of_point + ridge))
-    point_cross = root @ point_cross
+    crossed = np.zeros((points, 3, n, POSE))
+    crossed[track, :, key] = root[track] @ cross[:, :, :POSE]
+    of_camera = root @ np.add.reduceat(cross[:, :, POSE:], first)
+    point_cross = np.concatenate([crossed.reshape(points, 3, -1), of_camera], axis=2)
     rest = _applied(root, np.add.reduceat(_applied(to_point, residual), first))
     flat = point_cross.reshape(3 * points, -1)
     gradients -= _applied(point_cross.swapaxes(1, 2), rest)

@@ -6,6 +6,7 @@ Source: Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for
 (2017), section VI.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -173,17 +174,15 @@ def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
 def twist_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> TwistStrides:
     """Chain the twists, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
     off = np.concatenate([np.zeros((1, 6)), _DIFFERENCE * np.eye(6)])[:, None]
-    ends = []
-    for motion in motions_between(sequence.motion, t_ns, None):
-        assert isinstance(motion, TwistMotion)
-        w_radps = motion.w_radps - w_bias_radps - off[:, :, :3]
-        v_mps = motion.v_mps + np.cross(off[:, :, 3:], motion.v_mps)
-        T_a_now = np.tile(np.eye(4), (7, 1, 1))
-        steps = se3_exp(motion.dt_s[:, None] * np.concatenate([w_radps, v_mps], axis=2))
-        for k in range(steps.shape[1]):
-            T_a_now = T_a_now @ steps[:, k]
-        ends.append(T_a_now)
-    T_a_b = np.array(ends)
+    motions = [motion for motion in motions_between(sequence.motion, t_ns, None) if isinstance(motion, TwistMotion)]
+    w_radps = np.concatenate([motion.w_radps for motion in motions]) - w_bias_radps - off[:, :, :3]
+    v_mps = np.concatenate([motion.v_mps for motion in motions])
+    v_mps = v_mps + np.cross(off[:, :, 3:], v_mps)
+    part_s = np.concatenate([motion.dt_s for motion in motions])[:, None]
+    steps = se3_exp(part_s * np.concatenate([w_radps, v_mps], axis=2)).swapaxes(0, 1)
+    of_strides = np.split(steps, np.cumsum([motion.dt_s.size for motion in motions])[:-1])
+    at_rest = np.tile(np.eye(4), (7, 1, 1))
+    T_a_b = np.array([reduce(np.matmul, of_stride, at_rest) for of_stride in of_strides])
     R_a_b, moved, dt_s = T_a_b[:, :, :3, :3], T_a_b[:, :, :3, 3], np.diff(t_ns) / NS_PER_S
     turned = so3_log(R_a_b[:, :1].swapaxes(2, 3) @ R_a_b[:, 1:])
     d_turn, d_moved = (np.moveaxis(x / _DIFFERENCE, 1, -1) for x in (turned, moved[:, 1:] - moved[:, :1]))
