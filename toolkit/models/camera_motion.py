@@ -165,7 +165,7 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     rotation = T_after_before[:3, :3]
     moved = _applied(rotation, views.points) + T_after_before[:3, 3]
     moved[2] = np.maximum(moved[2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
-    d_point_d_uv, d_after = _triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
+    d_point_d_uv, d_after = triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
     d_uv_d_before = _product(_product(d_after, rotation), d_point_d_uv)
     before_px = views.uv_before_px - project(views.points.T, rig).T
     residual_px = views.uv_after_px - project(moved.T, rig).T - _applied(d_uv_d_before, before_px)
@@ -206,7 +206,7 @@ def _applied(matrix: Array, vector: Array) -> Array:
     return np.asarray(np.einsum("ijp,jp->ip", matrix, vector))
 
 
-def _triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
+def triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
     """Return d(point)/d(uL, uR, v) (3, 3, P) of points (3, P) in the camera: the inverse of the projection's."""
     x, y, z = points
     d_z_px = z**2 / (rig.fx_px * rig.baseline_m)
