@@ -1,5 +1,7 @@
 """What tests of several packages share: the way to the real recordings, and one line that runs an estimator."""
 
+# ruff: noqa: E402 - the number of threads must be set before NumPy is imported
+
 import fcntl
 import gc
 import json
@@ -14,6 +16,13 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from toolkit.linear_algebra import THREAD_VARIABLES
+
+# Before NumPy is loaded, here and in the workers of these tests: their linear algebra would start a thread for every
+# processor, which fight for the processors of the other workers and take ten times as long.
+for _variable in THREAD_VARIABLES:
+    os.environ.setdefault(_variable, "1")
 
 import cv2
 import numpy as np

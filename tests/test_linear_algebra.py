@@ -5,6 +5,8 @@ import subprocess
 import sys
 import textwrap
 
+from threadpoolctl import threadpool_info
+
 
 def test_libraries_run_on_one_thread_those_too_that_are_loaded_after_the_first_time() -> None:
     program = textwrap.dedent("""
@@ -26,3 +28,9 @@ def test_libraries_run_on_one_thread_those_too_that_are_loaded_after_the_first_t
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment
     )
     assert ended.returncode == 0, ended.stderr
+
+
+def test_these_tests_have_as_many_threads_as_asked_for_and_one_where_nothing_is_asked() -> None:
+    """What pytest loads before `conftest` must not load NumPy."""
+    told = {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+    assert told == {int(os.environ["OPENBLAS_NUM_THREADS"])}

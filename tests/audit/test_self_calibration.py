@@ -95,9 +95,9 @@ def test_sightings_change_with_the_pose_and_the_point_as_their_jacobians_say(unk
     here, none = predicted(window, calibration), np.zeros_like(window.points)
 
     def posed(step: float) -> Array:
-        own = np.zeros((len(window.position), 9))
-        own[:, unknown] = step
-        return predicted(window.moved(np.append(own, np.zeros(3)), none), calibration).uv_px
+        own = np.zeros(window.unknowns)
+        own[unknown : -window.strides.gravity_size : window.strides.state_size] = step
+        return predicted(window.moved(own, none), calibration).uv_px
 
     np.testing.assert_allclose(here.d_pose[:, :, unknown], difference(posed), rtol=1e-5, atol=1e-4)
     if unknown < 3:
@@ -107,20 +107,24 @@ def test_sightings_change_with_the_pose_and_the_point_as_their_jacobians_say(unk
         np.testing.assert_allclose(here.d_point[:, :, unknown], along, rtol=1e-5, atol=1e-4)
 
 
-@pytest.mark.parametrize("scenario", [FLIGHT, DRIVE], ids=lambda scenario: scenario.name)
-@pytest.mark.parametrize("unknown", range(27))
+# Of the states at both ends, 9 numbers each and 6 beside odometry, of gravity, which odometry lacks, and of the biases.
+STRIDE_UNKNOWNS = [(FLIGHT, k) for k in range(27)] + [(DRIVE, k) for k in range(18)]
+
+
+@pytest.mark.parametrize("scenario, unknown", STRIDE_UNKNOWNS, ids=lambda one: getattr(one, "name", one))
 def test_what_strides_lack_changes_as_their_jacobian_says(unknown: int, scenario: Scenario) -> None:
     window, calibration = window_and_calibration(scenario)
-    key = 3
+    key, strides = 3, window.strides
+    assert stride_equations(window, calibration)[1].shape[2] == 2 * strides.state_size + strides.gravity_size + 6
 
     def lacking(step: float) -> Array:
         own, common = np.zeros(window.unknowns), np.zeros(COMMON)
-        if unknown < 18:
-            own[9 * key + unknown] = step
-        elif unknown < 21:
-            own[-3 + unknown - 18] = step
+        if unknown < 2 * strides.state_size:
+            own[strides.state_size * key + unknown] = step
+        elif unknown < 2 * strides.state_size + strides.gravity_size:
+            own[unknown - 2 * strides.state_size - strides.gravity_size] = step
         else:
-            common[13 + unknown - 21] = step
+            common[13 + unknown - 2 * strides.state_size - strides.gravity_size] = step
         after = window.moved(own, np.zeros_like(window.points))
         return -stride_equations(after, calibration.moved(common))[0][key]
 

@@ -8,10 +8,10 @@ import pytest
 
 from toolkit.audit import audit, lever_arm
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.parts.alignment import alignment
+from toolkit.audit.parts.alignment import alignment, velocity_regression
 from toolkit.audit.parts.deviations import Deviation, sustained
-from toolkit.audit.parts.turn import turn_of_camera
-from toolkit.geometry import se3, so3_exp
+from toolkit.audit.parts.turn import Turn, turn_by_velocities
+from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -64,11 +64,16 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
     assert intervals is not None
     turned = se3(so3_exp(np.array([0.3, 0.03, -0.04])), np.zeros(3)) @ T_imu_cam
     turned[:3, 3] = T_imu_cam[:3, 3]
-    found = turn_of_camera(intervals, turned)
+
+    def turn_of(T_imu_cam: Array) -> Turn:
+        assert intervals is not None and intervals.v_mps is not None
+        return turn_by_velocities(velocity_regression(intervals, intervals.v_mps, T_imu_cam))
+
+    found = turn_of(turned)
     assert found.rad.size == 2
     # Five of its standard errors, about 0.001 rad, and what the roll turns the sides into each other.
     assert np.linalg.norm(found.rad) == pytest.approx(0.05, abs=0.01)
-    assert (np.abs(turn_of_camera(intervals, T_imu_cam).rad) < 0.006).all()
+    assert (np.abs(turn_of(T_imu_cam).rad) < 0.006).all()
 
 
 def test_a_turned_camera_is_told_on_five_seconds_of_a_drive() -> None:

@@ -19,6 +19,7 @@ from toolkit.estimate import Run
 from toolkit.geometry import Array, se3_exp, transform
 from toolkit.initialization import start_from_measurements
 from toolkit.models import stereo
+from toolkit.models.camera_motion import triangulation_jacobian
 from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.stereo import d_uv_d_scale, scaled_rig
 from toolkit.sequence import Sequence, StereoFrame, StereoRig
@@ -93,6 +94,13 @@ def test_triangulation_inverts_the_projection(rig, pose, points_cam):
     uvs_px = stereo.predict(points, pose, rig).uv_px
     # A disparity of 2 px at 30 m leaves eleven digits of the depth.
     np.testing.assert_allclose(stereo.triangulate_world(uvs_px, pose, rig), points, atol=1e-9)
+
+
+@every_rig
+def test_a_triangulations_jacobian_is_the_inverse_of_the_projections(rig, points_cam):
+    of_triangulation = np.moveaxis(triangulation_jacobian(points_cam.T, rig), -1, 0)
+    product = stereo.projection_jacobian(points_cam, rig) @ of_triangulation
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)
 
 
 def test_depth_is_negative_behind_the_camera(pose):

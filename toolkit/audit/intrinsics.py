@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, own_one_step_px
 from toolkit.geometry import Array
-from toolkit.models.camera_motion import camera_motion
+from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence, StereoRig, is_measured
 
 # Quantiles of the sightings that are their range: tracks may slide out of the image.
@@ -46,7 +46,10 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     ordinary: dict[str, Any] = {key: value for fields, _ in faults for key, value in fields.items()}
     other = replace(sequence.rig, **ordinary)
-    given_px, other_px = _own_px(sequence), _own_px(replace(sequence, rig=other))
+    part = sequence.truncated(TRIED_FRAMES)
+    given_px = _own_px(part, evidence.camera_motion.first(max(part.frame_count - 1, 0)))
+    tried = replace(part, rig=other)
+    other_px = _own_px(tried, camera_motion(tried))
     if not given_px * (1.0 - LEAST_GAIN) > other_px:
         return None
     return Symptom(
@@ -111,10 +114,9 @@ def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None
     }, f"{words} times the size of those the sightings are in"
 
 
-def _own_px(sequence: Sequence) -> float:
+def _own_px(sequence: Sequence, camera: CameraMotion) -> float:
     """Return the median residual of the camera's own best motion; infinite where there is none."""
-    part = sequence.truncated(TRIED_FRAMES)
-    own_px = own_one_step_px(part, camera_motion(part))
+    own_px = own_one_step_px(sequence, camera)
     return own_px if np.isfinite(own_px) else np.inf
 
 

@@ -16,7 +16,7 @@ from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, hidden, wrong
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.turn import turn_of_camera
+from toolkit.audit.parts.turn import turn_by_rotations, turn_by_velocities
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
 from toolkit.measured_motion import MotionKind
 from toolkit.sequence import StereoRig
@@ -87,7 +87,8 @@ def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> 
 def _by_turn(evidence: Evidence, intervals: Intervals) -> _Judged:
     """Judge where the camera looks from frame to frame, which leaves the intrinsics open."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
-    turn = turn_of_camera(intervals, rig.T_imu_cam, evidence.known_s)
+    whole = None if evidence.alignment is None else evidence.alignment.by_velocities
+    turn = turn_by_rotations(intervals, rig.T_imu_cam) if whole is None else turn_by_velocities(whole)
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
         return _Judged([], _undecided(float(least_rad.min()), kind == "twist"))

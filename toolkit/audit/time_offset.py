@@ -17,10 +17,10 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import LATE
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
-from toolkit.audit.parts.robust import Scalar, slope, spread
+from toolkit.audit.parts.robust import MAD_TO_SIGMA, Scalar, slope, spread
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.audit.twist_lag import LAG
-from toolkit.geometry import Array, BoolArray
+from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.jackknife import jackknife_error
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
@@ -28,6 +28,8 @@ from toolkit.sequence import Sequence
 
 # How far it is searched for, and the step of the search in intervals.
 MOST_S, COARSE_STEP = 0.6, 0.25
+# So many means over an interval at a time: what is computed of them takes a megabyte, however long the recording.
+MEANS_AT_A_TIME = 10_000
 REFINEMENTS = 5
 # An offset is one beyond so many standard errors and beyond what is no fault: a sample of an IMU may stand for the
 # interval before or after its stamp, 5 ms at 100 Hz. A twist may stand for the interval before its stamp or after it,
@@ -175,9 +177,10 @@ def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Sca
     """Estimate how much later than its stamps (s) the camera's rotation is, or None where nothing tells."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
-    candidates = np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s)
-    at_zero = _unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, 0.0))
-    costs = [_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, offset_s)) for offset_s in candidates]
+    candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
+    some = np.array_split(candidates, 1 + candidates.size * len(w_imu) // MEANS_AT_A_TIME)
+    costs = np.concatenate([_unexplained(w_imu, *_gyro_at(gyro, sequence, intervals, part_s)) for part_s in some])
+    costs, at_zero = costs[:-1], costs[-1]
     if not np.isfinite(costs).any():
         return None
     best = int(np.nanargmin(costs))
@@ -220,19 +223,36 @@ def _change_seen(sequence: Sequence, intervals: Intervals, w_imu: Array) -> tupl
     return (seen[after] - seen[before]) / (2.0 * step_s), np.asarray(known[before] & known[after])
 
 
-def _gyro_at(gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float) -> tuple[Array, BoolArray]:
-    """Return the mean rates (M, 3) of the gyro over the intervals, shifted, and which of them it reaches (M,)."""
-    frames_t_ns = sequence.frames_t_ns + round(offset_s * NS_PER_S)
-    begin, end = frames_t_ns[intervals.interval], frames_t_ns[intervals.interval + 1]
-    inside = (begin >= gyro.t_ns[0]) & (end <= gyro.t_ns[-1])
-    return gyro.means(frames_t_ns)[intervals.interval], np.asarray(inside)
+def _gyro_at(
+    gyro: Integral, sequence: Sequence, intervals: Intervals, offset_s: float | Array
+) -> tuple[Array, BoolArray]:
+    """Return the mean rates (..., M, 3) of the gyro over the intervals, and which of them it reaches (..., M).
+
+    The intervals are shifted by the offsets (...) s.
+    """
+    begin = intervals.interval - intervals.interval[0]
+    shift_ns = np.rint(np.asarray(offset_s) * NS_PER_S).astype(np.int64)[..., None]
+    t_ns = sequence.frames_t_ns[intervals.interval[0] : intervals.interval[-1] + 2] + shift_ns
+    inside = (t_ns[..., begin] >= gyro.t_ns[0]) & (t_ns[..., begin + 1] <= gyro.t_ns[-1])
+    return gyro.means(t_ns)[..., begin, :], np.asarray(inside)
 
 
-def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> float:
-    """Return the spread of the difference over the intervals that are reached, squared; NaN where those are few."""
-    if inside.sum() < LEAST_INTERVALS:
-        return float("nan")
-    return float(np.sum(spread((w_imu - mean)[inside]) ** 2))
+def _unexplained(w_imu: Array, mean: Array, inside: BoolArray) -> Array:
+    """Return the spread of the differences (C, M, 3) over the intervals that are reached (C, M), squared (C,).
+
+    NaN where those are few.
+    """
+    reached = inside.sum(axis=-1)
+    apart = np.where(inside[:, None], (w_imu - mean).swapaxes(-1, -2), np.nan)
+    deviation = MAD_TO_SIGMA * _medians(np.abs(apart - _medians(apart, reached)), reached)
+    return np.where(reached < LEAST_INTERVALS, np.nan, np.sum(deviation[..., 0] ** 2, axis=-1))
+
+
+def _medians(values: Array, reached: IntArray) -> Array:
+    """Return the medians (C, d, 1) of values (C, d, M), of which so many (C,) are no NaN: those come last in order."""
+    ordered, last = np.sort(values, axis=-1), np.maximum(reached - 1, 0)
+    middle = [np.take_along_axis(ordered, row[:, None, None], axis=-1) for row in (last // 2, (last + 1) // 2)]
+    return np.asarray(0.5 * (middle[0] + middle[1]))
 
 
 def _share_apart(w_imu: Array, mean: Array) -> float:

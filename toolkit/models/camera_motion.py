@@ -10,12 +10,11 @@ Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment" (2000), section 6.
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log, skew
+from toolkit.geometry import Array, BoolArray, IntArray, se3_exp, se3_inverse, se3_log
 from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.models.stereo import disparity_px, project, projection_jacobian, triangulate
 from toolkit.resampling import NS_PER_S
@@ -48,6 +47,10 @@ class CameraMotion(NamedTuple):
     w_radps: Array
     v_mps: Array
     known: BoolArray
+
+    def first(self, intervals: int) -> "CameraMotion":
+        """Return the motion over so many intervals from the first one on."""
+        return CameraMotion(self.w_radps[:intervals], self.v_mps[:intervals], self.known[:intervals])
 
 
 class Neighbours(NamedTuple):
@@ -162,18 +165,16 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     rotation = T_after_before[:3, :3]
     moved = _applied(rotation, views.points) + T_after_before[:3, 3]
     moved[2] = np.maximum(moved[2], LEAST_DEPTH_M)  # a point behind is a gross outlier, not a division by zero
-    d_point_d_uv, d_after = _triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
+    d_point_d_uv, d_after = triangulation_jacobian(views.points, rig), _last(projection_jacobian(moved.T, rig))
     d_uv_d_before = _product(_product(d_after, rotation), d_point_d_uv)
     before_px = views.uv_before_px - project(views.points.T, rig).T
     residual_px = views.uv_after_px - project(moved.T, rig).T - _applied(d_uv_d_before, before_px)
-    spread = np.einsum("ijp,jk->ikp", d_uv_d_before, rig.cov_uv_px2)
+    spread = rig.cov_uv_px2 @ d_uv_d_before
     whitener = _whitener(_ridged(rig.cov_uv_px2[..., None] + np.einsum("ijp,kjp->ikp", spread, d_uv_d_before)))
     white = _applied(whitener, residual_px)
     weight = _cauchy_weights((white**2).sum(axis=0), views)
-    # A step [phi, rho] on the right of the motion moves a point p of the later view by [p]x phi - rho.
-    d_white = _product(whitener, d_after)
-    equations = [_product(d_white, _last(skew(moved.T))), -d_white, white[:, None]]
-    normal = _normal_by_interval(np.sqrt(weight) * np.concatenate(equations, axis=1), views.first)
+    root = np.sqrt(weight)
+    normal = _normal_by_interval(_equations(root * _product(whitener, d_after), moved, root * white), views.first)
     # The ridge keeps an interval without tracks where it is; it is far below one sighting's information.
     hessian = np.moveaxis(_ridged(normal[:6, :6]), -1, 0) + 1e-6 * np.eye(6)
     step = np.asarray(np.linalg.solve(hessian, np.moveaxis(normal[:6, 6:], -1, 0))[..., 0], dtype=np.float64)
@@ -183,6 +184,16 @@ def _gauss_newton(views: _TwoViews, T_before_after: Array, rig: StereoRig) -> tu
     points[2] = np.clip(points[2], LEAST_DEPTH_M, MOST_DEPTH_M)
     support = np.bincount(views.interval, weight, len(step)).astype(np.float64)
     return step, support, points
+
+
+def _equations(d_white: Array, moved: Array, white: Array) -> Array:
+    """Return the equations (7, 3, P) of a step [phi, rho] on the right of the motion, and what they lack.
+
+    The step moves a point p of the later view, one of ``moved`` (3, P), by [p]x phi - rho.
+    """
+    d_x, d_y, d_z = d_white.swapaxes(0, 1)
+    x, y, z = moved
+    return np.stack([d_y * z - d_z * y, d_z * x - d_x * z, d_x * y - d_y * x, -d_x, -d_y, -d_z, white])
 
 
 def _product(a: Array, b: Array) -> Array:
@@ -195,7 +206,7 @@ def _applied(matrix: Array, vector: Array) -> Array:
     return np.asarray(np.einsum("ijp,jp->ip", matrix, vector))
 
 
-def _triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
+def triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
     """Return d(point)/d(uL, uR, v) (3, 3, P) of points (3, P) in the camera: the inverse of the projection's."""
     x, y, z = points
     d_z_px = z**2 / (rig.fx_px * rig.baseline_m)
@@ -209,7 +220,9 @@ def _triangulation_jacobian(points: Array, rig: StereoRig) -> Array:
 
 def _ridged(matrices: Array) -> Array:
     """Return symmetric matrices (d, d, N) with a ridge on each, so that a singular one can be solved."""
-    return np.asarray(matrices + RIDGE * np.trace(matrices) * np.eye(len(matrices))[..., None])
+    ridged, diagonal = matrices.copy(), np.arange(len(matrices))
+    ridged[diagonal, diagonal] += RIDGE * np.trace(matrices)
+    return ridged
 
 
 def _whitener(cov: Array) -> Array:
@@ -244,8 +257,10 @@ def _cauchy_weights(chi2: Array, views: _TwoViews) -> Array:
 
 
 def _normal_by_interval(equations: Array, first: IntArray) -> Array:
-    """Return A^T A (d, d, K - 1) of the equations (3, d, P) of each interval, which are consecutive."""
-    d = equations.shape[1]
-    by_unknown = equations.swapaxes(0, 1)
-    of_intervals = (by_unknown[..., a:b].reshape(d, -1) for a, b in pairwise(first.tolist()))
-    return np.stack([rows @ rows.T for rows in of_intervals], axis=-1)
+    """Return A^T A (d, d, K - 1) of the equations (d, 3, P) of each interval, which are consecutive; zero of none."""
+    normal, seen = np.zeros((len(equations), len(equations), first.size - 1)), np.diff(first) > 0
+    for k, row in enumerate(equations):
+        products = np.einsum("ip,jip->jp", row, equations[k:])
+        normal[k, k:, seen] = np.add.reduceat(products, first[:-1][seen], axis=1).T
+        normal[k:, k] = normal[k, k:]
+    return normal

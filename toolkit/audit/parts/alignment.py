@@ -26,7 +26,7 @@ from toolkit.audit.parts.robust import (
 )
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
-from toolkit.jackknife import jackknife_cov
+from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
@@ -41,17 +41,32 @@ ACCEL_BIAS, GYRO_BIAS = 0.2, 0.01
 _LEVER, TURN, _COMMON = slice(1, 4), slice(4, 7), 13
 
 
+class Regression(NamedTuple):
+    """What the difference of the velocities depends on (7,), in the order of ``velocity_equations``.
+
+    ``formal`` (7, 7) is the covariance if every interval erred by itself, ``cov`` (7, 7) that of a jackknife over
+    ``stretches`` no shorter than slip lasts, in which the vehicle moved as in so many of ``in_motion``.
+    """
+
+    found: Array
+    formal: Array
+    cov: Array
+    stretches: int
+    in_motion: float
+
+
 class Alignment(NamedTuple):
     """What the camera's translation is too long by, as a share, and what its position in the IMU frame lacks (3,) m.
 
     ``lever_cov_m2`` (3, 3) is the covariance of the latter, ``scale_by_chance`` what the scale is beyond by chance less
-    often than ``robust.LEVEL``.
+    often than ``robust.LEVEL``. ``by_velocities`` is the whole regression beside odometry.
     """
 
     scale: Scalar
     lever_m: Array
     lever_cov_m2: Array
     scale_by_chance: float = np.inf
+    by_velocities: Regression | None = None
 
     @property
     def lever_error_m(self) -> Array:
@@ -73,22 +88,32 @@ def _with_velocities(intervals: Intervals, v_mps: Array, T_imu_cam: Array, step_
     Noise of the regressor feigns a scale. What the regression of the one on the other and its inverse leave open
     between them counts for nothing (Frisch, "Statistical confluence analysis", 1934).
     """
+    whole = velocity_regression(intervals, v_mps, T_imu_cam, len(v_mps) * step_s)
     measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
-    found = robust_solution(measured - seen, jacobian)
-    cov = jackknife_cov(robust_solution, measured - seen, jacobian)
-    other = float(robust_solution(seen - measured, measured[:, :, None])[0])
-    one = 1.0 / (1.0 - float(found[0])) - 1.0
+    cov = whole.cov
+    if whole.stretches != STRETCHES:
+        cov = jackknife_cov(_robust_solution, measured - seen, jacobian)
+    other = float(_robust_solution(seen - measured, measured[:, :, None])[0])
+    one = 1.0 / (1.0 - float(whole.found[0])) - 1.0
     scale = 0.0 if one * other < 0.0 else min(one, other, key=abs)
     error = float(np.sqrt(cov[0, 0])) * (1.0 + scale) ** 2
-    by_chance = (1.0 + scale) ** 2 * _by_chance(measured - seen, jacobian, seen, slip_stretches(len(seen) * step_s))
-    return Alignment(Scalar(scale, error), found[_LEVER], cov[_LEVER, _LEVER], by_chance)
+    by_chance = (1.0 + scale) ** 2 * _by_chance(whole)
+    return Alignment(Scalar(scale, error), whole.found[_LEVER], cov[_LEVER, _LEVER], by_chance, whole)
 
 
-def _by_chance(response: Array, jacobian: Array, seen: Array, stretches: int) -> float:
+def _by_chance(whole: Regression) -> float:
     """Return what the first unknown is beyond by chance, where its errors last as long as slip."""
-    slipping = np.sqrt(jackknife_cov(robust_solution, response, jacobian, stretches=stretches)[:1, 0])
-    formal = np.sqrt(formal_cov(response, jacobian)[:1, 0])
-    return float(chance_bound(slipping, formal, in_motion(seen, stretches), INFLATION["twist"])[0])
+    slipping, formal = np.sqrt(whole.cov[:1, 0]), np.sqrt(whole.formal[:1, 0])
+    return float(chance_bound(slipping, formal, whole.in_motion, INFLATION["twist"])[0])
+
+
+def velocity_regression(intervals: Intervals, v_mps: Array, T_imu_cam: Array, duration_s: float = np.inf) -> Regression:
+    """Regress the difference of the camera's velocity and the measured one on what makes one, by Cauchy weights."""
+    stretches = slip_stretches(duration_s)
+    measured, seen, jacobian = velocity_equations(intervals, v_mps, T_imu_cam)
+    found, formal = robust_with_formal_cov(measured - seen, jacobian)
+    cov = jackknife_cov(_robust_solution, measured - seen, jacobian, stretches=stretches)
+    return Regression(found, formal, cov, stretches, in_motion(seen, stretches))
 
 
 def velocity_equations(intervals: Intervals, v_mps: Array, T_imu_cam: Array) -> tuple[Array, Array, Array]:
@@ -213,14 +238,17 @@ def chained(step: Array) -> Array:
     return products
 
 
-def robust_solution(response: Array, jacobian: Array) -> Array:
-    """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights."""
+def robust_with_formal_cov(response: Array, jacobian: Array) -> tuple[Array, Array]:
+    """Solve response (M, 3) = jacobian (M, 3, m) x by least squares with Cauchy weights.
+
+    The covariance (m, m) is that if every row erred by itself.
+    """
+    found, information, _ = _weighted(response, jacobian, np.zeros(jacobian.shape[2]))
+    return found, np.asarray(np.linalg.inv(information))
+
+
+def _robust_solution(response: Array, jacobian: Array) -> Array:
     return _weighted(response, jacobian, np.zeros(jacobian.shape[2]))[0]
-
-
-def formal_cov(response: Array, jacobian: Array) -> Array:
-    """Return the covariance (m, m) of that solution if every row erred by itself."""
-    return np.asarray(np.linalg.inv(_weighted(response, jacobian, np.zeros(jacobian.shape[2]))[1]))
 
 
 def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntArray) -> tuple[Array, Array]:
@@ -240,14 +268,15 @@ def _robust_with_cov(response: Array, jacobian: Array, prior: Array, block: IntA
 def _weighted(response: Array, jacobian: Array, prior: Array) -> tuple[Array, Array, Array]:
     """Return the solution (m,), its information (m, m) and the weighted gradient (M, m) of every row there."""
     unknowns = jacobian.shape[2]
-    found = np.linalg.lstsq(jacobian.reshape(-1, unknowns), response.ravel())[0]
+    rows, flat = jacobian.reshape(-1, unknowns), response.ravel()
+    found = np.linalg.lstsq(rows, flat)[0]
     for _ in range(ITERATIONS):
-        residual = response - jacobian @ found
+        residual = (flat - rows @ found).reshape(response.shape)
         scale = np.maximum(spread(residual), 1e-9)
         weight = 1.0 / (1.0 + (residual / scale) ** 2 / CAUCHY_SIGMAS**2) / scale**2
-        weighted = jacobian * weight[:, :, None]
-        information: Array = weighted.reshape(-1, unknowns).T @ jacobian.reshape(-1, unknowns) + np.diag(prior)
+        weighted = rows * weight.reshape(-1, 1)
+        information: Array = weighted.T @ rows + np.diag(prior)
         information += 1e-12 * np.trace(information) * np.eye(unknowns)
-        found = np.linalg.solve(information, weighted.reshape(-1, unknowns).T @ response.ravel())
-    score = np.einsum("nij,ni->nj", weighted, response - jacobian @ found)
+        found = np.linalg.solve(information, weighted.T @ flat)
+    score = np.einsum("nij,ni->nj", weighted.reshape(jacobian.shape), (flat - rows @ found).reshape(response.shape))
     return np.asarray(found), information, score

@@ -1,13 +1,14 @@
 """One window of an adjustment of key frames and points beside measured motion, linearised, its calibration unknown.
 
-Unknowns are the states of the key frames (9 each: turn on the right, position, velocity in the axes of the first), the
-gravity of the window (3), and the calibration that all windows share (19). Points are eliminated track by track, states
-and gravity after that, so that a window says what it knows of the calibration alone.
+Unknowns are the poses of the key frames (6 each: turn on the right, position in the axes of the first), beside an IMU
+with their velocities (3) and the gravity of the window (3), and the calibration that all windows share (19). Points are
+eliminated track by track, the window's own unknowns after that, so that it says what it knows of the calibration alone.
 Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
 al. (2017), as in `strides`.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from toolkit.geometry import Array, IntArray, se3, skew, so3_exp
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
-STATE, GRAVITY, COMMON = 9, 3, 19
+POSE, COMMON = 6, 19
 # Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
 # in its own axes (rad), its position in the IMU (m), how much later than its stamps it saw (s), and by how much more so
 # in the second half of the recording than in the first (s); the biases of gyro and accelerometer, or beside odometry of
@@ -82,18 +83,21 @@ class Window(NamedTuple):
     @property
     def unknowns(self) -> int:
         """How many unknowns are the window's own, without its points."""
-        return STATE * len(self.position) + GRAVITY
+        return self.strides.state_size * len(self.position) + self.strides.gravity_size
 
     def moved(self, own: Array, points: Array) -> "Window":
         """Return the window after steps of its own unknowns and of its points (T, 3)."""
-        state = own[:-GRAVITY].reshape(-1, STATE)
-        return self._replace(
+        count = len(self.position)
+        state, gravity = np.split(own, [self.strides.state_size * count])
+        state = state.reshape(count, -1)
+        after = self._replace(
             R_first_imu=self.R_first_imu @ so3_exp(state[:, :3]),
-            position=self.position + state[:, 3:6],
-            velocity=self.velocity + state[:, 6:],
-            gravity=self.gravity + own[-GRAVITY:],
+            position=self.position + state[:, 3:POSE],
             points=self.points + points,
         )
+        if not gravity.size:
+            return after
+        return after._replace(velocity=self.velocity + state[:, POSE:], gravity=self.gravity + gravity)
 
 
 class Reduced(NamedTuple):
@@ -109,18 +113,20 @@ class Reduced(NamedTuple):
 
 
 class _Back(NamedTuple):
-    """Own unknowns (U,) = own - per_common @ step; points (T, 3) likewise of what was eliminated with them."""
+    """Own unknowns (U,) = own - per_common @ step; points (T, 3) likewise of what was eliminated with them.
+
+    ``seen`` (E,) are the unknowns that the tracks' equations have.
+    """
 
     own: Array
     per_common: Array
-    point_root: Array
-    point_cross: Array
-    point_rest: Array
+    seen: IntArray
+    tracks: "_Tracks"
 
     def steps(self, common: Array) -> tuple[Array, Array]:
-        own = self.own - self.per_common @ common
-        rest = self.point_rest - self.point_cross @ np.append(own, common)
-        return own, (self.point_root.swapaxes(1, 2) @ rest[:, :, None])[..., 0]
+        own, tracks = self.own - self.per_common @ common, self.tracks
+        rest = tracks.point_rest - tracks.point_cross @ np.append(own, common)[self.seen]
+        return own, (tracks.point_root.swapaxes(1, 2) @ rest[:, :, None])[..., 0]
 
 
 def moved(window: Window, reduced: Reduced, step: Array) -> Window:
@@ -130,20 +136,29 @@ def moved(window: Window, reduced: Reduced, step: Array) -> Window:
 
 def reduce(window: Window, calibration: Calibration) -> Reduced:
     """Linearise the window and eliminate its own unknowns and its points."""
-    tracks = _tracks(window, calibration)
-    own, by_stride = window.unknowns, _strides(window, calibration)
-    information = tracks.information + by_stride.information
-    gradients = np.concatenate([tracks.gradients, by_stride.gradients])
+    tracks, by_stride = _tracks(window, calibration), _strides(window, calibration)
+    own, seen, information = window.unknowns, _seen(window), by_stride.information
+    information[seen[:, None], seen] += tracks.information
+    gradients = np.zeros((len(tracks.gradients) + len(by_stride.gradients), own + COMMON))
+    gradients[: len(tracks.gradients), seen] = tracks.gradients
+    gradients[len(tracks.gradients) :] = by_stride.gradients
     gradient = gradients.sum(axis=0)
     information[np.arange(6), np.arange(6)] += _GAUGE
     information[np.arange(own), np.arange(own)] += _RIDGE
     cross = information[:own, own:]
     solved = np.linalg.solve(information[:own, :own], np.column_stack([cross, gradient[:own]]))
     per_common = solved[:, :-1]
-    back = _Back(solved[:, -1], per_common, tracks.point_root, tracks.point_cross, tracks.point_rest)
     return Reduced(
-        information[own:, own:] - cross.T @ per_common, gradients[:, own:] - gradients[:, :own] @ per_common, back
+        information[own:, own:] - cross.T @ per_common,
+        gradients[:, own:] - gradients[:, :own] @ per_common,
+        _Back(solved[:, -1], per_common, seen, tracks),
     )
+
+
+def _seen(window: Window) -> IntArray:
+    """Return the unknowns (E,) that sightings depend on: the poses and what is common but for the biases."""
+    of_poses = window.strides.state_size * np.arange(len(window.position))[:, None] + np.arange(POSE)
+    return np.concatenate([of_poses.ravel(), window.unknowns + np.arange(_CAMERA)])
 
 
 class _Normal(NamedTuple):
@@ -152,7 +167,10 @@ class _Normal(NamedTuple):
 
 
 class _Tracks(NamedTuple):
-    """Information (D, D) and gradients (T, D) of the tracks, and what of their points was eliminated."""
+    """Information (E, E) and gradients (T, E) of the tracks, and what of their points was eliminated.
+
+    Its columns are the poses, 6 each, and the 13 of the common unknowns that the camera's sightings depend on.
+    """
 
     information: Array
     gradients: Array
@@ -206,34 +224,35 @@ def _weighted(residual_px: Array, rig: StereoRig) -> Array:
 
 
 def _tracks(window: Window, calibration: Calibration) -> _Tracks:
-    """Return the tracks' normal equations in the window's own and the common unknowns, without the points."""
+    """Return the tracks' normal equations in the poses and the camera, without the points."""
     seen, key, track = predicted(window, calibration), window.key, window.track
     weight = _weighted(window.uv_px - seen.uv_px, calibration.rig)
     residual, d_point = _applied(weight, window.uv_px - seen.uv_px), weight @ seen.d_point
-    n, points, own = len(window.position), len(window.points), window.unknowns
-    first, camera = np.searchsorted(track, np.arange(points)), slice(own, own + _CAMERA)
+    n, points = len(window.position), len(window.points)
+    first, poses = np.searchsorted(track, np.arange(points)), POSE * n
     d_both = weight @ np.concatenate([seen.d_pose, seen.d_camera], axis=2)
-    information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((points, own + COMMON))
-    for k in range(n):
-        rows, pose = d_both[key == k].reshape(-1, 6 + _CAMERA), slice(STATE * k, STATE * k + 6)
+    information, gradients = np.zeros((poses + _CAMERA, poses + _CAMERA)), np.zeros((points, poses + _CAMERA))
+    by_key = np.argsort(key, kind="stable")
+    in_order = d_both[by_key].reshape(-1, POSE + _CAMERA)
+    edges = 3 * np.searchsorted(key[by_key], np.arange(n + 1))
+    for k, (begin, end) in enumerate(pairwise(edges.tolist())):
+        rows, pose = in_order[begin:end], slice(POSE * k, POSE * (k + 1))
         squared = rows.T @ rows
-        information[pose, pose], information[pose, camera] = squared[:6, :6], squared[:6, 6:]
-        information[camera, pose] = squared[6:, :6]
-        information[camera, camera] += squared[6:, 6:]
+        information[pose, pose], information[pose, poses:] = squared[:POSE, :POSE], squared[:POSE, POSE:]
+        information[poses:, pose] = squared[POSE:, :POSE]
+        information[poses:, poses:] += squared[POSE:, POSE:]
     pulled = _applied(d_both.swapaxes(1, 2), residual)
-    states = gradients[:, : STATE * n].reshape(points, n, STATE)
-    states[track, key, :6] = pulled[:, :6]
-    gradients[:, : STATE * n], gradients[:, camera] = states.reshape(points, -1), np.add.reduceat(pulled[:, 6:], first)
+    by_pose = np.zeros((points, n, POSE))
+    by_pose[track, key] = pulled[:, :POSE]
+    gradients[:, :poses], gradients[:, poses:] = by_pose.reshape(points, -1), np.add.reduceat(pulled[:, POSE:], first)
     to_point = d_point.swapaxes(1, 2)
     of_point, cross = np.add.reduceat(to_point @ d_point, first), to_point @ d_both
-    point_cross = np.zeros((points, 3, own + COMMON))
-    by_state = np.zeros((points, 3, n, STATE))
-    by_state[track, :, key, :6] = cross[:, :, :6]
-    point_cross[:, :, : STATE * n] = by_state.reshape(points, 3, -1)
-    point_cross[:, :, camera] = np.add.reduceat(cross[:, :, 6:], first)
     ridge = _RIDGE * np.trace(of_point, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     root = np.linalg.inv(np.linalg.cholesky(of_point + ridge))
-    point_cross = root @ point_cross
+    crossed = np.zeros((points, 3, n, POSE))
+    crossed[track, :, key] = root[track] @ cross[:, :, :POSE]
+    of_camera = root @ np.add.reduceat(cross[:, :, POSE:], first)
+    point_cross = np.concatenate([crossed.reshape(points, 3, -1), of_camera], axis=2)
     rest = _applied(root, np.add.reduceat(_applied(to_point, residual), first))
     flat = point_cross.reshape(3 * points, -1)
     gradients -= _applied(point_cross.swapaxes(1, 2), rest)
@@ -243,22 +262,22 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
 def _strides(window: Window, calibration: Calibration) -> _Normal:
     """Return the normal equations of the motion between the key frames, with gradients by parts of a second or more."""
     residual, jacobian = stride_equations(window, calibration)
-    whitener = window.strides.whitener
+    whitener, state = window.strides.whitener, window.strides.state_size
     residual, jacobian = _applied(whitener, residual), whitener @ jacobian
-    strides, own = len(residual), window.unknowns
-    information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((strides, own + COMMON))
-    shared = np.append(np.arange(own - GRAVITY, own), own + np.arange(COMMON)[_BIASES])
-    for k in range(strides):
-        columns = np.append(STATE * k + np.arange(2 * STATE), shared)
-        information[np.ix_(columns, columns)] += jacobian[k].T @ jacobian[k]
-        gradients[k, columns] = jacobian[k].T @ residual[k]
+    to_unknowns, count, own = jacobian.swapaxes(1, 2), len(residual), window.unknowns
+    squared, pulled = to_unknowns @ jacobian, _applied(to_unknowns, residual)
+    shared = np.append(np.arange(own - window.strides.gravity_size, own), own + np.arange(COMMON)[_BIASES])
+    both = np.concatenate([state * np.arange(count)[:, None] + np.arange(2 * state), np.tile(shared, (count, 1))], 1)
+    information, gradients = np.zeros((own + COMMON, own + COMMON)), np.zeros((count, own + COMMON))
+    np.add.at(information, (both[:, :, None], both[:, None, :]), squared)
+    gradients[np.arange(count)[:, None], both] = pulled
     elapsed_s = np.cumsum(window.strides.dt_s)
     part = np.flatnonzero(np.diff((elapsed_s - elapsed_s[0]) // 1.0, prepend=-1.0))
     return _Normal(information, np.add.reduceat(gradients, part))
 
 
 def stride_equations(window: Window, calibration: Calibration) -> tuple[Array, Array]:
-    """Return what the strides lack (m, k) and its change (m, k, 27) by the states at both ends, gravity and biases."""
+    """Return what the strides lack (m, k) and its change (m, k, j) by the states at both ends, gravity and biases."""
     attitudes, position, velocity = window.R_first_imu, window.position, window.velocity
     return window.strides.equations(attitudes, position, velocity, window.gravity, calibration.bias)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import moved_by
 from toolkit.geometry import Array, IntArray, se3_inverse, transform
-from toolkit.models.camera_motion import CameraMotion, usable_pairs
+from toolkit.models.camera_motion import CameraMotion, triangulation_jacobian, usable_pairs
 from toolkit.models.gating import LEAST_DEPTH_M
 from toolkit.models.stereo import project, projection_jacobian, triangulate
 from toolkit.sequence import Sequence
@@ -35,7 +35,8 @@ def one_step(sequence: Sequence, camera: CameraMotion) -> OneStep:
     before = triangulate(uv_px[pairs.before], rig)
     after = transform(T_after_before, before)
     after[:, 2] = np.maximum(after[:, 2], LEAST_DEPTH_M)
-    d_after_d_before = T_after_before[:, :3, :3] @ np.linalg.inv(projection_jacobian(before, rig))
+    d_point_d_uv = np.ascontiguousarray(np.moveaxis(triangulation_jacobian(before.T, rig), -1, 0))
+    d_after_d_before = T_after_before[:, :3, :3] @ d_point_d_uv
     jacobian = projection_jacobian(after, rig) @ d_after_d_before
     cov_px2 = jacobian @ rig.cov_uv_px2 @ jacobian.swapaxes(1, 2) + rig.cov_uv_px2
     return OneStep(pairs.before, pairs.after, uv_px[pairs.after] - project(after, rig), cov_px2, jacobian)

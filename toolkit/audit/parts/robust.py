@@ -106,12 +106,15 @@ def slope(instrument: Array, regressor: Array, response: Array) -> Scalar:
     """
     scale = np.maximum(spread(response), 1e-9)
     z, x, y = instrument / scale, regressor / scale, response / scale
-    value, weight = 0.0, np.ones_like(z)
+    # A row has one weight, so the products of its components are summed beforehand.
+    zy, zx, yy, xy, xx = (np.einsum("ij,ij->i", a, b) for a, b in ((z, y), (z, x), (y, y), (x, y), (x, x)))
+    value, weight = 0.0, np.ones(len(z))
     for _ in range(ITERATIONS):
-        value = float(np.sum(weight * z * y) / _away_from_zero(np.sum(weight * z * x)))
-        weight = 1.0 / (1.0 + np.sum((y - value * x) ** 2, axis=1, keepdims=True) / (z.shape[1] * CAUCHY_SIGMAS**2))
-    moment = np.sum(weight * z * (y - value * x), axis=1)
-    return Scalar(value, float(np.sqrt(np.sum(moment**2)) / abs(_away_from_zero(np.sum(weight * z * x)))))
+        value = float(weight @ zy) / _away_from_zero(float(weight @ zx))
+        chi2 = yy - 2.0 * value * xy + value**2 * xx
+        weight = 1.0 / (1.0 + chi2 / (z.shape[1] * CAUCHY_SIGMAS**2))
+    moment = weight * (zy - value * zx)
+    return Scalar(value, float(np.linalg.norm(moment)) / abs(_away_from_zero(float(weight @ zx))))
 
 
 def _away_from_zero(x: float) -> float:

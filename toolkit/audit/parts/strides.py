@@ -6,6 +6,7 @@ Source: Forster, Carlone, Dellaert & Scaramuzza, "On-manifold preintegration for
 (2017), section VI.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +40,16 @@ class ImuStrides(NamedTuple):
     d_faster: Array
     d_moved: Array
     whitener: Array
+
+    @property
+    def state_size(self) -> int:
+        """How many unknowns of a state the equations depend on: turn, position and velocity."""
+        return 9
+
+    @property
+    def gravity_size(self) -> int:
+        """How many unknowns of gravity they depend on."""
+        return 3
 
     def biased(self, bias: Array) -> "ImuStrides":
         """Return what the strides are where the biases (6,) are these."""
@@ -88,22 +99,32 @@ class TwistStrides(NamedTuple):
     d_moved: Array
     whitener: Array
 
+    @property
+    def state_size(self) -> int:
+        """How many unknowns of a state the equations depend on: turn and position."""
+        return 6
+
+    @property
+    def gravity_size(self) -> int:
+        """How many unknowns of gravity they depend on: none."""
+        return 0
+
     def equations(
         self, R_first_imu: Array, position: Array, velocity: Array, gravity: Array, bias: Array
     ) -> tuple[Array, Array]:
-        """Return what states lack (m, 6), turn and position, and its change (m, 6, 27) by the same unknowns.
+        """Return what states lack (m, 6), turn and position, and its change (m, 6, 18) by the unknowns.
 
-        Velocities and gravity are not among what odometry tells of states.
+        Unknowns are the poses at both ends (6 each) and the biases (6,).
         """
         R_first_a, R_first_b, one = R_first_imu[:-1], R_first_imu[1:], np.eye(3)
         R_b_a = R_first_b.swapaxes(1, 2) @ R_first_a
         R_a_b, way = self.R_a_b @ so3_exp(self.d_turn @ bias), self.moved + self.d_moved @ bias
         turn = so3_log(R_a_b.swapaxes(1, 2) @ R_b_a.swapaxes(1, 2))
         moved = position[1:] - position[:-1] - _applied(R_first_a, way)
-        d = np.zeros((len(way), 6, 27))
-        d[:, :3, :3], d[:, :3, 9:12], d[:, :3, 21:] = -R_b_a, one, -self.d_turn
-        d[:, 3:, :3], d[:, 3:, 3:6], d[:, 3:, 12:15] = R_first_a @ skew(way), -one, one
-        d[:, 3:, 21:] = -R_first_a @ self.d_moved
+        d = np.zeros((len(way), 6, 18))
+        d[:, :3, :3], d[:, :3, 6:9], d[:, :3, 12:] = -R_b_a, one, -self.d_turn
+        d[:, 3:, :3], d[:, 3:, 3:6], d[:, 3:, 9:12] = R_first_a @ skew(way), -one, one
+        d[:, 3:, 12:] = -R_first_a @ self.d_moved
         return -np.concatenate([turn, moved], axis=1), d
 
 
@@ -153,17 +174,15 @@ def _imu_whitener(sequence: Sequence, dt_s: Array) -> Array:
 def twist_strides(sequence: Sequence, t_ns: IntArray, w_bias_radps: Array) -> TwistStrides:
     """Chain the twists, less a bias (3,) of the gyro, between stamps (m + 1,) of frames."""
     off = np.concatenate([np.zeros((1, 6)), _DIFFERENCE * np.eye(6)])[:, None]
-    ends = []
-    for motion in motions_between(sequence.motion, t_ns, None):
-        assert isinstance(motion, TwistMotion)
-        w_radps = motion.w_radps - w_bias_radps - off[:, :, :3]
-        v_mps = motion.v_mps + np.cross(off[:, :, 3:], motion.v_mps)
-        T_a_now = np.tile(np.eye(4), (7, 1, 1))
-        steps = se3_exp(motion.dt_s[:, None] * np.concatenate([w_radps, v_mps], axis=2))
-        for k in range(steps.shape[1]):
-            T_a_now = T_a_now @ steps[:, k]
-        ends.append(T_a_now)
-    T_a_b = np.array(ends)
+    motions = [motion for motion in motions_between(sequence.motion, t_ns, None) if isinstance(motion, TwistMotion)]
+    w_radps = np.concatenate([motion.w_radps for motion in motions]) - w_bias_radps - off[:, :, :3]
+    v_mps = np.concatenate([motion.v_mps for motion in motions])
+    v_mps = v_mps + np.cross(off[:, :, 3:], v_mps)
+    part_s = np.concatenate([motion.dt_s for motion in motions])[:, None]
+    steps = se3_exp(part_s * np.concatenate([w_radps, v_mps], axis=2)).swapaxes(0, 1)
+    of_strides = np.split(steps, np.cumsum([motion.dt_s.size for motion in motions])[:-1])
+    at_rest = np.tile(np.eye(4), (7, 1, 1))
+    T_a_b = np.array([reduce(np.matmul, of_stride, at_rest) for of_stride in of_strides])
     R_a_b, moved, dt_s = T_a_b[:, :, :3, :3], T_a_b[:, :, :3, 3], np.diff(t_ns) / NS_PER_S
     turned = so3_log(R_a_b[:, :1].swapaxes(2, 3) @ R_a_b[:, 1:])
     d_turn, d_moved = (np.moveaxis(x / _DIFFERENCE, 1, -1) for x in (turned, moved[:, 1:] - moved[:, :1]))

@@ -9,16 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.parts.alignment import TURN, formal_cov, robust_solution, velocity_equations
+from toolkit.audit.parts.alignment import TURN, Regression, robust_with_formal_cov
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import (
-    INFLATION,
-    chance_bound,
-    in_motion,
-    slip_stretches,
-)
+from toolkit.audit.parts.robust import INFLATION, chance_bound, in_motion
 from toolkit.geometry import Array, skew
 from toolkit.jackknife import STRETCHES, jackknife_cov
+from toolkit.measured_motion import MotionKind
 
 # Axes about which the turn is known worse than this many times the best one are not judged: about its own direction a
 # velocity says nothing, and slip feigns something.
@@ -38,38 +34,28 @@ class Turn(NamedTuple):
     by_chance_rad: Array
 
 
-def turn_of_camera(intervals: Intervals, T_imu_cam: Array, duration_s: float = np.inf) -> Turn:
-    """Return the turn that brings the camera's motion onto the measured one, by velocities, or else by rotations."""
-    if intervals.v_mps is None:
-        kind, stretches, seen = "imu", STRETCHES, intervals.w_cam_radps @ T_imu_cam[:3, :3].T
-        bias = np.tile(np.eye(3), (len(seen), 1, 1))
-        found = _turn(intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2), stretches)
-    else:
-        kind, stretches = "twist", slip_stretches(duration_s)
-        measured, seen, jacobian = velocity_equations(intervals, intervals.v_mps, T_imu_cam)
-        turn_first = np.concatenate([jacobian[:, :, TURN], np.delete(jacobian, TURN, axis=2)], axis=2)
-        found = _turn(measured - seen, turn_first, stretches)
-    by_chance_rad = chance_bound(found.error_rad, found.formal_rad, in_motion(seen, stretches), INFLATION[kind])
-    return Turn(found.rad, found.error_rad, np.maximum(by_chance_rad, LEAST_BOUND_RAD))
+def turn_by_velocities(whole: Regression) -> Turn:
+    """Return the turn that brings the camera's velocities onto those of odometry."""
+    return _judged(whole.found[TURN], whole.formal[TURN, TURN], whole.cov[TURN, TURN], whole.in_motion, "twist")
 
 
-class _Found(NamedTuple):
-    rad: Array
-    error_rad: Array
-    formal_rad: Array
+def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
+    """Return the turn that brings the camera's rotations onto those of the gyro."""
+    seen = intervals.w_cam_radps @ T_imu_cam[:3, :3].T
+    bias = np.tile(np.eye(3), (len(seen), 1, 1))
+    response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
+    found, formal = robust_with_formal_cov(response, jacobian)
+    cov = jackknife_cov(lambda *rows: robust_with_formal_cov(*rows)[0], response, jacobian)
+    return _judged(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES), "imu")
 
 
-def _turn(response: Array, jacobian: Array, stretches: int) -> _Found:
-    """Solve response (M, 3) = jacobian (M, 3, n) x, the turn being the first three unknowns.
+def _judged(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
+    """Return the turn (3,) about axes that can be judged: those of its formal covariance (3, 3).
 
-    The axes are those of its formal covariance: that of a few stretches has none of its own.
+    The covariance (3, 3) of a few stretches has none of its own.
     """
-    formal, axes = np.linalg.eigh(formal_cov(response, jacobian)[:3, :3])
-    cov = jackknife_cov(_first_three, response, jacobian, stretches=stretches)
-    error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), formal))
-    judged = formal <= MOST_ERROR_RATIO**2 * formal.min()
-    return _Found((axes.T @ _first_three(response, jacobian))[judged], error_rad[judged], np.sqrt(formal[judged]))
-
-
-def _first_three(response: Array, jacobian: Array) -> Array:
-    return robust_solution(response, jacobian)[:3]
+    variance, axes = np.linalg.eigh(formal)
+    error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), variance))
+    judged = variance <= MOST_ERROR_RATIO**2 * variance.min()
+    by_chance_rad = chance_bound(error_rad[judged], np.sqrt(variance[judged]), stretches, INFLATION[kind])
+    return Turn((axes.T @ rad)[judged], error_rad[judged], np.maximum(by_chance_rad, LEAST_BOUND_RAD))
