@@ -20,7 +20,6 @@ the standard deviation it had.
 """
 
 from collections.abc import Callable, Collection, Iterable
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -40,8 +39,9 @@ from toolkit.errors import EstimatorError
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
-# In how many turns the landmarks are eliminated that what has left the window tells of. Two to six cost the same.
-_TURNS_OF_THE_TOLD = 3
+# How many landmarks are eliminated in one clique that what has left the window tells of: fewer, and what is copied from
+# clique to clique costs more; more, and rows have zeros.
+_MOST_AT_ONCE = 12
 # Radians, metres and their kin that an estimate may be from where GTSAM linearised its factors; beside chained
 # sightings nothing, but for what a marginal holds.
 RELINEARISE_BEYOND, BESIDE_CHAINED = 0.01, 0.0
@@ -311,11 +311,9 @@ class FixedLagTree:
         """
         told = [key for key in landmarks if self._first_seen_ns[key] < self._oldest_ns]
         told.sort(key=self._landmark_stamps_ns.__getitem__)
-        bounds = [len(told) * i // _TURNS_OF_THE_TOLD for i in range(_TURNS_OF_THE_TOLD + 1)]
-        turns = [told[start:end] for start, end in pairwise(bounds)]
-        return [[key for key in landmarks if self._first_seen_ns[key] >= self._oldest_ns]] + [
-            part for turn in turns for part in (turn[-1:], turn[:-1])
-        ]
+        turns = [told[i : i + _MOST_AT_ONCE] for i in range(0, len(told), _MOST_AT_ONCE)]
+        untold = [key for key in landmarks if self._first_seen_ns[key] >= self._oldest_ns]
+        return [untold, *(part for turn in turns for part in (turn[-1:], turn[:-1]))]
 
 
 def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:
