@@ -2,9 +2,10 @@
 
 GTSAM's own IncrementalFixedLagSmoother leaves the order of elimination within the window to chance, and the newest
 state deep in the tree: its marginal then costs twice the update. Here the elimination takes what is to leave first,
-then the landmarks, then the states in the order of time, but the oldest, which leaves next, beside the newest in the
-root: the last covariance of the one and the first of the other are nearly free, and the update costs no more. Behind
-the newest comes a variable without a meaning, for the sake of the condition of the cliques (``indeterminate``).
+then the landmarks (those that the marginals of what has left tie to one another last, in a few large cliques), then the
+states in the order of time, but the oldest, which leaves next, beside the newest in the root: the last covariance of
+the one and the first of the other are nearly free, and the update costs no more. Behind the newest comes a variable
+without a meaning, for the sake of the condition of the cliques (``indeterminate``).
 
 A variable that makes the system indeterminate is held weakly where it is; a landmark that does so again in the same
 frame is dropped, and so are landmarks without a depth in a clique that GTSAM names by another. A state that does so the
@@ -38,6 +39,9 @@ from toolkit.errors import EstimatorError
 from toolkit.models.factors import L, kind_of
 
 MOST_RECOVERIES = 20
+# How many landmarks are eliminated in one clique that what has left the window tells of: fewer, and what is copied from
+# clique to clique costs more; more, and rows have zeros.
+_MOST_AT_ONCE = 12
 # Radians, metres and their kin that an estimate may be from where GTSAM linearised its factors; beside chained
 # sightings nothing, but for what a marginal holds.
 RELINEARISE_BEYOND, BESIDE_CHAINED = 0.01, 0.0
@@ -57,6 +61,7 @@ class FixedLagTree:
         self._oldest_ns = 0
         self._state_stamps_ns: dict[int, int] = {}
         self._landmark_stamps_ns: dict[int, int] = {}
+        self._first_seen_ns: dict[int, int] = {}
         # What the trees before this one marginalised is linear in these variables, where they are linearised.
         self._fixed: set[int] = set()
         # The variables of the newest state with their sizes; where the factors are that tie the last variable to them.
@@ -71,7 +76,9 @@ class FixedLagTree:
         Raises EstimatorError where the system stays indeterminate whatever is held or dropped.
         """
         self._state_stamps_ns |= dict.fromkeys(extension.state_keys, t_ns)
-        self._landmark_stamps_ns |= dict.fromkeys(map(L, extension.landmark_ids), t_ns)
+        seen = list(map(L, extension.landmark_ids))
+        self._landmark_stamps_ns |= dict.fromkeys(seen, t_ns)
+        self._first_seen_ns = dict.fromkeys(seen, t_ns) | self._first_seen_ns
         self._oldest_ns = t_ns - self._lag_ns
         if extension.chained is not None:
             self._chained.add(*extension.chained)
@@ -204,6 +211,8 @@ class FixedLagTree:
 
     def _relinearised(self, new: gtsam.Values) -> gtsam.NonlinearFactorGraph:
         """Return the factors of chained sightings about the latest estimates, or where there are none the new."""
+        if not self._chained.is_used:
+            return gtsam.NonlinearFactorGraph()
         keys = self._chained.keys()
         estimates = self._latest(new, keys)
         held = self._fixed.union(self._isam.getFixedVariables()).intersection(keys)
@@ -217,7 +226,7 @@ class FixedLagTree:
         return _joined(self._values.extract(known), new, keys)
 
     def _forget(self, leaving: Iterable[int]) -> None:
-        for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns):
+        for stamps_ns in (self._state_stamps_ns, self._landmark_stamps_ns, self._first_seen_ns):
             for key in stamps_ns.keys() & leaving:
                 del stamps_ns[key]
         self._fixed.difference_update(leaving)
@@ -282,15 +291,29 @@ class FixedLagTree:
         states = [(key, t_ns) for key, t_ns in self._state_stamps_ns.items() if t_ns >= self._oldest_ns]
         some_leave = len(landmarks) + len(states) < len(self._landmark_stamps_ns) + len(self._state_stamps_ns)
         groups, place = gtsam.KeyGroupMap(), int(some_leave)
-        for key in landmarks:
-            groups.insert2(key, place)
-        place += bool(landmarks)
+        for together in self._in_turn(landmarks):
+            for key in together:
+                groups.insert2(key, place)
+            place += bool(together)
         stamps_ns = _oldest_beside_newest(list(dict.fromkeys(t_ns for _, t_ns in states)))
         place_of = {t_ns: place + i for i, t_ns in enumerate(stamps_ns)}
         for key, t_ns in states:
             groups.insert2(key, place_of[t_ns])
         groups.insert2(LAST, place + len(stamps_ns))
         return groups
+
+    def _in_turn(self, landmarks: list[int]) -> list[list[int]]:
+        """Return which landmarks are eliminated together: first those that what has left the window tells nothing of.
+
+        All others are tied to one another. Of those that were seen up to about the same time one that was seen the
+        latest leads: then no other has states that it has not, and they are eliminated as one clique, not each as one
+        of nearly all that is left.
+        """
+        told = [key for key in landmarks if self._first_seen_ns[key] < self._oldest_ns]
+        told.sort(key=self._landmark_stamps_ns.__getitem__)
+        turns = [told[i : i + _MOST_AT_ONCE] for i in range(0, len(told), _MOST_AT_ONCE)]
+        untold = [key for key in landmarks if self._first_seen_ns[key] >= self._oldest_ns]
+        return [untold, *(part for turn in turns for part in (turn[-1:], turn[:-1]))]
 
 
 def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:

@@ -58,8 +58,8 @@ def measure(source: str, frames: int) -> None:
     sequence = sequence.truncated(frames) if frames else sequence
     solve, ours_s, theirs_s = robust_schedule.solve, [], []
 
-    def both(graph: Any, start: Any, stopping: Stopping, *rest: Any) -> Solution:
-        solution, spent_s = timed(lambda: solve(graph, start, stopping, *rest))
+    def both(graph: Any, start: Any, stopping: Stopping, *rest: Any, **named: Any) -> Solution:
+        solution, spent_s = timed(lambda: solve(graph, start, stopping, *rest, **named))
         optimizer, own_s = timed(lambda: own(graph, start, stopping))
         ours_s.append(spent_s)
         theirs_s.append(own_s)
@@ -72,11 +72,11 @@ def measure(source: str, frames: int) -> None:
     robust_schedule.solve = both
     try:
         print(f"{sequence.name}, {sequence.frame_count} frames")
-        timings = runner.run("batch", find("batch").load(), sequence, prior).timings
+        run = runner.run("batch", find("batch").load(), sequence, prior)
     finally:
         robust_schedule.solve = solve
-    assert timings is not None
-    whole_s = timings.cpu_s - sum(theirs_s)
+    assert run.status == "ok" and run.timings is not None, run.log
+    whole_s = run.timings.cpu_s - sum(theirs_s)
     print(f"  solves {sum(ours_s) / sum(theirs_s):.2f}, whole batch {whole_s / sum(theirs_s):.2f} x GTSAM's own")
 
 

@@ -315,6 +315,21 @@ def test_a_reader_that_goes_away_costs_no_results(
     assert (tmp_path / "card.json").exists()
 
 
+def test_a_table_does_not_wait_for_figures(
+    vislam: Vislam, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Drawing takes seconds, and the first table is the first impression."""
+    shown: list[str] = []
+
+    def draw_nothing(*_: object) -> dict[str, str]:
+        shown.append(capsys.readouterr().out)
+        return {}
+
+    monkeypatch.setattr("toolkit.report.figures.save", draw_nothing)
+    assert vislam(*QUICK, "--out", "run") == 0
+    assert "dead-reckoning" in shown[0]
+
+
 def test_an_interrupt_inside_text_that_is_executed_is_130_as_well(tmp_path: Path) -> None:
     """As where a dataclass is being made: CPython would then end ``python -m`` by the signal, caught or not."""
     (tmp_path / "interrupted.py").write_text(

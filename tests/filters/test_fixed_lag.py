@@ -1,5 +1,6 @@
 """The window of fixed-lag goes on after what would end GTSAM's, and a tree built anew has the same estimates."""
 
+import re
 from dataclasses import replace
 
 import gtsam
@@ -75,6 +76,18 @@ def test_a_linear_chain_has_its_exact_answer_after_the_tree_is_built_anew_in_eve
         # Eight digits are left of sixteen by normal equations of this condition, and more.
         np.testing.assert_allclose(position_of(window, k), exact.atPoint3(X(k)), atol=1e-9)
     assert np.linalg.norm(exact.atPoint3(X(7)) - start.atPoint3(X(7))) > 1.0
+
+
+def test_landmarks_that_the_past_ties_together_are_eliminated_a_dozen_in_a_clique():
+    """Nearly every such clique has nearly all that is left: copied in each, that costs more than the arithmetic."""
+    sequence = simulate(replace(DRIVE_IMU, duration_s=3.0), seed=0)
+    estimator = FixedLag(setup_of(sequence), 1.0)
+    for packet in sequence.packets():
+        estimator.step(packet)
+    cliques = [label.partition(":") for label in re.findall(r'label="(.*?)"', estimator._tree._isam.dot())]
+    eliminated_of_tied = [len(re.findall(r"l\d+", own)) for own, _, left in cliques if "l" in left]
+    assert len(eliminated_of_tied) > 3
+    assert set(eliminated_of_tied) == {12}
 
 
 def test_states_that_hang_together_far_better_than_on_the_world_are_solved_by_cholesky():

@@ -164,11 +164,11 @@ def compare(options: argparse.Namespace) -> int:
         coming = comparisons(plan, cases, workers, progress_for, tuple(stores.values()))
         for comparison, directory in zip(coming, directories, strict=True):
             try:
-                with progress_for(f"{comparison.name}: figures and report"):
-                    write_run(comparison, directory, made_by)
-            finally:  # after the files, which a reader that goes away must not cost; also where they cannot be written
                 if not (options.json or options.quiet):
                     print_above(comparison_text(comparison, columns, width_of_output()))
+            finally:  # before the files, which take seconds to draw, and which a reader that goes away must not cost
+                with progress_for(f"{comparison.name}: figures and report"):
+                    write_run(comparison, directory, made_by)
             found = _found(comparison, stores.get(directory))
             if options.json:
                 print_above(to_line(scores_document(comparison)).rstrip())

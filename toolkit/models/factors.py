@@ -125,6 +125,5 @@ def joint_cov(tree: EliminatedGraph, keys: list[int]) -> Array:
     that is next to nothing, however long the graph (Kaess & Dellaert 2009). Raises RuntimeError, as GTSAM does,
     where the graph does not determine them.
     """
-    marginal = tree.jointMarginalCovariance(keys)
-    cov = np.block([[marginal.at(i, j) for j in keys] for i in keys])
+    cov = tree.jointMarginalCovariance(keys).fullMatrix()
     return np.asarray(0.5 * (cov + cov.T))
