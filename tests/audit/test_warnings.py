@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, lever_arm
+from toolkit.audit import audit, lever_arm, track_scatter
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.turn import turn_of_camera
-from toolkit.geometry import se3, so3_exp
+from toolkit.geometry import interpolate_poses, se3, se3_inverse, so3_exp, transform
+from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -156,7 +157,49 @@ def test_a_tenth_of_tracks_that_slide_is_told_where_the_noise_is_right(scenario:
     assert told is not None
     assert 1.0 < float(told[1]) < 10.0  # some slide by less than four standard deviations a frame
     # With twice the noise stated they are beneath it.
-    assert "track-scatter" not in found_in(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
+    beneath = scatter_of(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
+    assert beneath is None or ("times too large" in beneath and "miss by more" not in beneath)
+
+
+def scatter_of(sequence: Sequence) -> str | None:
+    found = track_scatter.check(Evidence(sequence))
+    assert found is None or (isinstance(found, Symptom) and found.warns)
+    return found and f"{found.detail}; {found.treatment}"
+
+
+@pytest.mark.parametrize("scenario", ["drive", "flight", "drive-imu"])
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_pixel_noise_stated_too_large_or_too_small_is_told_with_its_ratio(scenario: str, seed: int) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=6.0), seed)
+    assert scatter_of(sound) is None
+    assert scatter_of(faults.wrong_noise(sound, 1.3)) is None
+    for dose in (2.0, 5.0, 30.0):
+        told = re.search(r"stated ([\d.]+) times too large", scatter_of(faults.wrong_noise(sound, dose)) or "")
+        assert told is not None
+        assert float(told[1]) == pytest.approx(dose, rel=0.06)
+        told = re.search(r"stated ([\d.]+) times too small", scatter_of(faults.wrong_noise(sound, 1.0 / dose)) or "")
+        assert told is not None
+        assert float(told[1]) == pytest.approx(dose, rel=0.06)
+
+
+def test_of_tracks_whose_errors_go_together_only_a_noise_far_too_large_is_told_and_by_how_much_at_most() -> None:
+    """The steps of tracks that drift are smaller than their errors: 30 times too much looks like more."""
+    sound = simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0), 11)
+    assert scatter_of(sound) is None
+    told = re.search(r"by less than (\d+) times", scatter_of(faults.wrong_noise(sound, 30.0)) or "")
+    assert told is not None
+    assert float(told[1]) > 30.0
+
+
+def test_tracks_without_errors_refute_no_noise() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=5.0), 11)
+    observations, truth = sound.observations, sound.truth
+    assert truth is not None
+    T_world_cam = interpolate_poses(truth.t_ns, truth.T_world_imu, sound.frames_t_ns) @ sound.rig.T_imu_cam
+    points = transform(T_world_cam[observations.frame], triangulate(observations.uv_px, sound.rig))
+    _, first, row = np.unique(observations.track_id, return_index=True, return_inverse=True)
+    uv_px = project(transform(se3_inverse(T_world_cam)[observations.frame], points[first][row]), sound.rig)
+    assert scatter_of(replace(sound, observations=replace(observations, uv_px=uv_px))) is None
 
 
 @pytest.mark.parametrize(
