@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets.trajectories import euroc, tum
+from toolkit.datasets.trajectories.exchanged_axes import Exchange
 from toolkit.documents import schema
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
@@ -138,6 +139,9 @@ def test_poses_of_a_camera_are_named_and_only_positions_scored(scene, vislam) ->
     assert 0.0 < run["metrics"]["ate_se3_m"] < 0.4
 
 
+Y_Z = Exchange(np.eye(3)[[0, 2, 1]], "positions and quaternions")
+
+
 def bad_text(scene, kind: str) -> str:
     t_ns = scene.stamps(10.0)
     poses = scene.poses_at(t_ns)
@@ -151,6 +155,8 @@ def bad_text(scene, kind: str) -> str:
             f"{t / S:.9f} {' '.join(map(repr, row))}" for t, row in zip(t_ns, w_first.tolist(), strict=True)
         ),
         "inverted": tum.text(Trajectory(t_ns, se3(np.swapaxes(rotations, 1, 2), positions))),
+        "mirrored": tum.text(Trajectory(t_ns, se3(rotations, positions[:, [0, 2, 1]]))),
+        "mirrored with quaternions": tum.text(Trajectory(t_ns, Y_Z.reread(poses))),
         "millimetres": tum.text(Trajectory(t_ns, se3(rotations, 1000.0 * positions))),
         "own clock": tum.text(Trajectory(t_ns - t_ns[0], poses)),
         "not a number": text.replace(text.splitlines()[5].split()[1], "nan", 1),
@@ -169,6 +175,8 @@ def bad_text(scene, kind: str) -> str:
         ("milliseconds from zero", "time must be in seconds"),
         ("w first", "turns as the truth does only if read w first"),
         ("inverted", "turns as the truth does only if inverted"),
+        ("mirrored", "it fits the truth with y and z exchanged (positions alone), and not as given"),
+        ("mirrored with quaternions", "it fits the truth with y and z exchanged (positions and quaternions)"),
         ("millimetres", "it is in millimetres"),
         ("own clock", "one counts from its own start: add 1700000000.000 s"),
         ("not a number", "line 6 holds a value that is not finite"),

@@ -27,6 +27,7 @@ from toolkit.datasets.trajectories.belonging import (
     range_s,
     turned_body,
 )
+from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
 from toolkit.datasets.trajectories.poses import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
@@ -152,6 +153,8 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     estimate = _stamped(file, truth, terms.offset_s)
     turn = _checked(file, estimate, truth)
     matched = _matched(estimate, truth, terms.max_dt_s)
+    if turn is None:
+        check_axes(str(path), matched.truth, matched.estimate)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
@@ -182,6 +185,8 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     reference = truth.reference
     check_clock(what, reference, estimate.t_ns)
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
+    matched = matched_poses(estimate, truth.stamped)
+    check_mirrored(what, matched.truth, matched.estimate)
     readings = [inverted()]
     if file.other_order is not None:
         readings.insert(0, in_other_order(file.other_order))
