@@ -168,7 +168,7 @@ class _Fit:
     @property
     def is_mirrored(self) -> bool:
         """Say whether the positions fit far better after a reflection."""
-        return self.off_share(np.eye(3)) > max(_TIMES * self.off_share(-np.eye(3)), _LEAST_SHARE)
+        return bool(self.off_share(np.eye(3)) > max(_TIMES * self.off_share(-np.eye(3)), _LEAST_SHARE))
 
     def of_inverse(self) -> "_Fit":
         """Return the fit of the inverse poses."""
