@@ -310,7 +310,7 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     basis = "all that is used of the recording, so that causal answers know it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
-    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted)}"
+    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted, whole.rig.cov_uv_px2)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
     return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)
