@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
 _LENSES = ("none", "radtan", "equidistant")
 _LONGEST_EXPOSURE_MS = 40
+# Of more pairs is said, before they are made, how much room they take.
+_MANY_PAIRS = 1000
 _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 
 
@@ -206,8 +209,12 @@ def simulate(options: argparse.Namespace) -> int:
 def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     """Render the images, with the time that is left, and say what was written."""
     from toolkit.progress import of_this_process
-    from toolkit.simulation.filming import Filming, film
+    from toolkit.simulation.filming import Filming, check_filmable, film, pair_count, size_gb
 
+    check_filmable(scenario, options.out)
+
+    if (pairs := pair_count(scenario)) > _MANY_PAIRS:
+        print(f"{printable(str(options.out))}: {pairs} stereo pairs, about {size_gb(scenario):.2g} GB", file=sys.stderr)
     filming = Filming(options.lens or "none", (options.blur or 0.0) / 1000.0, options.moving or 0)
     with of_this_process()(str(options.out)) as progress:
         sequence = film(scenario, options.seed, options.out, filming, progress)
