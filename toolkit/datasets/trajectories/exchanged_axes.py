@@ -183,7 +183,7 @@ class _Fit:
     def is_other_body(self) -> bool:
         """Say whether the orientations differ by a constant turn of the body, as a camera's from an IMU's do."""
         R_truth_estimate = self._rotation(np.eye(3)) @ self._estimate[:, :3, :3]
-        return _spread_rad(np.swapaxes(self._truth[:, :3, :3], 1, 2) @ R_truth_estimate) < _FITTING_RAD
+        return bool(_spread_rad(np.swapaxes(self._truth[:, :3, :3], 1, 2) @ R_truth_estimate) < _FITTING_RAD)
 
     def off_share(self, matrix: Array) -> float:
         """Return how far positions whose axes are exchanged are off the truth's, of the truth's extent."""
