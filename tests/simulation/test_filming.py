@@ -1,5 +1,6 @@
 """Rendered images show the scene where it is, and a folder of them is the scenario's recording."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -202,7 +203,7 @@ def test_images_for_which_there_is_no_room_are_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hour = replace(FLIGHT, duration_s=3600.0)
-    monkeypatch.setattr(filming.shutil, "disk_usage", lambda _: SimpleNamespace(free=20e9))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=20e9))
     monkeypatch.setattr(filming, "simulate", lambda *_: pytest.fail("simulated before the room was looked at"))
     with pytest.raises(OutputError, match=r"72001 stereo pairs take about 28\.8 GB, and 20 GB are free there"):
         film(hour, 0, tmp_path / "new" / "deeper")
