@@ -1,5 +1,6 @@
 """EuRoC recordings: both layouts, the choice among truths, the simulated tracks, and malformed folders."""
 
+import codecs
 import functools
 import itertools
 import shutil
@@ -130,6 +131,13 @@ def test_mav0_itself_is_the_same_recording(recording: Path) -> None:
     inner, outer = load_sequence(str(recording / "mav0")), load_sequence(str(recording))
     assert inner.content_hash() == outer.content_hash()
     assert inner.name == outer.name
+
+
+def test_a_byte_order_mark_is_no_part_of_a_column(recording: Path) -> None:
+    before = load_sequence(str(recording)).content_hash()
+    table = recording / "mav0/imu0/data.csv"
+    table.write_bytes(codecs.BOM_UTF8 + table.read_bytes())
+    assert load_sequence(str(recording)).content_hash() == before
 
 
 def test_imu_stamps_and_columns_are_read_exactly(recording: Path) -> None:
