@@ -11,7 +11,8 @@ from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.parts.alignment import alignment
 from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.turn import turn_of_camera
-from toolkit.geometry import interpolate_poses, se3, se3_inverse, so3_exp, transform
+from toolkit.geometry import Array, interpolate_poses, se3, se3_inverse, so3_exp, transform
+from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
@@ -191,15 +192,40 @@ def test_of_tracks_whose_errors_go_together_only_a_noise_far_too_large_is_told_a
     assert float(told[1]) > 30.0
 
 
+def test_half_a_pixel_that_is_assumed_and_too_much_is_told_for_information() -> None:
+    """It is what the toolkit takes tracks to have of which nobody says more, and no fault of a recording."""
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 11)
+    sigma_px, assumed_px2 = 0.1, TRACKED_PIXEL_SIGMA_PX**2 * np.diag([1.0, 1.0, 0.5])
+    truth = sound.truth
+    assert truth is not None
+    T_world_cam = interpolate_poses(truth.t_ns, truth.T_world_imu, sound.frames_t_ns) @ sound.rig.T_imu_cam
+    uv_px = exactly_seen(sound, T_world_cam)
+    uv_px += np.random.default_rng(0).normal(0.0, sigma_px, uv_px.shape) * np.sqrt([1.0, 1.0, 0.5])
+    observations = replace(sound.observations, uv_px=uv_px)
+    found = track_scatter.check(Evidence(replace(
+        sound, observations=observations, rig=replace(sound.rig, cov_uv_px2=assumed_px2)
+    )))  # fmt: skip
+    assert isinstance(found, Symptom)
+    assert not found.warns
+    assert "stated 5.1 times too large" in found.treatment
+    assert "half a pixel is assumed" in found.treatment
+
+
 def test_tracks_without_errors_refute_no_noise() -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=5.0), 11)
     observations, truth = sound.observations, sound.truth
     assert truth is not None
     T_world_cam = interpolate_poses(truth.t_ns, truth.T_world_imu, sound.frames_t_ns) @ sound.rig.T_imu_cam
-    points = transform(T_world_cam[observations.frame], triangulate(observations.uv_px, sound.rig))
-    _, first, row = np.unique(observations.track_id, return_index=True, return_inverse=True)
-    uv_px = project(transform(se3_inverse(T_world_cam)[observations.frame], points[first][row]), sound.rig)
-    assert scatter_of(replace(sound, observations=replace(observations, uv_px=uv_px))) is None
+    exact = replace(observations, uv_px=exactly_seen(sound, T_world_cam))
+    assert scatter_of(replace(sound, observations=exact)) is None
+
+
+def exactly_seen(sequence: Sequence, T_world_cam: Array) -> Array:
+    """Return where each track's point, as it was first triangulated, is seen (N, 3) without any error."""
+    seen = sequence.observations
+    points = transform(T_world_cam[seen.frame], triangulate(seen.uv_px, sequence.rig))
+    _, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
+    return project(transform(se3_inverse(T_world_cam)[seen.frame], points[first][row]), sequence.rig)
 
 
 @pytest.mark.parametrize(

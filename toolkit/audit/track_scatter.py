@@ -10,6 +10,8 @@ Tracks that scatter far less refute the stated noise as well, unless their error
 lasts along a track is not in its steps. Where each sighting errs by itself (``correlated_tracks``), that is certain.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from toolkit.audit.correlated_tracks import MOST_CORRELATION, step_correlation
@@ -18,6 +20,7 @@ from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
+from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
 
 # Standard deviations over the stated ones. 21 sound simulated recordings have 0.98 to 1.00 and real ones, whose noise
 # is assumed, at most 0.62; a tenth of mismatches makes 1.04 to 1.07, three tenths 1.20 to 1.46.
@@ -84,7 +87,12 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     cause = f"the noise is stated {times} times too large, or the errors last along whole tracks"
     if not each_by_itself:
         cause = f"the noise is stated too large, by less than {times} times as the errors go together between frames"
-    return _told(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
+    said = _told(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
+    if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
+        return said
+    # Nobody stated this noise: it is what is assumed of a tracker whose recording says nothing.
+    assumed = f"{said.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px states it"
+    return replace(said, treatment=assumed, warns=False)
 
 
 def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
