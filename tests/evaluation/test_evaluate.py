@@ -328,6 +328,27 @@ def test_time_coverage_of_keyframes_counts_gaps(scene, vislam) -> None:
     assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 46.0 / 59.95)
 
 
+def test_a_truth_that_stands_still_is_remarked_beside_what_moves(scene, vislam, capsys) -> None:
+    t_ns = scene.stamps(10.0)
+    still = np.tile(np.eye(4), (t_ns.size, 1, 1))
+    Path("still.tum").write_text(tum.text(Trajectory(t_ns, still)))
+    assert vislam("evaluate", "still.tum", "truth.tum") == 0
+    assert "the truth stands still, all its positions are one" in " ".join(capsys.readouterr().out.split())
+    assert vislam("evaluate", "still.tum", "still.tum") == 0
+    assert "the truth stands still" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [
+    ("evaluate", "truth.tum", "truth.tum", "--runs", "1000000000"),
+    ("tracks", "film", "--count", "1000000000", "--out", "out"),
+    ("simulate", "flight", "--images", "--moving", "1000000000", "--out", "out"),
+])  # fmt: skip
+def test_counts_beyond_any_use_are_refused(vislam, capsys, words) -> None:
+    """They took all memory, or all day."""
+    assert vislam(*words) == 2
+    assert "expected at most " in capsys.readouterr().err
+
+
 def test_an_offset_brings_clocks_together(scene, vislam, capsys) -> None:
     t_ns = scene.stamps(10.0)
     scene.write("late.tum", t_ns + 100 * S, scene.estimated(t_ns, 0.1))

@@ -31,6 +31,7 @@ _LENSES = ("none", "radtan", "equidistant")
 _LONGEST_EXPOSURE_MS = 40
 # Of more pairs is said, before they are made, how much room they take.
 _MANY_PAIRS = 1000
+_MOST_STILLS, _MOST_CRATES = 10_000, 1000
 _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 
 
@@ -94,7 +95,9 @@ def _tracks_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--count", metavar="N", type=at_least(1), default=10, help="how many stills (default: 10)")
+    what.add_argument(
+        "--count", metavar="N", type=at_least(1, _MOST_STILLS), default=10, help="how many stills (default: 10)"
+    )
     what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
     add_topics_argument(parser)
     add_settings_arguments(parser)
@@ -168,7 +171,9 @@ def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
         "--lens", choices=_LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
     )
     images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
-    images.add_argument("--moving", metavar="N", type=at_least(0), help="crates that fly about (default: 0)")
+    images.add_argument(
+        "--moving", metavar="N", type=at_least(0, _MOST_CRATES), help="crates that fly about (default: 0)"
+    )
 
 
 @command(
