@@ -75,19 +75,25 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     used, OutputError where what is to be kept cannot be written.
     """
     unnamed = () if own else defaults()
+    named = unnamed if estimators is None else _names("estimators", estimators)
+    both = sorted(set(named) & set(_by_name("own", own)))
+    if both:
+        raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
     plan = Plan(
         sources=(_source(source),),
-        estimators=unnamed if estimators is None else _names("estimators", estimators),
+        estimators=named,
         own=_by_name("own", own),
         settings=_with_seeds(settings, seed, seeds),
         truth=None if truth is None else Path(truth),
         trajectories={name: Path(file) for name, file in _by_name("trajectories", trajectories).items()},
         keep=frozenset(_names("keep", keep)),
         max_frames=None if max_frames is None else _whole("max_frames", max_frames),
-        part=Part(from_s, to_s, every),
-        workers=workers,
+        part=Part(_number("from_s", from_s), None if to_s is None else _number("to_s", to_s), _whole("every", every)),
+        workers=None if workers is None else _whole("workers", workers),
         scheduler=scheduler,
     )
+    if resume is not None and plan.settings.seeds == 1:
+        raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if resume is None else (Path(resume),))[0])
 
 
@@ -130,6 +136,13 @@ def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named
     if given is None or isinstance(given, Mapping):
         return given or {}
     raise SettingsError(f"{what} is a {type(given).__name__}; give a dict, by name")
+
+
+def _number(what: str, given: float) -> float:
+    try:
+        return float(operator.truediv(given, 1.0))
+    except TypeError as error:
+        raise SettingsError(f"{what} is {given!r}, expected a number") from error
 
 
 def _whole(what: str, given: int) -> int:

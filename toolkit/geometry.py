@@ -95,7 +95,8 @@ def so3_log(rotation: Array) -> Array:
     vector, scalar = quaternion[..., :3], quaternion[..., 3]
     length = np.sqrt(_squared_norm(vector))
     tiny = length < 1e-9  # there atan2(length, scalar) / length = 1 / scalar to double precision
-    factor = np.where(tiny, 2.0 / scalar, 2.0 * np.arctan2(length, scalar) / np.where(tiny, 1.0, length))
+    at_zero = 2.0 / np.where(tiny, scalar, 1.0)
+    factor = np.where(tiny, at_zero, 2.0 * np.arctan2(length, scalar) / np.where(tiny, 1.0, length))
     return factor[..., None] * vector
 
 

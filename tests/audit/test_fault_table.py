@@ -67,6 +67,8 @@ def mirrored(sequence: Sequence, dose: float, seed: int) -> Sequence:
 CASES = [
     Case(faults.swapped_images, 1.0, "swapped-coordinates", "repaired", "left and right are exchanged"),
     Case(faults.swapped_images, 0.4, "swapped-coordinates", "repaired", "whole tracks"),
+    Case(faults.swapped_coordinates, 0.1, "swapped-coordinates", "repaired", "only if u and v are exchanged"),
+    Case(faults.swapped_coordinates, 0.3, "swapped-coordinates", "blocks", "only if u and v are exchanged"),
     Case(faults.swapped_coordinates, 1.0, "swapped-coordinates", "blocks", "u and v are exchanged"),
     Case(faults.dropped_sightings, 1.0, "no-sightings", "blocks"),
     Case(faults.nan_span, 3600.0, "not-finite", "blocks", "of the sightings"),

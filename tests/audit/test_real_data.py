@@ -82,7 +82,8 @@ def test_with_the_disparities_halved_the_camera_moves_as_fast_as_the_twists_say(
 
 def test_the_starry_night_tracks_come_back() -> None:
     found = counts(audited("utias/dataset3.mat"))
-    assert found == {"returning-tracks": 551, "time-gap": 102, "thin-vision": 10}
+    # The file's variances, measured against surveyed landmarks, are 27 times what tracks do from frame to frame.
+    assert found == {"returning-tracks": 551, "time-gap": 102, "thin-vision": 10, "track-scatter": 1}
 
 
 def test_kitti00_raises_no_finding_but_that_its_tracks_errors_go_together() -> None:

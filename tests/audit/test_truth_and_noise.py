@@ -8,10 +8,11 @@ import pytest
 
 from toolkit.audit import overstated_noise, truth_mismatch
 from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.measured_motion import ImuNoise
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, Truth
-from toolkit.simulation import SCENARIOS, simulate
+from toolkit.simulation import SCENARIOS, faults, simulate
 
 DURATION_S = 6.0
 
@@ -64,7 +65,7 @@ def test_a_truth_that_runs_backwards_is_told(drive: Sequence) -> None:
     truth = truth_of(drive)
     found = with_truth(drive, Truth(truth.t_ns, truth.T_world_imu[::-1]))
     assert isinstance(found, Symptom)
-    assert "moves otherwise" in found.detail
+    assert "but for one whose poses run backwards" in found.detail
 
 
 def test_a_truth_of_another_flight_is_told(flight: Sequence) -> None:
@@ -110,10 +111,35 @@ def test_a_truth_that_leaps_or_is_not_finite_is_told(recording: str, request: py
         assert told in symptom.detail
 
 
-def test_a_truth_that_stands_still_is_not_judged(drive: Sequence) -> None:
-    truth = truth_of(drive)
-    still = np.repeat(truth.T_world_imu[:1], truth.t_ns.size, axis=0)
-    assert isinstance(with_truth(drive, Truth(truth.t_ns, still)), Undecided)
+@pytest.mark.parametrize("recording", ["drive", "flight"])
+@pytest.mark.parametrize("from_to", [(0, None), (40, None), (20, 65)])
+def test_a_truth_that_stands_still_while_the_camera_moves_is_told(
+    recording: str, from_to: tuple[int, int | None], request: pytest.FixtureRequest
+) -> None:
+    """As a whole, from a time on, and for a time only, where it repeats a pose exactly."""
+    sequence = request.getfixturevalue(recording)
+    truth, poses = truth_of(sequence), truth_of(sequence).T_world_imu.copy()
+    per_s = round(len(poses) / DURATION_S)
+    begin, end = (None if at is None else at * per_s // 10 for at in from_to)
+    poses[begin:end] = poses[begin]
+    found = with_truth(sequence, replace(truth, T_world_imu=poses))
+    assert isinstance(found, Symptom)
+    assert found.warns
+    assert "stands still in" in found.detail
+
+
+def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
+    sequence = faults.standstill(simulate(replace(SCENARIOS["drive"], duration_s=12.0), 4), 8.0, 1)
+    assert truth_mismatch.check(Evidence(sequence)) is None
+
+
+@pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y turned (positions alone)"])
+def test_a_truth_in_exchanged_axes_is_told_with_those(flight: Sequence, words: str) -> None:
+    truth = truth_of(flight)
+    (exchange,) = (one for one in exchanges() if one.in_words == words)
+    found = with_truth(flight, replace(truth, T_world_imu=exchange.reread(truth.T_world_imu)))
+    assert isinstance(found, Symptom)
+    assert f"but for one with {words}" in found.detail
 
 
 def test_a_truth_of_other_times_or_none_is_not_judged(drive: Sequence) -> None:

@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, lever_arm
+from toolkit.audit import audit, lever_arm, track_scatter
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.parts.alignment import alignment, velocity_regression
 from toolkit.audit.parts.deviations import Deviation, sustained
 from toolkit.audit.parts.turn import Turn, turn_by_velocities
-from toolkit.geometry import Array, se3, so3_exp
+from toolkit.geometry import Array, interpolate_poses, se3, se3_inverse, so3_exp, transform
+from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX
+from toolkit.models.stereo import project, triangulate
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -161,7 +163,74 @@ def test_a_tenth_of_tracks_that_slide_is_told_where_the_noise_is_right(scenario:
     assert told is not None
     assert 1.0 < float(told[1]) < 10.0  # some slide by less than four standard deviations a frame
     # With twice the noise stated they are beneath it.
-    assert "track-scatter" not in found_in(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
+    beneath = scatter_of(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
+    assert beneath is None or ("times too large" in beneath and "miss by more" not in beneath)
+
+
+def scatter_of(sequence: Sequence) -> str | None:
+    found = track_scatter.check(Evidence(sequence))
+    assert found is None or (isinstance(found, Symptom) and found.warns)
+    return found and f"{found.detail}; {found.treatment}"
+
+
+@pytest.mark.parametrize("scenario", ["drive", "flight", "drive-imu"])
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_pixel_noise_stated_too_large_or_too_small_is_told_with_its_ratio(scenario: str, seed: int) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=6.0), seed)
+    assert scatter_of(sound) is None
+    assert scatter_of(faults.wrong_noise(sound, 1.3)) is None
+    for dose in (2.0, 5.0, 30.0):
+        told = re.search(r"stated ([\d.]+) times too large", scatter_of(faults.wrong_noise(sound, dose)) or "")
+        assert told is not None
+        assert float(told[1]) == pytest.approx(dose, rel=0.06)
+        told = re.search(r"stated ([\d.]+) times too small", scatter_of(faults.wrong_noise(sound, 1.0 / dose)) or "")
+        assert told is not None
+        assert float(told[1]) == pytest.approx(dose, rel=0.06)
+
+
+def test_of_tracks_whose_errors_go_together_only_a_noise_far_too_large_is_told_and_by_how_much_at_most() -> None:
+    """The steps of tracks that drift are smaller than their errors: 30 times too much looks like more."""
+    sound = simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0), 11)
+    assert scatter_of(sound) is None
+    told = re.search(r"by less than (\d+) times", scatter_of(faults.wrong_noise(sound, 30.0)) or "")
+    assert told is not None
+    assert float(told[1]) > 30.0
+
+
+def test_half_a_pixel_that_is_assumed_and_too_much_is_told_for_information() -> None:
+    """It is what the toolkit takes tracks to have of which nobody says more, and no fault of a recording."""
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 11)
+    sigma_px, assumed_px2 = 0.1, TRACKED_PIXEL_SIGMA_PX**2 * np.diag([1.0, 1.0, 0.5])
+    truth = sound.truth
+    assert truth is not None
+    T_world_cam = interpolate_poses(truth.t_ns, truth.T_world_imu, sound.frames_t_ns) @ sound.rig.T_imu_cam
+    uv_px = exactly_seen(sound, T_world_cam)
+    uv_px += np.random.default_rng(0).normal(0.0, sigma_px, uv_px.shape) * np.sqrt([1.0, 1.0, 0.5])
+    observations = replace(sound.observations, uv_px=uv_px)
+    found = track_scatter.check(Evidence(replace(
+        sound, observations=observations, rig=replace(sound.rig, cov_uv_px2=assumed_px2)
+    )))  # fmt: skip
+    assert isinstance(found, Symptom)
+    assert not found.warns
+    assert "stated 5.1 times too large" in found.treatment
+    assert "half a pixel is assumed" in found.treatment
+
+
+def test_tracks_without_errors_refute_no_noise() -> None:
+    sound = simulate(replace(SCENARIOS["drive"], duration_s=5.0), 11)
+    observations, truth = sound.observations, sound.truth
+    assert truth is not None
+    T_world_cam = interpolate_poses(truth.t_ns, truth.T_world_imu, sound.frames_t_ns) @ sound.rig.T_imu_cam
+    exact = replace(observations, uv_px=exactly_seen(sound, T_world_cam))
+    assert scatter_of(replace(sound, observations=exact)) is None
+
+
+def exactly_seen(sequence: Sequence, T_world_cam: Array) -> Array:
+    """Return where each track's point, as it was first triangulated, is seen (N, 3) without any error."""
+    seen = sequence.observations
+    points = transform(T_world_cam[seen.frame], triangulate(seen.uv_px, sequence.rig))
+    _, first, row = np.unique(seen.track_id, return_index=True, return_inverse=True)
+    return project(transform(se3_inverse(T_world_cam)[seen.frame], points[first][row]), sequence.rig)
 
 
 @pytest.mark.parametrize(

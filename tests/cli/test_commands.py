@@ -84,6 +84,17 @@ def test_check_data_fails_on_a_fault_that_stays(
     assert ("not repaired" in told) == blocking
 
 
+def test_check_data_says_what_was_done_to_read_the_recording(
+    vislam: Vislam, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Images that cannot be used are left out, and tracks simulated where there are none: no fault, and to be known."""
+    assert vislam("simulate", "flight", "--images", "--duration", "0.4", "--out", "film") == 0
+    sorted(Path("film/mav0/cam0/data").iterdir())[3].write_bytes(b"")
+    vislam("check-data", "film")
+    assert "facts: " in (told := capsys.readouterr().out)
+    assert "1 of 9 image pairs could not be used and are left out" in " ".join(told.split())
+
+
 def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[frozenset[str]] = []
     first, second = list(audit.faults())[:2]

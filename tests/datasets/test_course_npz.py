@@ -337,6 +337,12 @@ def test_two_names_of_one_quantity_that_differ_are_refused(course: Course, tmp_p
         course_npz.load(written(tmp_path, course))
 
 
+def test_stamps_beyond_any_unit_are_named_with_the_first(course: Course, tmp_path: Path) -> None:
+    course["time_stamps"] = course["time_stamps"].astype(float) + 1e300
+    with pytest.raises(DataError, match=r"time_stamps\[0\] is 1e\+300, which no unit makes a time of"):
+        course_npz.load(written(tmp_path, course))
+
+
 def test_stamps_that_went_through_single_precision_are_named(course: Course, tmp_path: Path) -> None:
     stamps_s = 1.3e9 + 0.1 * np.arange(course["time_stamps"].size)[None]
     course["time_stamps"] = stamps_s.astype(np.float32)

@@ -1,5 +1,6 @@
 """EuRoC recordings: both layouts, the choice among truths, the simulated tracks, and malformed folders."""
 
+import codecs
 import functools
 import itertools
 import shutil
@@ -130,6 +131,13 @@ def test_mav0_itself_is_the_same_recording(recording: Path) -> None:
     inner, outer = load_sequence(str(recording / "mav0")), load_sequence(str(recording))
     assert inner.content_hash() == outer.content_hash()
     assert inner.name == outer.name
+
+
+def test_a_byte_order_mark_is_no_part_of_a_column(recording: Path) -> None:
+    before = load_sequence(str(recording)).content_hash()
+    table = recording / "mav0/imu0/data.csv"
+    table.write_bytes(codecs.BOM_UTF8 + table.read_bytes())
+    assert load_sequence(str(recording)).content_hash() == before
 
 
 def test_imu_stamps_and_columns_are_read_exactly(recording: Path) -> None:
@@ -305,6 +313,8 @@ def shift_truth(recording: Path) -> None:
 
 
 TRUTH = "state_groundtruth_estimate0"
+# Nine lists of ten, each of the one before it: 600 characters that stand for a billion values.
+BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
 MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ("no truth", lambda d: shutil.rmtree(d / "mav0" / TRUTH), "no ground truth in mav0/state_groundtruth_estimate0"),
     ("other clock", shift_truth, "share no 0.2 s"),
@@ -323,6 +333,8 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ),
     ("seconds", lambda d: replace_in(d, "imu0/data.csv", f"{START_NS},", "1403715273.26,"), "whole nanoseconds"),
     ("open list", lambda d: replace_in(d, "cam0/sensor.yaml", "248.0]", "248.0"), "line 16: expected .* truncated"),
+    ("aliases", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(BOMB), "its aliases .* more than 200000 values"),
+    ("too deep", lambda d: (d / "mav0/cam0/sensor.yaml").write_text(f"a: {'[' * 5000}"), "is nested too deeply"),
     ("no key", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz: 20", "rate_hz 20"), "line 14: .* it is no YAML"),
     ("twice", lambda d: replace_in(d, "cam0/sensor.yaml", "rate_hz", "sensor_type"), "gives sensor_type a second time"),
     ("not rigid", lambda d: replace_in(d, "cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),

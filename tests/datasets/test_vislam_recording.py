@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toolkit.datasets import vislam_recording
+from toolkit.datasets import load_sequence, vislam_recording
 from toolkit.errors import DataError, OutputError
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
@@ -111,6 +111,20 @@ def test_a_damaged_recording_is_still_recognised(drive: Sequence, tmp_path: Path
     text.write_text(text.read_text()[:100])
     (tmp_path / "drive" / "recording.npz").unlink()
     assert vislam_recording.recognises(tmp_path / "drive")
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"schema": "another/1"}', "[" * 9999])
+def test_a_text_that_is_spoilt_beside_its_arrays_is_named(drive: Sequence, tmp_path: Path, text: str) -> None:
+    vislam_recording.save(drive, tmp_path / "drive")
+    (tmp_path / "drive" / "recording.json").write_text(text)
+    with pytest.raises(DataError, match=r"recording\.json(: | is not JSON)"):
+        load_sequence(str(tmp_path / "drive"))
+
+
+def test_the_arrays_by_themselves_are_a_part_of_a_recording(drive: Sequence, tmp_path: Path) -> None:
+    vislam_recording.save(drive, tmp_path / "drive")
+    with pytest.raises(DataError, match=r"is a part of a recording: name the whole, .*drive; "):
+        load_sequence(str(tmp_path / "drive" / "recording.npz"))
 
 
 def test_the_text_is_for_people(flight: Sequence, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from toolkit.datasets.trajectories import euroc, tum
+from toolkit.datasets.trajectories.exchanged_axes import Exchange
 from toolkit.documents import schema
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
@@ -138,6 +139,9 @@ def test_poses_of_a_camera_are_named_and_only_positions_scored(scene, vislam) ->
     assert 0.0 < run["metrics"]["ate_se3_m"] < 0.4
 
 
+Y_Z = Exchange(np.eye(3)[[0, 2, 1]], "positions and quaternions")
+
+
 def bad_text(scene, kind: str) -> str:
     t_ns = scene.stamps(10.0)
     poses = scene.poses_at(t_ns)
@@ -151,6 +155,8 @@ def bad_text(scene, kind: str) -> str:
             f"{t / S:.9f} {' '.join(map(repr, row))}" for t, row in zip(t_ns, w_first.tolist(), strict=True)
         ),
         "inverted": tum.text(Trajectory(t_ns, se3(np.swapaxes(rotations, 1, 2), positions))),
+        "mirrored": tum.text(Trajectory(t_ns, se3(rotations, positions[:, [0, 2, 1]]))),
+        "mirrored with quaternions": tum.text(Trajectory(t_ns, Y_Z.reread(poses))),
         "millimetres": tum.text(Trajectory(t_ns, se3(rotations, 1000.0 * positions))),
         "own clock": tum.text(Trajectory(t_ns - t_ns[0], poses)),
         "not a number": text.replace(text.splitlines()[5].split()[1], "nan", 1),
@@ -169,6 +175,8 @@ def bad_text(scene, kind: str) -> str:
         ("milliseconds from zero", "time must be in seconds"),
         ("w first", "turns as the truth does only if read w first"),
         ("inverted", "turns as the truth does only if inverted"),
+        ("mirrored", "it fits the truth with y and z exchanged (positions alone), and not as given"),
+        ("mirrored with quaternions", "it fits the truth with y and z exchanged (positions and quaternions)"),
         ("millimetres", "it is in millimetres"),
         ("own clock", "one counts from its own start: add 1700000000.000 s"),
         ("not a number", "line 6 holds a value that is not finite"),
@@ -318,6 +326,29 @@ def test_time_coverage_of_keyframes_counts_gaps(scene, vislam) -> None:
     assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 34.0 / 59.95)
     assert vislam("evaluate", "truth.tum", "keyframes.tum", "--gap", "12", "--out", "out", "--quiet") == 0
     assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 46.0 / 59.95)
+
+
+def test_a_truth_that_stands_still_is_remarked_beside_what_moves(scene, vislam, capsys) -> None:
+    t_ns = scene.stamps(10.0)
+    still = np.tile(np.eye(4), (t_ns.size, 1, 1))
+    Path("still.tum").write_text(tum.text(Trajectory(t_ns, still)))
+    assert vislam("evaluate", "still.tum", "truth.tum") == 0
+    assert "the truth stands still, all its positions are one" in " ".join(capsys.readouterr().out.split())
+    assert vislam("evaluate", "still.tum", "still.tum") == 0
+    assert "the truth stands still" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [
+    ("evaluate", "truth.tum", "truth.tum", "--runs", "1000000000"),
+    ("tracks", "film", "--count", "1000000000", "--out", "out"),
+    ("simulate", "flight", "--images", "--moving", "1000000000", "--out", "out"),
+])  # fmt: skip
+def test_counts_beyond_any_use_are_refused(vislam, capsys, words) -> None:
+    """They took all memory, or all day."""
+    with pytest.raises(SystemExit) as ended:
+        vislam(*words)
+    assert ended.value.code == 2
+    assert "expected at most " in capsys.readouterr().err
 
 
 def test_an_offset_brings_clocks_together(scene, vislam, capsys) -> None:

@@ -1,5 +1,6 @@
 """Kept outcomes: found again to the bit, for what they depend on and nothing else, whatever a kill leaves behind."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -87,7 +88,7 @@ def _is_time(key: str) -> bool:
     return key.startswith(("frame_", "total_s", "cpu_s", "peak_rss"))
 
 
-@pytest.mark.parametrize(("ended", "torn"), [(0, b""), (1, b'{"schema":"vislam.outcome/1","unit":{"da'), (3, b"{")])
+@pytest.mark.parametrize(("ended", "torn"), [(0, b""), (1, b'{"schema":"vislam.outcome/2","unit":{"da'), (3, b"{")])
 def test_interrupted_and_continued_equals_uninterrupted(
     sweep: Sweep, ran: Ran, tmp_path: Path, ended: int, torn: bytes
 ) -> None:
@@ -239,6 +240,51 @@ def test_a_damaged_line_is_told_with_its_number(store: OutcomeStore, tmp_path: P
     (tmp_path / OUTCOMES).write_bytes(first + second.replace(b'"ok"', b'"fine"'))
     with pytest.raises(DataError, match=r"line 2: is no outcome .*fine.*; delete the line"):
         OutcomeStore(tmp_path, Conditions("hash"))
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes"),
+    [
+        (b'"ok"', b'"diverged"'),
+        (b'"ate_se3_m":0.5', b'"ate_se3_m":0.1'),
+        (b'"seed":3', b'"seed":4'),
+        (b'"log":[]', b'"log": []'),
+        (b'"sha256":"', b'"sha256":"0'),
+        (b'"sequence_hash":"hash"', b'"sequence_hash":""'),
+    ],
+)
+def test_a_line_that_was_edited_is_not_believed(
+    store: OutcomeStore, tmp_path: Path, was: bytes, becomes: bytes
+) -> None:
+    scored = Scored(Scores({**dict.fromkeys(describe()), "ate_se3_m": 0.5}), np.zeros(2), np.zeros(2), 3.0)
+    store.keep(UNIT, OUTCOME)
+    store.keep(replace(UNIT, seed=3), replace(OUTCOME, seed=3, outputs={"final": scored}))
+    store.close()
+    path = tmp_path / OUTCOMES
+    first, second = path.read_bytes().splitlines(keepends=True)
+    assert second.count(was) == 1
+    path.write_bytes(first + second.replace(was, becomes, 1))
+    with pytest.raises(DataError, match=r"line 2: was changed since it was written.*delete the line"):
+        OutcomeStore(tmp_path, Conditions("hash"))
+
+
+def test_a_line_of_an_earlier_version_is_read_and_never_found(store: OutcomeStore, tmp_path: Path) -> None:
+    """It has no checksum, and is of other code in any case."""
+    store.keep(UNIT, OUTCOME)
+    store.close()
+    path = tmp_path / OUTCOMES
+    line = re.sub(rb',"sha256":"\w+"', b"", path.read_bytes()).replace(b"vislam.outcome/2", b"vislam.outcome/1")
+    path.write_bytes(line)
+    again = OutcomeStore(tmp_path, Conditions("hash"))
+    assert again.unusable == 1
+    assert again.find(UNIT) is None
+    again.close()
+
+
+@pytest.mark.parametrize("name", ["../notes.txt", "notes.txt", "/etc/hosts", "trajectories/../notes.txt"])
+def test_a_line_makes_no_file_elsewhere_ours(tmp_path: Path, name: str) -> None:
+    (tmp_path / OUTCOMES).write_text(f'{{"schema":"vislam.outcome-files/1","files":["{name}"]}}\n')
+    assert files_of_ours(tmp_path) == {OUTCOMES}
 
 
 @pytest.mark.parametrize(("content", "ours"), [(b"", True), (b'{"sche', True), (b"{}\n", False), (b"notes", False)])

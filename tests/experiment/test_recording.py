@@ -47,6 +47,15 @@ def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion()
     np.testing.assert_allclose(cov_uv_px2 / cov_uv_px2[0, 0], recorded / recorded[0, 0], rtol=1e-12)
 
 
+def test_a_pixel_sigma_that_the_tracks_refute_is_told() -> None:
+    """The audit reads the recording's own noise; estimators are told the one of the settings."""
+    for sigma_px, told in ((1.0, None), (30.0, "30 times too large"), (0.1, "9.99 times too small")):
+        asked = Recording("drive", duration_s=5.0, noise=Noise(pixel_sigma_px=sigma_px))
+        said = {finding.fault: finding.detail for finding in prepare(asked).findings if finding.warning}
+        assert set(said) == ({"track-scatter"} if told else set())
+        assert told is None or told in said["track-scatter"]
+
+
 def test_a_factor_on_twists_scales_both_densities() -> None:
     before, (_, after) = load_sequence("drive").noise, told("drive", motion_scale=3.0)
     assert isinstance(before, TwistNoise)

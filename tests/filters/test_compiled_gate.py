@@ -228,3 +228,26 @@ def test_what_was_kept_is_compiled_anew_when_any_source_of_its_folder_changes(ke
     other.write_text("ONE = 1.0\n")
     assert told() != ""
     assert told() == ""
+
+
+@pytest.mark.parametrize("kind", [".nbi", ".nbc"])
+@pytest.mark.parametrize("damaged", [lambda _: b"", lambda content: content[: len(content) // 2], lambda _: b"text"])
+def test_what_was_kept_and_is_damaged_is_thrown_away_and_compiled_anew(kernels, tmp_path, monkeypatch, kind, damaged):
+    from numba import types
+
+    from filters.kalman.kernels.compiling import kept, what_was_compiled
+
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "kept_two.py").write_text("def add(x):\n    return x + 1.0\n")
+
+    def told() -> str:
+        sys.modules.pop("kept_two", None)
+        kernel = kept((types.float64,), tmp_path)(importlib.import_module("kept_two").add)
+        assert kernel(1.0) == 2.0
+        return what_was_compiled(kernel, "add was")
+
+    assert told() != ""
+    (file,) = tmp_path.rglob(f"*{kind}")
+    file.write_bytes(damaged(file.read_bytes()))
+    assert told() == "add was compiled, once for this version"
+    assert told() == ""

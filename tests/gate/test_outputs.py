@@ -60,6 +60,19 @@ def test_json_has_every_verdict_and_no_number_that_is_none(check, tmp_path):
     assert document["tests"] == sum(v["p"] is not None for v in document["verdicts"])
 
 
+def test_the_table_is_no_wider_than_100_columns_and_says_every_name_whole(failed):
+    sequence, metric = "a-recording-of-a-long-name/part.2", "heldout_over_motion_error"
+    long = {"sequence": sequence, "metric": metric, "estimator": "msckf"}
+    verdicts = [replace(v, **long, output="causal", before=0.00012345, after=123456.7) for v in failed.verdicts]
+    text = gate_text(replace(failed, verdicts=tuple(verdicts)))
+    table = text.split("\n\n")[0].splitlines()
+    assert max(map(len, table)) <= 100
+    rows = table[1 + next(i for i, line in enumerate(table) if line.startswith("---")) :]
+    for name, column, following in ((sequence, "sequence", "estimator"), (metric, "metric", "finding")):
+        cells = slice(table[0].index(column), table[0].index(following))
+        assert "".join(line[cells].strip() for line in rows) == name * len(verdicts)
+
+
 def test_markdown_tables_are_well_formed(check):
     text = gate_markdown(check)
     tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]

@@ -136,6 +136,17 @@ def test_another_clock_is_told_with_both_ranges(vislam, capsys):
     assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
 
 
+def test_exchanged_axes_are_named_where_a_baseline_is_made_and_held(vislam, capsys):
+    lap = Path("results/lap.tum")
+    rows = [line.split() for line in lap.read_text().splitlines() if not line.startswith("#")]
+    lap.write_text("".join(f"{' '.join([t, x, z, y, *rest])}\n" for t, x, y, z, *rest in rows))
+    assert failures(vislam) == [("lap", "sequence", "missing")]
+    told = "lap.tum: it fits the truth with y and z exchanged (positions alone), and not as given"
+    assert told in " ".join(capsys.readouterr().out.split())
+    assert vislam(*BASELINE[:-1], "other.json") == 3
+    assert told in capsys.readouterr().err
+
+
 def test_another_truth_is_not_compared_with(vislam, capsys):
     write(Path("other/lap.tum"), stamps(20.0), 0.01)
     assert failures(vislam, "--truth", "lap=other/lap.tum") == [("lap", "sequence", "missing")]

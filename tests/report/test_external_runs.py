@@ -117,6 +117,13 @@ def test_poses_of_the_camera_are_named(tmp_path: Path, recording: Sequence, name
     assert "the poses look like the left camera's" in refusal(tmp_path, of_camera, recording, name)
 
 
+def test_poses_in_exchanged_axes_are_named_where_a_truth_shows_them(tmp_path: Path) -> None:
+    recording = simulate(replace(FLIGHT, duration_s=10.0), seed=2)
+    truth = truth_of(recording)
+    exchanged = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], truth.positions[:, [0, 2, 1]]))
+    assert "with y and z exchanged (positions alone)" in refusal(tmp_path, exchanged, recording)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_poor_estimate_is_no_wrong_file(tmp_path: Path, recording: Sequence, seed: int) -> None:
     truth, rng = truth_of(recording), np.random.default_rng(seed)

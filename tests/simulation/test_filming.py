@@ -1,13 +1,16 @@
 """Rendered images show the scene where it is, and a folder of them is the scenario's recording."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from toolkit.cli import main
 from toolkit.datasets import load_sequence
 from toolkit.errors import OutputError
 from toolkit.geometry import Array, se3_inverse
@@ -194,6 +197,34 @@ def test_what_fails_on_the_way_leaves_nothing(tmp_path: Path, monkeypatch: pytes
     with pytest.raises(OutputError, match="No space left"):
         film(SHORT, 0, tmp_path / "full")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_images_for_which_there_is_no_room_are_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hour = replace(FLIGHT, duration_s=3600.0)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=20e9))
+    monkeypatch.setattr(filming, "simulate", lambda *_: pytest.fail("simulated before the room was looked at"))
+    with pytest.raises(OutputError, match=r"72001 stereo pairs take about 28\.8 GB, and 20 GB are free there"):
+        film(hour, 0, tmp_path / "new" / "deeper")
+    assert not list(tmp_path.iterdir())
+
+
+def test_how_much_is_to_be_made_is_said_before_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(filming, "film", stopped)
+    words = ("simulate", "flight", "--images", "--duration", "60", "--out", str(tmp_path / "long"))
+    assert main(words) == 130
+    assert "1201 stereo pairs, about 0.48 GB" in capsys.readouterr().err
+
+
+def test_the_stated_size_of_a_pair_is_about_what_it_takes(filmed: Path) -> None:
+    sizes = [path.stat().st_size for path in filmed.rglob("*.png")]
+    assert 2.0 * np.mean(sizes) / 1e9 == pytest.approx(filming._PAIR_GB, rel=0.35)
 
 
 def test_a_world_of_points_cannot_be_filmed(tmp_path: Path) -> None:

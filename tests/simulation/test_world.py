@@ -8,7 +8,7 @@ import pytest
 from toolkit.geometry import se3_inverse, transform
 from toolkit.models.stereo import project
 from toolkit.simulation import DRIVE, FLIGHT, Scenario
-from toolkit.simulation.world import follow, room, visibility
+from toolkit.simulation.world import follow, roadside, room, visibility
 
 
 def view(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,3 +85,14 @@ def test_the_walls_of_a_room_are_equally_dense() -> None:
     share = np.bincount(wall) / len(points)
     # Counted by the nearest wall; near the edges a point may belong to its neighbour.
     np.testing.assert_allclose(share, np.array([18.0, 30.0, 60.0]) / 108.0, atol=0.03)
+
+
+def test_no_landmark_stands_in_the_way_however_long_the_road_is() -> None:
+    """Distances of all points to all poses would take 30 GB."""
+    path = np.tile(np.eye(4), (20_000, 1, 1))
+    path[:, 0, 3], path[:, 1, 3] = np.arange(20_000.0), 30.0 * np.sin(np.arange(20_000.0) / 40.0)
+    points = roadside(path, 5, np.random.default_rng(0))
+    some = points[::997]
+    nearest_m = np.sqrt(((some[:, None, :2] - path[None, :, :2, 3]) ** 2).sum(axis=-1).min(axis=1))
+    assert nearest_m.min() >= 3.0
+    assert len(points) > 90_000

@@ -1,5 +1,6 @@
 """Noise that was planted is found, white noise stays white, and the parts of the fit are what they say."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -29,14 +30,20 @@ def test_a_planted_walk_and_offset_are_found(walking_fit: Fit) -> None:
     np.testing.assert_allclose(noise.offset_px, [0.0, OFFSET_PX, 0.0], rtol=0.12)
     assert noise.white_px.max() < 0.06
     assert walking_fit.gain > 5.0 * walking_fit.gain_error
-    assert "an offset of 0." in in_words(walking_fit)
+    assert "an offset of 0." in in_words(walking_fit, np.eye(3))
 
 
 def test_white_noise_comes_out_white(white_fit: Fit) -> None:
     assert not white_fit.correlated
     # c is the mean of two columns of 1 px, d their difference, v the mean of two rows; 600 tracks are good for 3 %.
     np.testing.assert_allclose(white_fit.noise.white_px, [np.sqrt(0.5), np.sqrt(2.0), np.sqrt(0.5)], rtol=0.1)
-    assert "each sighting by itself" in in_words(white_fit)
+    stated_px2 = 2.0**2 * np.diag([1.0, 1.0, 0.5])
+    assert "each sighting by itself" in in_words(white_fit, stated_px2)
+    times = re.search(
+        r"recording's own 1.41/2.83/1.41 px in c/d/v, ([\d.]+) times that", in_words(white_fit, stated_px2)
+    )
+    assert times is not None
+    assert float(times[1]) == pytest.approx(2.0, rel=0.05)
 
 
 def test_the_settings_put_the_fitted_noise_on_the_rig_and_say_so(walking: Sequence) -> None:

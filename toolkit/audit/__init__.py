@@ -7,7 +7,7 @@ Read ``fault``, then ``no_disparity`` for the smallest fault, ``stale_frames`` a
 import importlib
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from graphlib import TopologicalSorter
 
@@ -20,7 +20,7 @@ from toolkit.sequence import Sequence
 # Share of the sightings that a repair may drop; frames cut off with theirs do not count, for what stays is whole.
 MOST_LOST = 0.2
 
-__all__ = ["Audit", "Finding", "audit", "faults"]
+__all__ = ["Audit", "Finding", "audit", "faults", "judged_again"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,19 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
             elif symptom.spoils_vision:
                 evidence = Evidence(evidence.sequence, fault.name)
     return Audit(evidence.sequence, tuple(findings), undecided)
+
+
+def judged_again(found: Audit, name: str, sequence: Sequence) -> Audit:
+    """Return an audit with one fault, of those that nothing repairs, checked anew in what became of the recording."""
+    fault = next(fault for fault in _ordered() if fault.name == name)
+    findings = tuple(finding for finding in found.findings if finding.fault != name)
+    undecided = {key: why for key, why in found.undecided.items() if key != name}
+    symptom = fault.check(Evidence(sequence))
+    if isinstance(symptom, Undecided):
+        undecided[name] = symptom.why
+    elif symptom is not None:
+        findings = (*findings, _finding(fault, symptom, sequence, repaired=False))
+    return replace(found, findings=findings, undecided=undecided)
 
 
 def faults() -> dict[str, str]:

@@ -31,12 +31,10 @@ def check(evidence: Evidence) -> Symptom | None:
         return None
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
-    first, second = _neighbouring_residuals(evidence)
-    if len(first) < LEAST_TRIPLES:
+    found = step_correlation(evidence)
+    if found is None:
         return None
-    if not (first.any() and second.any()):
-        return None
-    value, error = _correlation(first, second), jackknife_error(_correlation, first, second)
+    value, error = found
     if value < MOST_CORRELATION + SIGMAS * error:
         return None
     return Symptom(
@@ -49,6 +47,14 @@ def check(evidence: Evidence) -> Symptom | None:
         remedy=None,
         harmful=False,
     )
+
+
+def step_correlation(evidence: Evidence) -> tuple[float, float] | None:
+    """Return the correlation of neighbouring one-step residuals and its standard error; None of too few, or of none."""
+    first, second = _neighbouring_residuals(evidence)
+    if len(first) < LEAST_TRIPLES or not (first.any() and second.any()):
+        return None
+    return _correlation(first, second), jackknife_error(_correlation, first, second)
 
 
 def _neighbouring_residuals(evidence: Evidence) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
 from toolkit.audit.parts.agreement import agreement
+from toolkit.audit.parts.exchanged_rows import exchanged_rows, like_rows
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.stereo import disparity_px
 from toolkit.sequence import Sequence, is_left_only
@@ -23,6 +24,9 @@ SUSPECT_SHARE = 0.2
 SOUND_SHARE = 0.05
 # Rows of a pair differ by their noise: within so many standard deviations of the rig's for half of the sightings.
 ROW_SIGMAS = 5.0
+# Share of the sightings in tracks of exchanged rows that counts: no sound recording at hand has any. Most of the tracks
+# like rows must be so, or the camera's motion, or what they are, is not known.
+LEAST_EXCHANGED, MOSTLY = 0.02, 0.5
 # Frames in which the orders are tried.
 TRIED_FRAMES = 300
 NAMES = ("uL", "uR", "v")
@@ -31,6 +35,8 @@ NAMES = ("uL", "uR", "v")
 def check(evidence: Evidence) -> Symptom | None:
     """Find the order of the coordinates under which tracks and motion agree; exchange them where it is certain."""
     sequence = evidence.sequence
+    if (partly := _rows_in_some_tracks(evidence)) is not None:
+        return partly
     disparity = disparity_px(sequence.observations.uv_px)
     suspect = np.isfinite(disparity) & (disparity <= 0.0)
     if suspect.sum() <= SUSPECT_SHARE * max(len(disparity), 1):
@@ -52,6 +58,30 @@ def check(evidence: Evidence) -> Symptom | None:
     words, remedy = explained[0]
     treatment = "exchanged again, and the tracks follow the measured motion"
     return Symptom(count, f"{detail}: {words}", treatment, remedy, spoils_vision=True)
+
+
+def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
+    """Tell of tracks that follow the camera's own motion, which the others show, with u and v exchanged alone."""
+    sequence = evidence.sequence
+    candidates = like_rows(sequence)
+    if (
+        candidates.sum() < max(LEAST_EXCHANGED * candidates.size, 1)
+        or not np.isfinite(sequence.observations.uv_px[:, [0, 2]]).all()
+    ):
+        return None
+    exchanged = exchanged_rows(sequence, evidence.camera_motion)
+    count = int(exchanged.sum())
+    if count < max(LEAST_EXCHANGED * len(exchanged), MOSTLY * candidates.sum()):
+        return None
+    return Symptom(
+        count=count,
+        detail=(
+            f"{count} of {len(exchanged)} sightings ({count / len(exchanged):.0%}), whole tracks, have a uL that "
+            "differs from uR as the rows of a pair do, and follow the camera's own motion only if u and v are exchanged"
+        ),
+        treatment=f"the depth is lost with the exchange: these and what else is like rows dropped ({candidates.sum()})",
+        remedy=replace(sequence, observations=sequence.observations.select(~candidates)),
+    )
 
 
 def _flat(sequence: Sequence, suspect: BoolArray) -> Symptom | None:

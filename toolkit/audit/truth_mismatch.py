@@ -6,6 +6,7 @@ another unit; they go elsewhere where the truth is another recording's, runs bac
 of this motion, the camera turns as it does, but for an offset of its clock.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,6 +18,7 @@ from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, is_comparable, moved_by
 from toolkit.audit.parts.robust import chance_sigmas, median_error
 from toolkit.audit.time_offset import camera_offset
+from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth
@@ -38,10 +40,18 @@ LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
 LEAST_TURNING = 1.0 / 3.0
 # From one true pose to the next: so far (m) and so many times the usual speed (m/s) is no motion.
 LEAST_LEAP_M, LEAP, LEAST_LEAP_MPS = 0.5, 10.0, 10.0
+# So many times as far as counts as a motion the camera drives while the truth stands; for half of the time no vehicle
+# fills the view, and no truth that was measured repeats a pose exactly while it does.
+DRIVES, MOST_STANDING = 5.0, 0.5
+# Root mean squares, as shares of the motion: a truth that is so far off is tried in other readings, and taken to
+# be of one where it is so many times nearer then. In sound recordings at hand it never is.
+LEAST_APART, TIMES_NEARER = 0.1, 3.0
 # An offset of the truth's clock beyond so many standard errors and so much (s) counts.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
+
+_AXES = "write the truth in the axes it is read in: the world's, z upwards, and the body's that the samples have"
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -76,11 +86,15 @@ def _broken(truth: Truth) -> Symptom | None:
 def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | None:
     both = _windows(evidence, truth)
     moved, turned = _moving(both.displaced_m, LEAST_MOVED_M), _moving(both.turned_rad, LEAST_TURNED_RAD)
+    if (stands := _standing(both, moved)) is not None:
+        return stands
     if moved.sum() < LEAST_WINDOWS:
         return Undecided(
             f"the truth moves by {LEAST_MOVED_M:g} m and more, and the camera's own motion is known, in {moved.sum()} "
             f"windows of {WINDOW_S:g} s; {LEAST_WINDOWS} are needed"
         )
+    if (other := _read_otherwise(evidence, truth, both)) is not None:
+        return other
     off = {"moves": _off(both.displaced_m[:, moved])}
     if turned.sum() >= max(LEAST_WINDOWS, LEAST_TURNING * moved.sum()):
         off["turns"] = _off(both.turned_rad[:, turned])
@@ -97,6 +111,51 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
         return None
     return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's", _WHERE)
+
+
+def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:
+    """Tell of a truth that stands in more than chance of the windows while the camera drives, or in most of them."""
+    drives_m = np.linalg.norm(both.displaced_m[0], axis=1)
+    frozen = (both.displaced_m[1] == 0.0).all(axis=1) & (both.turned_rad[1] == 0.0).all(axis=1)
+    apart = ~moved & (drives_m > DRIVES * LEAST_MOVED_M)
+    in_most = apart.sum() >= max(LEAST_WINDOWS, MOST_STANDING * moved.size)
+    if not in_most and (apart & frozen).sum() < LEAST_WINDOWS:
+        return None
+    speed_mps = float(np.median(drives_m[apart])) / WINDOW_S
+    return _told(
+        f"the truth stands still in {apart.sum()} of {moved.size} windows of {WINDOW_S:g} s in which the camera moves "
+        f"at {speed_mps:.2g} m/s",
+        "it is no truth of this motion, or was frozen: leave it out, for errors and consistency against it say nothing",
+    )
+
+
+def _read_otherwise(evidence: Evidence, truth: Truth, both: "_Windows") -> Symptom | None:
+    """Tell of a truth that moves as the camera does backwards, or in other axes, and not as given, as ``both`` are."""
+    given = _apart(both)
+    if not given > LEAST_APART:
+        return None
+    for words, remedy, T_world_imu in _readings(truth.T_world_imu):
+        apart = _apart(_windows(evidence, replace(truth, T_world_imu=T_world_imu)))
+        if apart < given / TIMES_NEARER:
+            said = f"the truth's motion is not the camera's, but for one {words}, by which they differ by {apart:.1%}"
+            return _told(f"{said} and not by {given:.0%}", remedy)
+    return None
+
+
+def _readings(T_world_imu: Array) -> Iterator[tuple[str, str, Array]]:
+    """Yield what a truth may be in the place of what it is: in words, what to do about it, and the poses."""
+    yield "whose poses run backwards", "write them in the order of their stamps", T_world_imu[::-1]
+    for exchange in exchanges():
+        yield f"with {exchange.in_words}", _AXES, exchange.reread(T_world_imu)
+
+
+def _apart(both: "_Windows") -> float:
+    """Return how far the two of windows are apart, as a share of what the truth moves and turns: root mean squares."""
+    squared = [
+        np.mean((x[0] - x[1]) ** 2) / max(float(np.mean(x[1] ** 2)), least**2)
+        for x, least in ((both.displaced_m, LEAST_MOVED_M), (both.turned_rad, LEAST_TURNED_RAD))
+    ]
+    return float(np.sqrt(sum(squared)))
 
 
 def _by_another_clock(evidence: Evidence, truth: Truth) -> Symptom | None:

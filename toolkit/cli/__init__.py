@@ -175,7 +175,7 @@ def _unexpected(error: Exception) -> int:
 def _refused(behind: BaseException) -> str:
     """Return what of the system's means is missing, and what to do."""
     if isinstance(behind, MemoryError):
-        return "the memory does not suffice; use fewer --workers, or a part of the recording"
+        return "the memory does not suffice; take a part of the recording, a shorter one, or fewer --workers"
     if isinstance(behind, ImportError):
         return f"a library cannot be loaded ({behind}); allow more memory, or install it again"
     return f"the system refuses to go on: {behind}"

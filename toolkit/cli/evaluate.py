@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from toolkit.evaluation.standings import EvaluatedSystems
     from toolkit.metrics import Metric
 
+# Of one sequence: what is missing is counted one by one.
+MOST_RUNS = 10_000
 _FORMATS = ("text", "markdown", "csv", "latex")
 
 
@@ -53,7 +55,10 @@ def _add_terms(parser: argparse.ArgumentParser) -> None:
         help="of the truth's time; a run that covers less counts as failed (default: 50)",
     )
     parser.add_argument(
-        "--runs", metavar="N", type=at_least(1), help="runs that each system ought to have of a sequence; others failed"
+        "--runs",
+        metavar="N",
+        type=at_least(1, MOST_RUNS),
+        help="runs that each system ought to have of a sequence; others failed",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 SCENARIOS = ("drive", "drive-imu", "flight", "drive-realistic", "flight-realistic")
 _LENSES = ("none", "radtan", "equidistant")
 _LONGEST_EXPOSURE_MS = 40
+# Of more pairs is said, before they are made, how much room they take.
+_MANY_PAIRS = 1000
+_MOST_STILLS, _MOST_CRATES = 10_000, 1000
 _ONLY_WITH_IMAGES = ("lens", "blur", "moving")
 
 
@@ -91,7 +95,9 @@ def _tracks_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--count", metavar="N", type=at_least(1), default=10, help="how many stills (default: 10)")
+    what.add_argument(
+        "--count", metavar="N", type=at_least(1, _MOST_STILLS), default=10, help="how many stills (default: 10)"
+    )
     what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
     add_topics_argument(parser)
     add_settings_arguments(parser)
@@ -165,7 +171,9 @@ def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
         "--lens", choices=_LENSES, help="the distortion of both cameras, mounted askew then (default: none, rectified)"
     )
     images.add_argument("--blur", metavar="MS", type=_exposure_ms, help="milliseconds of exposure (default: 0)")
-    images.add_argument("--moving", metavar="N", type=at_least(0), help="crates that fly about (default: 0)")
+    images.add_argument(
+        "--moving", metavar="N", type=at_least(0, _MOST_CRATES), help="crates that fly about (default: 0)"
+    )
 
 
 @command(
@@ -206,8 +214,12 @@ def simulate(options: argparse.Namespace) -> int:
 def _film(scenario: Scenario, options: argparse.Namespace) -> int:
     """Render the images, with the time that is left, and say what was written."""
     from toolkit.progress import of_this_process
-    from toolkit.simulation.filming import Filming, film
+    from toolkit.simulation.filming import Filming, check_filmable, film, pair_count, size_gb
 
+    check_filmable(scenario, options.out)
+
+    if (pairs := pair_count(scenario)) > _MANY_PAIRS:
+        print(f"{printable(str(options.out))}: {pairs} stereo pairs, about {size_gb(scenario):.2g} GB", file=sys.stderr)
     filming = Filming(options.lens or "none", (options.blur or 0.0) / 1000.0, options.moving or 0)
     with of_this_process()(str(options.out)) as progress:
         sequence = film(scenario, options.seed, options.out, filming, progress)

@@ -17,7 +17,7 @@ from toolkit.datasets.io.npz_archive import opened
 from toolkit.errors import DataError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array
-from toolkit.inputs import open_input, read_text_input
+from toolkit.inputs import is_regular, open_input, read_text_input
 from toolkit.measured_motion import (
     ImuNoise,
     ImuSamples,
@@ -40,10 +40,14 @@ Text = dict[str, Any]
 
 
 def recognises(path: Path) -> bool:
-    """Say whether the path is a recording of this format: its folder, or the JSON file in it; damaged ones too."""
+    """Say whether the path is a recording of this format: its folder, or the JSON file in it; damaged ones too.
+
+    Where both files stand side by side it is one, whatever became of the text.
+    """
+    text = _text_file(path)
     try:
-        with open_input(_text_file(path)) as file:
-            return b'"vislam.recording/' in file.read(4096)
+        with open_input(text) as file:
+            return b'"vislam.recording/' in file.read(4096) or is_regular(text.with_name(_ARRAYS))
     except (DataError, OSError):
         return False
 

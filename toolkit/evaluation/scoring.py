@@ -27,6 +27,7 @@ from toolkit.datasets.trajectories.belonging import (
     range_s,
     turned_body,
 )
+from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
 from toolkit.datasets.trajectories.poses import PosesFile, StatedApart, check_order
 from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
@@ -74,6 +75,11 @@ _OF_THE_CLOCK = (*_OVER_A_SECOND, *(metric.key for metric in clock_offset.METRIC
 _OF_THE_BODY = (
     *("ate_none_m", "ate_se3_deg", *_OVER_A_SECOND, "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m"),
     *("end_drift_percent", *_NEES_KEYS),
+)
+# What a truth that repeats one position makes of errors.
+_OF_POSITIONS = tuple(metric.key for metric in ate.METRICS)
+_STANDS = (
+    "the truth stands still, all its positions are one: these are the estimate's own motion, unless it ought to stand"
 )
 # Frames without stamps are taken to be so far apart where only their order matters.
 _FRAME_NS = NS_PER_S // 10
@@ -152,6 +158,8 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
     estimate = _stamped(file, truth, terms.offset_s)
     turn = _checked(file, estimate, truth)
     matched = _matched(estimate, truth, terms.max_dt_s)
+    if turn is None:
+        check_axes(str(path), matched.truth, matched.estimate)
     scores = _score(matched, file, estimate, truth, terms)
     if not truth.is_timed:
         scores = scores.without(_OF_THE_CLOCK, "the files have no stamps")
@@ -159,6 +167,8 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
         scores = scores.without(
             _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
         )
+    if np.ptp(matched.truth[:, :3, 3], axis=0).max() == 0.0 < np.ptp(matched.estimate[:, :3, 3], axis=0).max():
+        scores = scores.remarked(_OF_POSITIONS, _STANDS)
     return scores.remarked([_PAIRS.key], _how_matched(estimate, truth, terms.max_dt_s))
 
 
@@ -182,6 +192,8 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     reference = truth.reference
     check_clock(what, reference, estimate.t_ns)
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
+    matched = matched_poses(estimate, truth.stamped)
+    check_mirrored(what, matched.truth, matched.estimate)
     readings = [inverted()]
     if file.other_order is not None:
         readings.insert(0, in_other_order(file.other_order))

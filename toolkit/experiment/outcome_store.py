@@ -9,7 +9,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal, Protocol
 
 import msgspec
@@ -31,9 +31,10 @@ from toolkit.settings import Settings, as_values
 Infinite = Literal["inf", "-inf"]
 Number = float | Infinite | None
 Series = Annotated[tuple[Number, ...], Meta(description="one a frame; null where unknown")]
-OUTCOMES = "outcomes.jsonl"
+OUTCOMES, _TRAJECTORIES = "outcomes.jsonl", "trajectories"
 # Every line of such a file begins so.
 _OUR_START = b'{"schema":"vislam.outcome'
+_NO_CHECKSUM = b'"sha256":""}'
 _FILES_START = b'{"schema":"vislam.outcome-files/1"'
 
 
@@ -63,8 +64,11 @@ class ScoredRecord(Struct, frozen=True, kw_only=True):
     nis_dof: Number
 
 
-class OutcomeRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/1"):
-    """An outcome. A final output that only repeats the causal one is not there."""
+class UncheckedRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/1"):
+    """An outcome without a checksum, as earlier versions wrote it: of other code, and so never found.
+
+    A final output that only repeats the causal one is not there.
+    """
 
     unit: UnitKey
     requested: Annotated[tuple[str, ...], Meta(description="metrics on request that were computed")]
@@ -75,6 +79,12 @@ class OutcomeRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="
     files: Annotated[dict[str, str], Meta(description="SHA-256 of its trajectories by their relative paths")]
     log: tuple[str, ...]
     arithmetic: Annotated[Arithmetic | None, Meta(description="of an estimator that has both")] = None
+
+
+class OutcomeRecord(UncheckedRecord, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome/2"):
+    """An outcome as its line holds it."""
+
+    sha256: Annotated[str, Meta(description="of the line with this empty: a line that was edited is refused")]
 
 
 class FilesRecord(Struct, frozen=True, kw_only=True, tag_field="schema", tag="vislam.outcome-files/1"):
@@ -96,7 +106,26 @@ def record_of(outcome: Outcome, unit: UnitKey, requested: tuple[str, ...], files
         files=files,
         log=outcome.log,
         arithmetic=outcome.arithmetic,
+        sha256="",
     )
+
+
+def line_of(record: OutcomeRecord) -> bytes:
+    """Return the line of an outcome, with its checksum, which stands last."""
+    line = msgspec.json.encode(record)
+    assert line.endswith(_NO_CHECKSUM)
+    return _with_checksum(line, hashlib.sha256(line).hexdigest())
+
+
+def _with_checksum(line: bytes, digest: str) -> bytes:
+    return line.removesuffix(_NO_CHECKSUM) + _NO_CHECKSUM[:-2] + digest.encode() + _NO_CHECKSUM[-2:]
+
+
+def _is_as_written(line: bytes, record: OutcomeRecord) -> bool:
+    """Say whether the checksum of a line is that of the line."""
+    end = _with_checksum(_NO_CHECKSUM, record.sha256)
+    bare = line.removesuffix(end) + _NO_CHECKSUM
+    return line.endswith(end) and hashlib.sha256(bare).hexdigest() == record.sha256
 
 
 def outcome_of_record(record: OutcomeRecord, requested: tuple[str, ...]) -> Outcome:
@@ -154,7 +183,7 @@ def _series(numbers: tuple[Number, ...]) -> Array:
     return np.array([math.nan if number is None else float(number) for number in numbers], dtype=float)
 
 
-_DECODER = msgspec.json.Decoder(OutcomeRecord | FilesRecord)
+_DECODER = msgspec.json.Decoder(OutcomeRecord | UncheckedRecord | FilesRecord)
 
 
 class Store(Protocol):
@@ -228,10 +257,12 @@ class OutcomeStore:
         self._path = directory / OUTCOMES
         self._lines = LineFile(self._path) if self._path.exists() else None
         self._records: dict[bytes, list[OutcomeRecord]] = {}
+        self._unchecked = 0
         try:
             for record in _records_in(self._path):
                 if isinstance(record, OutcomeRecord):
                     self._records.setdefault(record.unit.text(), []).append(record)
+                self._unchecked += type(record) is UncheckedRecord
         except BaseException:
             self.close()
             raise
@@ -239,7 +270,8 @@ class OutcomeStore:
     @property
     def unusable(self) -> int:
         """Return how many outcomes are there of other data, code or repairs, which no unit of the case can have."""
-        return sum(not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
+        of_others = (not self._conditions.fit(one.unit) for records in self._records.values() for one in records)
+        return self._unchecked + sum(of_others)
 
     @property
     def is_there(self) -> bool:
@@ -271,7 +303,7 @@ class OutcomeStore:
             self._write(texts)
         digests = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
         asked = unit.settings.metrics.requested()
-        line = msgspec.json.encode(record_of(outcome, self._conditions.key(unit), asked, digests))
+        line = line_of(record_of(outcome, self._conditions.key(unit), asked, digests))
         self._lines.append(line)
         kept = _DECODER.decode(line)
         assert isinstance(kept, OutcomeRecord)
@@ -300,7 +332,7 @@ class OutcomeStore:
 
 def trajectory_file(unit: Unit, output: Output) -> str:
     """Return where in a run directory the trajectory of a unit's output is kept."""
-    return f"trajectories/seed-{unit.seed}/{plain_name(unit.estimator)}_{output}.tum"
+    return f"{_TRAJECTORIES}/seed-{unit.seed}/{plain_name(unit.estimator)}_{output}.tum"
 
 
 def _names(unit: Unit, final_is_causal: bool, outputs: Iterable[Output]) -> set[str]:
@@ -325,19 +357,26 @@ def _files_named(line: bytes) -> tuple[str, ...]:
         record = _DECODER.decode(line)
     except msgspec.DecodeError:
         return ()
-    return record.files if isinstance(record, FilesRecord) else ()
+    named = record.files if isinstance(record, FilesRecord) else ()
+    return tuple(name for name in named if PurePosixPath(name).parts[:1] == (_TRAJECTORIES,) and ".." not in name)
 
 
-def _records_in(path: Path) -> Iterable[OutcomeRecord | FilesRecord]:
+def _records_in(path: Path) -> Iterable[UncheckedRecord | FilesRecord]:
     """Yield what the lines of a file hold; a last line without its end was cut off by a kill and is not read."""
     if not path.exists():
         return
     for number, line in enumerate(whole_lines(read_input(path)), start=1):
         try:
-            yield _DECODER.decode(line)
+            record = _DECODER.decode(line)
         except msgspec.DecodeError as error:
             what = " ".join(str(error).split())
             raise DataError(f"{path}, line {number}: is no outcome ({what}); delete the line, and repeat") from error
+        if isinstance(record, OutcomeRecord) and not _is_as_written(line, record):
+            raise DataError(
+                f"{path}, line {number}: was changed since it was written, for its checksum is another; delete the "
+                "line, and repeat: its run is made anew"
+            )
+        yield record
 
 
 def _digest(path: Path) -> str | None:

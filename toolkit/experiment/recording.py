@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from toolkit.audit import Audit, Finding, audit
+from toolkit.audit import Audit, Finding, audit, judged_again
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
@@ -108,6 +108,8 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
     with on_one_thread():
         audited = audited_recording(recording, progress)
         whole = _with_noise(audited.sequence, recording.noise)
+        if recording.noise.pixel_sigma_px is not None and recording.noise.tracks == "white":
+            audited = _judged_with_its_noise(audited, _cut(whole, recording))
         card = None
         if recording.noise.tracks == "fitted":
             whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
@@ -277,6 +279,12 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
     return replace(at_rest, provenance=provenance), share
 
 
+def _judged_with_its_noise(audited: Audit, used: Sequence) -> Audit:
+    """Return what was found, with the tracks held against the noise that the settings state in the place of another."""
+    with np.errstate(all="ignore"):
+        return judged_again(audited, "track-scatter", used)
+
+
 def _stated_track_noise(asked: Noise) -> TrackNoise:
     """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
     white, walk, offset = asked.track_white_px, asked.track_walk_px, asked.track_offset_px
@@ -302,7 +310,7 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     basis = "all that is used of the recording, so that causal answers know it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
-    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted)}"
+    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted, whole.rig.cov_uv_px2)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
     return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)

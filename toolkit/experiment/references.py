@@ -12,11 +12,12 @@ from toolkit.datasets.trajectories.belonging import (
     of_the_camera,
     range_s,
 )
+from toolkit.datasets.trajectories.exchanged_axes import check_axes
 from toolkit.datasets.trajectories.poses import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.experiment.comparison import plain_name
-from toolkit.metrics._shared.association import median_period_ns, poses_at
+from toolkit.metrics._shared.association import associate, median_period_ns, poses_at
 from toolkit.sequence import Sequence
 
 _OTHER_TERMS = (
@@ -59,6 +60,9 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
     confirmed = check_turns(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)
     if poses.other_order is not None and not confirmed:
         check_order(poses.path, trajectory.T_world_imu, poses.other_order)
+    if recording.truth is not None:
+        matched = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
+        check_axes(what, matched.truth, matched.estimate)
     return _run(
         name, trajectory, sequence, "final", f"read from {what} ({poses.format}, {len(poses)} poses)", _AS_FINAL
     )

@@ -149,7 +149,7 @@ def _now(sequence: str, before: ScoredSequence, given: GivenRuns, scoring: Scori
 
 
 def _scores_of(files: tuple[Path, ...], truth: Poses, scoring: Scoring) -> dict[str, Values]:
-    by_file = [scores(read_stamped(file), truth, scoring) for file in files]
+    by_file = [scores(read_stamped(file, truth), truth, scoring) for file in files]
     return {key: tuple(one[key] for one in by_file) for key in scoring.metrics}
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import range_s
+from toolkit.datasets.trajectories.exchanged_axes import check_axes, check_mirrored
 from toolkit.datasets.trajectories.poses import check_order
 from toolkit.errors import DataError, printable
 from toolkit.files import content_digest
@@ -95,20 +96,27 @@ def _is_file(path: Path) -> bool:
     return path.is_file() and path.suffix in SUFFIXES and not path.name.startswith(".")
 
 
-def read_stamped(path: Path) -> Poses:
-    """Read a trajectory file with stamps; raises DataError, in one line with the remedy, where it is none."""
+def read_stamped(path: Path, truth: Poses | None = None) -> Poses:
+    """Read a trajectory file with stamps; raises DataError, in one line with the remedy, where it is none.
+
+    Beside the truth one that is mirrored is named as that, and not for what this does to its quaternions.
+    """
     file = read_poses(path)
     if file.t_ns is None:
         raise DataError(f"{path}: a {file.format} file has no stamps, and its poses meet no truth; write TUM")
+    poses = Poses(path, file.t_ns, file.T_world_imu)
+    if truth is not None and len(file):
+        matched = matched_poses(poses, truth)
+        check_mirrored(str(path), matched.truth, matched.estimate)
     if file.other_order is not None:
         check_order(path, file.T_world_imu, file.other_order)
-    return Poses(path, file.t_ns, file.T_world_imu)
+    return poses
 
 
 def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float | None]:
     """Return the metrics of a trajectory, None where one cannot be computed.
 
-    Raises DataError where no two of its poses meet the truth in time.
+    Raises DataError where no two of its poses meet the truth in time, or they do in exchanged axes alone.
     """
     matched = matched_poses(estimate, truth)
     if len(matched) < 2:
@@ -116,6 +124,7 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
             f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "
             f"the truth {range_s(truth.t_ns)}: write the stamps of the truth's clock, in seconds"
         )
+    check_axes(str(estimate.path), matched.truth, matched.estimate)
     fit = _FITS[scoring.align]
     computed: dict[str, Callable[[], float]] = {
         f"ate_{scoring.align}_m": lambda: position_rmse(matched, fit(*matched.positions)),

@@ -65,7 +65,7 @@ _UNMEASURED = (
     "without a measured vertical the tilt of an estimator's world, its first frame, in the truth's depends on where it "
     "begins, and is most of this error; compare ate_se3_m"
 )
-_ON_A_LINE = "the positions lie on a line, so the rotation about it is not determined"
+_ON_A_LINE = "the positions lie on a line or in a point, so the rotation about it is not determined"
 
 
 def score(evaluation: AgainstTruth) -> Scores:

@@ -125,7 +125,7 @@ def _meanings(comparison: Comparison) -> str:
 
 
 def audit_text(audited: Audit, width: Width = WIDTH) -> str:
-    """Return what the audit found as plain text: fault, count, outcome, and the details below each."""
+    """Return what the audit found as plain text: fault, count, outcome, the details below each, and the facts."""
     findings = audited.findings
     lines = [printable(sequence_line(audited.sequence)), ""]
     if findings:
@@ -136,6 +136,7 @@ def audit_text(audited: Audit, width: Width = WIDTH) -> str:
     else:
         lines += ["no fault found"]
     lines += [filled(line, width) for line in undecided_lines(audited.undecided)]
+    lines += section("facts", audited.sequence.provenance.facts, width)
     if any(f.blocking for f in findings):
         lines += ["", *_spoiling(findings)]
     elif any(f.warning for f in findings):

@@ -165,7 +165,7 @@ def _from_truth(comparison: Comparison) -> _Reference | None:
         return None
     caption = (
         f"Position and heading error over time. {alignment_words(sequence)} "
-        "Dashed: causal, what was known at the time. Solid: final, or both where they agree (as a filter's do)."
+        "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
     )
     return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)
 

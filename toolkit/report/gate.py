@@ -6,7 +6,7 @@ And the files it leaves behind, each only where it is asked for: JUnit XML, Mark
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -28,6 +28,8 @@ _FAILED: Mapping[Finding, str] = {
 }
 _STATES: tuple[Finding, ...] = ("changed metric", "missing")
 _LABELS = (("sequence", "", ""), ("estimator", "", ""), ("output", "", ""), ("metric", "", ""), ("finding", "", ""))
+# Labels give way to the numbers down to so many characters.
+_NARROWEST = 10
 _NUMBERS = (
     ("before", "", ""),
     ("now", "", ""),
@@ -48,6 +50,32 @@ def failures_table(check: Check) -> Table:
     rows = tuple((*_row(verdict), _escaped(verdict.words)) for verdict in check.failures)
     headings = (*_LABELS, *_NUMBERS, ("why", "", ""))
     return Table(headings, rows, labels=len(_LABELS))
+
+
+def _folded(table: Table, width: int) -> Table:
+    """Return a table no wider than ``width``, as far as its labels give way: the widest go on in rows below."""
+    heads = zip(*table.headings, strict=True)
+    columns = list(zip(*heads, *table.rows, strict=True))
+    widest = [max(map(len, map(printable, column))) for column in columns]
+    room = width - 2 * (len(widest) - 1) - sum(widest[table.labels :])
+    while sum(widest[: table.labels]) > room and max(widest[: table.labels]) > _NARROWEST:
+        widest[widest.index(max(widest[: table.labels]))] -= 1
+    rows: list[tuple[str, ...]] = []
+    for row in table.rows:
+        parts = [_broken(text, widest[i]) if i < table.labels else [text] for i, text in enumerate(row)]
+        rows += zip_longest(*parts, fillvalue="")
+    return table._replace(rows=tuple(rows))
+
+
+def _broken(text: str, width: int) -> list[str]:
+    """Return a name in lines no wider than ``width``, broken behind a separator where there is one."""
+    lines, rest = [], printable(text)
+    while len(rest) > width:
+        behind = max((rest.rfind(mark, 0, width) for mark in "_-/. "), default=-1) + 1
+        end = behind or width
+        lines.append(rest[:end])
+        rest = rest[end:]
+    return [*lines, rest]
 
 
 def _row(verdict: Verdict) -> tuple[str, ...]:
@@ -131,7 +159,7 @@ def note_lines(check: Check) -> Iterator[str]:
 
 def gate_text(check: Check, width: Width = WIDTH) -> str:
     """Return a check as plain text: the table of everything, the notes, and last what it comes to."""
-    lines = [as_text(gate_table(check)), ""]
+    lines = [as_text(_folded(gate_table(check), WIDTH)), ""]
     lines += section("notes", note_lines(check), width)
     lines += section("fails", failure_lines(check), width)
     return "\n".join([*lines, "", headline(check)])

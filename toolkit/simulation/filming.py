@@ -10,6 +10,7 @@ What flies about counts as wrong, as it does to an estimator.
 
 import json
 import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import count
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.arrays import rows_of
+from toolkit.errors import OutputError
 from toolkit.files import check_replaceable, replaced_directory
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples
@@ -35,6 +37,7 @@ from toolkit.simulation.trajectory import SmoothTrajectory
 # The file that marks a folder in the layout of real recordings as simulated, and says what was simulated.
 ABOUT, SCHEMA = "simulation.json", "vislam.simulation/1"
 _CAMERAS = ("cam0", "cam1")
+_PAIR_GB = 4e-4
 _TRUTH = "state_groundtruth_estimate0"
 _IMAGES_STREAM = 5  # of the seed; simulate() has the first five
 # The exposure follows the light: the gain of both images swings by a share over some seconds; the right is brighter.
@@ -69,12 +72,31 @@ class Filming:
 
 
 def check_filmable(scenario: Scenario, directory: Path) -> None:
-    """Raise SettingsError where a scenario has no surfaces, OutputError where the directory holds anything else."""
+    """Raise SettingsError where a scenario has no surfaces, OutputError where the directory holds anything else,
+    or has no room for the images.
+    """
     if not (scenario.has_surfaces and isinstance(scenario.motion, Imu)):
         raise SettingsError(f"{scenario.name} has landmarks and no surfaces to take images of; flight has")
     if scenario.varied:
         raise SettingsError(f"{scenario.name}: a world that the seed draws cannot be filmed; leave it as it is")
     check_replaceable(directory, _written_by_us)
+    there = next(path for path in (directory.absolute(), *directory.absolute().parents) if path.is_dir())
+    needed_gb, free_gb = size_gb(scenario), shutil.disk_usage(there).free / 1e9
+    if needed_gb > free_gb:
+        raise OutputError(
+            f"{directory}: {pair_count(scenario)} stereo pairs take about {needed_gb:.3g} GB, and {free_gb:.3g} GB are "
+            "free there; film less, or elsewhere"
+        )
+
+
+def pair_count(scenario: Scenario) -> int:
+    """Return how many pairs the images of a scenario are."""
+    return int(scenario.duration_s * scenario.camera.rate_hz) + 1
+
+
+def size_gb(scenario: Scenario) -> float:
+    """Return about how much room the images of a scenario take."""
+    return _PAIR_GB * pair_count(scenario)
 
 
 def film(
@@ -87,6 +109,7 @@ def film(
     """
     filming = filming or Filming()
     check_filmable(scenario, directory)
+    progress.advance(0, pair_count(scenario), "simulating")
     sequence = simulate(scenario, seed)
     pair = _Pair.of(scenario, filming.lens)
     with replaced_directory(directory, _written_by_us) as partial:

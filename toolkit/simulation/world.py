@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
 from toolkit.models.stereo import project
@@ -68,9 +69,14 @@ def roadside(path: Array, per_pose: int, rng: np.random.Generator) -> Array:
 
 
 def _near_path(points: Array, path: Array, radius_m: float) -> BoolArray:
+    """Say of points (M, 3) whether they are that near to the path (N, 4, 4), seen from above.
+
+    An hour's path with its points would be 25 GB of distances, so that the nearest pose is looked for first.
+    """
     along = path[:, :2, 3]
-    squared = ((points[:, None, :2] - along[None]) ** 2).sum(axis=-1)
-    return np.asarray(squared.min(axis=1) < radius_m**2)
+    _, nearest = cKDTree(along).query(points[:, :2])
+    squared = ((points[:, :2] - along[nearest]) ** 2).sum(axis=-1)
+    return np.asarray(squared < radius_m**2)
 
 
 def visibility(points: Array, T_world_imu: Array, rig: StereoRig, camera: CameraLimits) -> BoolArray:

@@ -16,7 +16,7 @@ from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
 from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood, linearised
 from toolkit.track_errors.tracklets import Tracklets, tracklets
-from toolkit.track_noise import TrackNoise
+from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Fewer tracks of three sightings cannot tell a noise of seven parameters, or which kind it is.
 FEWEST_TRACKS = 100
@@ -191,8 +191,8 @@ def _without_traces(noise: TrackNoise) -> TrackNoise:
     return TrackNoise(noise.white_px, walk_px, offset_px)
 
 
-def in_words(fit: Fit) -> str:
-    """Return the fitted noise in a line."""
+def in_words(fit: Fit, stated_px2: Array) -> str:
+    """Return the fitted noise in a line; where it is white, beside the covariance (3, 3) of (uL, uR, v) that stands."""
     noise = fit.noise
     parts = [f"white {_of_channels(noise.white_px)}"]
     if noise.walk_px.any():
@@ -200,7 +200,12 @@ def in_words(fit: Fit) -> str:
     if noise.offset_px.any():
         parts.append(f"an offset of {noise.offset_px[1]:.2f} px in d")
     if not fit.correlated:
-        return f"{parts[0]}, each sighting by itself; the recording's own noise stands"
+        stated_px = np.sqrt(np.diag(CHANNELS @ stated_px2 @ CHANNELS.T))
+        times = float(np.exp(np.mean(np.log(stated_px / noise.white_px))))
+        return (
+            f"{parts[0]}, each sighting by itself; what estimators are told is left at the recording's own "
+            f"{_of_channels(stated_px)}, {times:.2f} times that"
+        )
     return (
         f"{', '.join(parts)}; {fit.gain:.1f} +- {fit.gain_error:.1f} in log-likelihood a track better than white noise"
     )

@@ -187,6 +187,16 @@ class _KeptFor(FunctionCache):
             cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=sources
         )
 
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what was kept for some types, None where there is nothing; what is damaged is thrown away."""
+        try:
+            return super().load_overload(sig, target_context)
+        except (OSError, RuntimeError):
+            raise
+        except Exception:  # what unpickling makes of a file that was cut off or overwritten is of any kind
+            self.flush()
+            return None
+
 
 def kept(signature: tuple[Any, ...], folder: Path = Path(__file__).parent) -> Callable[[Callable[..., Any]], Any]:
     """Return what compiles a function and keeps what comes out for every process that finds the folder's files so.

@@ -141,6 +141,11 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
     bad = np.flatnonzero(np.abs(stamps_s) > _LATEST_NS_S)
     if 0 < bad.size < 0.5 * stamps_s.size:
         raise DataError(f"{path}: {key}[{bad[0]}] is {stamps_s[bad[0]]:g} s ({bad.size} such stamps); mend them")
+    beyond = np.flatnonzero(np.abs(stamps_s) > NS_PER_S * _LATEST_NS_S)
+    if beyond.size:
+        raise DataError(
+            f"{path}: {key}[{beyond[0]}] is {stamps_s[beyond[0]]:g}, which no unit makes a time of; mend it"
+        )
     coarse_s = float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
     if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s, coarse_s):
         raise DataError(

@@ -4,6 +4,7 @@ Tables of one's own may be written in several ways, and are read value by value.
 whole nanoseconds and are read at once: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016), section 3.
 """
 
+import codecs
 import csv
 import gzip
 import io
@@ -69,7 +70,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> Array:
 
 def _read_whole(path: Path) -> bytes:
     """Return the content of a table, plain or gzipped; raises DataError where it cannot be read or is damaged."""
-    content = read_input(path)
+    content = read_input(path).removeprefix(codecs.BOM_UTF8)
     try:
         return gzip.decompress(content) if content.startswith(_GZIP_MAGIC) else content
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:

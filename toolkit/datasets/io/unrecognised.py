@@ -17,6 +17,8 @@ _ARCHIVES = {
     b"PK\x03\x04": "zip",
     b"7z\xbc\xaf": "7-zip",
 }
+# Arrays of NumPy are packed so, and nobody need unpack them.
+_ARRAYS = ".npz"
 _TAR, _TAR_AT = b"ustar", 257
 # So many entries of a folder are looked at, and so many recordings among them named.
 _LOOKED_AT, _NAMED = 50, 3
@@ -50,7 +52,7 @@ def _of_file(path: Path) -> str:
     """Return what a file is, nothing where it cannot be told."""
     if path.stat().st_size == 0:
         return "the file is empty and so of no known format"
-    archive = _archive(path)
+    archive = None if path.suffix == _ARRAYS else _archive(path)
     if archive is not None:
         return f"is packed ({archive}), unpack it and name what was in it: as it stands it is of no known format"
     if _is_trajectory(path):

@@ -18,6 +18,8 @@ from toolkit.inputs import read_text_input
 _DIALECT = "%YAML:"
 # A calibration of a rig of many cameras takes some thousand characters.
 _MOST_CHARACTERS = 1_000_000
+# An alias may repeat all that stands before it: nine lists of ten, each of the one before, are a billion values.
+_MOST_VALUES = 200_000
 
 
 def read_fields(path: Path) -> Fields:
@@ -37,8 +39,11 @@ def read_fields(path: Path) -> Fields:
     except yaml.MarkedYAMLError as error:
         line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
         raise DataError(f"{path}: {line}{error.problem or error}; it is no YAML, or truncated") from error
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise DataError(f"{path}: is no YAML ({str(error).partition(chr(10))[0]}); copy it again") from error
+    except RecursionError as error:
+        raise DataError(f"{path}: is nested too deeply for a calibration; name another file") from error
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        why = str(error).partition("\n")[0].partition(";")[0]
+        raise DataError(f"{path}: is no YAML of a calibration ({why}); copy it again, or name another file") from error
     if not isinstance(document, dict):
         raise DataError(f"{path}: holds no 'key: value'; a calibration is made of them")
     return Fields(path, dict(_flattened(document, "")))
@@ -47,12 +52,34 @@ def read_fields(path: Path) -> Fields:
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """PyYAML's safe loader, which takes OpenCV's matrices as the mappings they are, and a key only once."""
 
+    def get_single_node(self) -> Any:
+        """Return the document's node; raises YAMLError where aliases make a small file into a huge document."""
+        node = super().get_single_node()
+        if node is not None and _values_in(node, {}) > _MOST_VALUES:
+            raise yaml.YAMLError(f"its aliases (*name) repeat it to more than {_MOST_VALUES} values")
+        return node
+
+
+def _values_in(node: Any, known: dict[int, int]) -> int:
+    """Return how many values a node stands for, each alias counted with all that it repeats.
+
+    ``known`` has those of nodes by their ids; a node inside itself counts as none, and is refused elsewhere.
+    """
+    if id(node) not in known:
+        known[id(node)] = 0
+        inner = [] if isinstance(node, yaml.ScalarNode) else node.value
+        parts = (part for one in inner for part in (one if isinstance(one, tuple) else (one,)))
+        known[id(node)] = 1 + sum(_values_in(part, known) for part in parts)
+    return known[id(node)]
+
 
 def _mapping(loader: _Loader, node: Any) -> dict[Any, Any]:
-    keys = [key.value for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
-    twice = next((key for i, (key, _) in enumerate(getattr(node, "value", ())) if keys and key.value in keys[:i]), None)
-    if twice is not None:
-        raise yaml.MarkedYAMLError(problem=f"gives {twice.value} a second time", problem_mark=twice.start_mark)
+    before: set[str] = set()
+    for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+        if isinstance(key, yaml.ScalarNode):
+            if key.value in before:
+                raise yaml.MarkedYAMLError(problem=f"gives {key.value} a second time", problem_mark=key.start_mark)
+            before.add(key.value)
     mapping: dict[Any, Any] = loader.construct_mapping(node, deep=True)
     return mapping
 

@@ -141,8 +141,8 @@ def annotate(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
 
 
 def output_entries(outputs: Collection[Output]) -> list[Entry]:
-    """Return the legend's entries for the outputs that are drawn; where both agree, one line stands for them."""
-    words: dict[Output, str] = {"causal": "causal", "final": "final, or both"}
+    """Return the legend's entries for the outputs that are drawn; a filter's final output repeats its causal one."""
+    words: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
     return [Entry.of_line(words[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
 
 
