@@ -112,11 +112,13 @@ class DiscountedTracks:
         if not self._correlation.matches:
             return
         left = residuals_of(frames, T_world_imu, points, self._rig)
+        if not self._beside_imu:
+            self._correlation.add(*left.successive())
+            return
         self._learn(left, left)
-        if self._beside_imu:
-            for frame, pose in zip(frames, T_world_imu, strict=True):
-                self.settle(frame, pose)
-            self._correlation.settle_last()
+        for frame, pose in zip(frames, T_world_imu, strict=True):
+            self.settle(frame, pose)
+        self._correlation.settle_last()
 
     def settle(self, frame: StereoFrame, T_world_imu: Array) -> None:
         """Take in the next frame whose pose (4, 4) will hardly change any more."""
