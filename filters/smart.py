@@ -93,9 +93,9 @@ class Smart:
         increment = self._motion.integrate(packet.motion, self._belief.bias)
         prediction, points = increment.predict(self._belief), self._tracked.points_by_id()
         expected = relative_to_its_map(self._belief).predicted(prediction)
-        there, sound = self._outlier_check.placed(expected, packet.frame, points, self._tracks.share)
-        self._predicted = self._belief.predicted(prediction)
-        self._belief = replace(self._predicted, T_world_imu=there.T_world_imu)
+        # The state begins as predicted: the solver iterates.
+        _, sound = self._outlier_check.placed(expected, packet.frame, points, self._tracks.share)
+        self._belief = self._predicted = self._belief.predicted(prediction)
         return self._with_state(self._tracked, packet.index, sound, increment.factors(packet.index))
 
     def _started(self, packet: Packet) -> TrackedWindow:

@@ -1,8 +1,9 @@
 """What one packet adds to an incremental smoother's graph: new factors, first values, and the variables they are on.
 
-Sightings of tracks that have gone over to another point are left out. A new state begins where its sightings of known
-landmarks put it, not where the measured motion alone does: the motion may be off by many times what is new in a
-sighting of a track, and linearised there a loss would weigh every sighting down as an outlier.
+Sightings of tracks that have gone over to another point are left out. Beside odometry, and where errors along tracks
+are correlated, a new state begins where its sightings of known landmarks put it, not where the measured motion alone
+does: the motion may be off by many times what is new in a sighting of a track, and linearised there a loss would weigh
+every sighting down as an outlier.
 """
 
 from collections.abc import Mapping
@@ -60,6 +61,8 @@ class GraphBuilder:
         if setup.rig.track_noise is not None:
             outliers = msgspec.structs.replace(outliers, smoother_gate_factor=1.0)
         self._outlier_check = OutlierCheck(setup.rig, outliers)
+        # What an IMU predicts of pose and velocity goes together, and is near enough for white noise of tracks.
+        self._begins_there = setup.motion_kind != "imu" or setup.rig.track_noise is not None
         self._bridge = None
         if setup.settings.noise.bridge_gaps:
             self._bridge = gap_bridge_for(setup.noise, setup.settings.window.seconds(setup.motion_kind))
@@ -75,7 +78,8 @@ class GraphBuilder:
         extension = GraphExtension()
         expected = self._add_state(self._noise.applied(packet), extension)
         there, sound = self._outlier_check.placed(expected, packet.frame, self._points, self._tracks.share)
-        self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
+        if self._begins_there:
+            self.belief = replace(self.belief, T_world_imu=there.T_world_imu)
         self._refused = packet.frame, ~np.isin(packet.frame.track_ids, sound.track_ids)
         self._add_values(packet, extension)
         self._add_sightings(sound, packet.index, extension)
