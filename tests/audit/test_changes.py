@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from toolkit.audit import Audit, audit
-from toolkit.audit.clock_change import _of_rotations, check
+from toolkit.audit.clock_change import check
 from toolkit.audit.fault import Evidence, Symptom
-from toolkit.audit.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s, camera_offset
+from toolkit.audit.time_offset import LARGEST_ERROR_S, SIGMAS, _constant_phase_s, camera_offset, change_of_offset
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 
@@ -86,7 +86,7 @@ def test_clocks_that_keep_pace_do_not_part_by_what_rotations_of_half_a_recording
 ) -> None:
     evidence = Evidence(simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=True), seed))
     assert evidence.intervals is not None
-    by_rotations = _of_rotations(evidence, evidence.intervals)
+    by_rotations = change_of_offset(evidence.sequence, evidence.intervals)
     assert by_rotations is not None
     assert abs(by_rotations.value) > 5.0 * by_rotations.error + 0.005
     assert check(evidence) is None
@@ -101,6 +101,18 @@ def test_a_camera_clock_that_is_set_by_little_is_told_within_its_error(duration_
     assert found is not None
     # Printed to a millisecond.
     assert float(found[1]) == pytest.approx(-25.0, abs=3.0 * float(found[2]) + 0.5)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_step_of_the_camera_clock_is_no_offset_to_shift_all_frames_by(seed: int) -> None:
+    """A shift by 0.26 s mended the half that had it, spoilt the other, and left no change to be seen."""
+    found = audit(faults.camera_clock_step(simulate(replace(SCENARIOS["drive"], duration_s=12.0), seed), 0.3))
+    offset = next(finding for finding in found.findings if finding.fault == "time-offset")
+    assert not offset.repaired
+    assert offset.warning
+    parted = re.search(r"by (-?\d+) \+- (\d+) ms more in the second half", offset.detail)
+    assert parted is not None
+    assert abs(int(parted[1]) + 300) < 5 * int(parted[2])
 
 
 def test_a_camera_clock_that_drifts_is_told() -> None:

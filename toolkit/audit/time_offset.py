@@ -7,7 +7,8 @@ rotation, the change that the camera sees is the instrument. Source: Furgale, Re
 spatial calibration for multi-sensor systems" (2013), section III, reduced to rotation.
 
 A twist that is stamped at the frames is judged by its lag; here only an offset that no pairing of it explains. Where it
-is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit.
+is stamped elsewhere no pairing mends it, and the frames are shifted to where the samples, as they are paired, fit. An
+offset that half of the recording has, or that grows, is none to be shifted by: that is a change of the clock.
 """
 
 from dataclasses import replace
@@ -42,6 +43,10 @@ LEAST_OFF_FRAMES = 0.25
 # The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
 # intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
+# The offset changes between the halves beyond so many standard errors of the difference, and what sound recordings at
+# hand have beyond them (s): the halves of drives 14 ms at most, those of recordings beside an IMU 3 ms. Chosen with
+# them in view.
+CHANGE_SIGMAS, CHANGE_SYSTEMATIC_S = 5.0, {"twist": 0.015, "imu": 0.005}
 # A self-calibration finds offsets (s) no larger than this.
 NEAR_S = 0.025
 # With a larger standard error (s) than these no offset is ruled out; one that is beyond chance is believed up to twice
@@ -73,14 +78,27 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if abs(beyond_s) < max(least_s, SIGMAS * found.error) or found.error > surely_s:
         return _as_often(sequence, Scalar(offset_s, found.error)) or _unknown(sequence, found)
     late = "late" if offset_s < 0.0 else "early"
+    detail = (
+        f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
+        f"{1e3 * found.error:.1f} ms: frames are stamped {late}"
+    )
+    change = change_of_offset(sequence, intervals)
+    if change is not None and abs(change.value) > max(least_change_s(sequence, change.error), 0.5 * abs(offset_s)):
+        return _changing(detail, change)
+    remedy = _shifted(sequence, offset_s)
+    return Symptom(count=1, detail=detail, treatment="the frames are shifted by it", remedy=remedy)
+
+
+def _changing(detail: str, change: Scalar) -> Symptom:
+    """Tell of an offset that no constant shift mends, for half of the recording has another one."""
+    parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms"
     return Symptom(
         count=1,
-        detail=(
-            f"the camera turns as the gyro does when its stamps are shifted by {1e3 * offset_s:.1f} +- "
-            f"{1e3 * found.error:.1f} ms: frames are stamped {late}"
-        ),
-        treatment="the frames are shifted by it",
-        remedy=_shifted(sequence, offset_s),
+        detail=f"{detail}, but by {parted} more in the second half than in the first",
+        treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
+        remedy=None,
+        harmful=False,
+        warns=True,
     )
 
 
@@ -171,6 +189,21 @@ def _expected(sequence: Sequence) -> tuple[float, float]:
 def _stamped_at_frames(sequence: Sequence) -> bool:
     """Say whether most frames have a motion sample of the same stamp."""
     return bool(np.isin(sequence.frames_t_ns, sequence.motion.t_ns).mean() > 0.5)
+
+
+def change_of_offset(sequence: Sequence, intervals: Intervals) -> Scalar | None:
+    """Return by how much (s) the camera's offset changes between the halves; None where a half shows none."""
+    w_imu = intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T
+    early = np.arange(len(w_imu)) < len(w_imu) // 2
+    first, second = (camera_offset(sequence, intervals.select(rows), w_imu[rows]) for rows in (early, ~early))
+    if first is None or second is None:
+        return None
+    return Scalar(second.value - first.value, float(np.hypot(first.error, second.error)))
+
+
+def least_change_s(sequence: Sequence, error_s: float) -> float:
+    """Return the least difference (s) of the halves' offsets, known to a standard error, that is none of chance."""
+    return CHANGE_SIGMAS * error_s + CHANGE_SYSTEMATIC_S[sequence.motion_kind]
 
 
 def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
