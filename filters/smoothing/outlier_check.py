@@ -60,11 +60,7 @@ class OutlierCheck:
         sightings count for. What the motion is off by is none of the check's business any more.
         """
         there = aligned(expected, frame, points, self.rig, share)
-        return there, self.without_outliers(frame, points, relative_to_its_map(there))
-
-    def without_outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> StereoFrame:
-        """Return the frame without its outliers; see :meth:`outliers`."""
-        return frame.select(~self.outliers(frame, points, expected))
+        return there, frame.select(~self.outliers(frame, points, relative_to_its_map(there)))
 
     def outliers(self, frame: StereoFrame, points: Mapping[int, Array], expected: Belief) -> BoolArray:
         """Say which sightings (N,) of a frame are not of the landmarks (3,) m that their tracks have.
