@@ -6,6 +6,7 @@ import pytest
 
 from filters.kalman.residual_correlation import ResidualCorrelation
 from filters.smoothing.discounted_tracks import (
+    DiscountedTracks,
     Residuals,
     discounted,
     discounted_past,
@@ -158,3 +159,32 @@ def test_residuals_are_those_of_the_points_that_are_known(rig):
 def test_tracks_seen_often_have_four_sightings():
     frames = [frame([1, 2], np.zeros((2, 3)))] * 3 + [frame([2], np.zeros((1, 3)))]
     assert seen_often(frames) == {2}
+
+
+@pytest.fixture(scope="module")
+def clusters_err_as_one(rig):
+    """Return 60 frames from one place, their poses, and points in clusters whose tracks err alike and as before."""
+    rng = np.random.default_rng(0)
+    corners = np.stack(np.meshgrid([10.0, 14.0, 18.0], np.linspace(-4.0, 4.0, 6), [-1.0, 1.0]), axis=-1).reshape(
+        -1, 1, 3
+    )
+    points = (corners + rng.uniform(-0.05, 0.05, (36, 4, 3))).reshape(-1, 3)
+    exact_px, frames = stereo.predict(points, np.eye(4), rig).uv_px, []
+    errors = np.zeros((36, 4, 3))
+    for _ in range(60):
+        new = np.sqrt(0.5) * (rng.normal(size=(36, 1, 3)) + rng.normal(size=(36, 4, 3)))
+        errors = 0.8 * errors + 0.6 * new
+        frames.append(frame(range(len(points)), exact_px + errors.reshape(-1, 3) @ np.linalg.inv(rig.whitener).T))
+    return frames, np.tile(np.eye(4), (60, 1, 1)), dict(enumerate(points))
+
+
+@pytest.mark.parametrize(("noise_factor", "counts"), [(1.0, False), (10.0, True)])
+def test_neighbours_count_beside_odometry_whose_white_noise_is_larger_than_what_lasts_of_its_errors(
+    noise_factor, counts, clusters_err_as_one
+):
+    sequence = simulate(DRIVE, 0)
+    noise = sequence.noise.scaled(noise_factor)
+    tracks = DiscountedTracks(Setup(sequence.rig, noise, sequence.prior, sequence.gravity_world, sequence.motion_kind))
+    tracks.learn_from_all(*clusters_err_as_one)
+    assert tracks.share < 0.3
+    assert ("neighbours as one" in tracks.told[0]) == counts
