@@ -25,5 +25,5 @@ RULES = {"tracks": "a landmark in its state has no state for the error of its tr
 def build(setup: Setup) -> Estimator:
     """Return the estimator for one sequence."""
     belief = partial(InverseDepthBelief, T_imu_cam=setup.rig.T_imu_cam)
-    correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
+    correlation = LandmarkCorrelation.of(setup)
     return OnlineOutput(JointEkf(setup, AtFirstEstimates(), belief, correlation=correlation))

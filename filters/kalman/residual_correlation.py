@@ -16,10 +16,13 @@ Where the first is not beyond 1, noise was stated large enough for such tracks, 
 a drift all the same is the motion's error, not theirs (kitti00, dataset3).
 
 Where residuals of neighbours in an image are known as well, and alike beyond chance, the share is smaller by as many as
-err as one (:mod:`filters.kalman.neighbour_correlation`). White errors have residuals that are correlated negatively, by
-the landmark that was fitted to them, and count in full: a filter whose noise is as stated stays, to the bit, what it is
-without.
+err as one (:mod:`filters.kalman.neighbour_correlation`). Not so beside odometry whose white noise is smaller than what
+lasts of any odometry's errors: the less tracks count for, the more the way is left to it. White errors have residuals
+that are correlated negatively, by the landmark that was fitted to them, and count in full: a filter whose noise is as
+stated stays, to the bit, what it is without.
 """
+
+from typing import Self
 
 import numpy as np
 
@@ -28,7 +31,9 @@ from filters.kalman.multiview import TrackSightings
 from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from filters.kalman.track_scores import FEWEST_SIGHTINGS, SOUND, TrackScores
 from toolkit.arrays import rows_of
+from toolkit.estimator import Setup
 from toolkit.geometry import Array, IntArray
+from toolkit.measured_motion import MotionNoise, TwistNoise
 from toolkit.models import left_only
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
@@ -37,6 +42,10 @@ from toolkit.sequence import StereoFrame, StereoRig
 _STANDARD_ERRORS = 3.0
 # What counts for less than a hundredth would be no measurement; beyond that another cause is likelier.
 _MOST_CORRELATED = 0.98
+# Odometry with less white noise (m/s/sqrt(Hz)) is stated to be off after a second by less than wheels and cameras are
+# calibrated to, 1 % of 5 m/s. Chosen between what is assumed of odometry that looks free of noise (0.016 at 10 Hz) and
+# the noise of the course's (0.17).
+_LEAST_WHITE_NOISE = 0.05
 # What rounds to the full information is none to speak of.
 _MOST_TOLD = 0.95
 # Gates, robust weights and linearisation leave residuals of white landmarks correlated, however many there are: by up
@@ -49,11 +58,17 @@ class ResidualCorrelation:
 
     _of, _least = "tracks", 0.0
 
-    def __init__(self, rig: StereoRig, matches: bool = True) -> None:
+    def __init__(self, rig: StereoRig, matches: bool = True, counts_neighbours: bool = True) -> None:
         # Where noise of tracks is stated, their sightings correct with its covariance, which is whole.
         self._rig, self.matches = rig, matches and rig.track_noise is None
+        self._counts_neighbours = counts_neighbours
         self._products, self._squares, self._pairs = 0.0, 0.0, 0
         self._neighbours, self._scores = NeighbourCorrelation(), TrackScores(rig)
+
+    @classmethod
+    def of(cls, setup: Setup) -> Self:
+        """Return what the settings and the motion of a run ask for."""
+        return cls(setup.rig, setup.settings.noise.match_tracks, not _is_calibration_larger(setup.noise))
 
     @property
     def correlation(self) -> float:
@@ -123,7 +138,7 @@ class ResidualCorrelation:
 
         ``H_pose`` (N, 3, 6) are their whitened Jacobians to the poses of the frames.
         """
-        if self.matches:
+        if self.matches and self._counts_neighbours:
             self._neighbours.add(frames, uvs_px, freed_of_poses(frames, whitened, H_pose))
 
 
@@ -138,8 +153,8 @@ class LandmarkCorrelation(ResidualCorrelation):
 
     _of, _least = "tracks of landmarks in the state", _LEAST_OF_LANDMARKS
 
-    def __init__(self, rig: StereoRig, matches: bool = True) -> None:
-        super().__init__(rig, matches)
+    def __init__(self, rig: StereoRig, matches: bool = True, counts_neighbours: bool = True) -> None:
+        super().__init__(rig, matches, counts_neighbours)
         self._before_ids: IntArray = np.empty(0, dtype=np.int64)
         self._before = np.empty((0, 3))
 
@@ -163,12 +178,23 @@ class LandmarkCorrelation(ResidualCorrelation):
         predicted_px, _ = images.plain(points[seen], T_world_imu[None], self._rig)
         residuals = left_only.whitened_residuals(uvs_px, predicted_px[:, 0], self._rig)
         sound = np.square(residuals).sum(axis=1) < chi2_bound(3, SOUND)
+        self._add_image(uvs_px[sound], residuals[sound], points[seen][sound], T_world_imu, images)
         ids, residuals = ids[sound], residuals[sound]
         order = np.argsort(ids)
         ids, residuals = ids[order], residuals[order]
         before, known = rows_of(ids, self._before_ids)
         self.add(self._before[before[known]], residuals[known])
         self._before_ids, self._before = ids, residuals
+
+    def _add_image(
+        self, uvs_px: Array, whitened: Array, points: Array, T_world_imu: Array, images: multiview.Images
+    ) -> None:
+        """Take in what one image shows together, where sightings have come to count for less."""
+        if self.share == 1.0 or not len(points):
+            return
+        there = images.linearised(points, T_world_imu[None], self._rig)
+        H_pose = left_only.whitener(uvs_px, self._rig) @ left_only.seen_rows(uvs_px, there.d_uv_d_pose[:, 0])
+        self.add_images(np.zeros(len(points), dtype=np.int64), uvs_px, whitened, H_pose)
 
 
 def residuals_left(sightings: TrackSightings, points: Array, poses: Array, rig: StereoRig) -> Array:
@@ -182,3 +208,8 @@ def residuals_left(sightings: TrackSightings, points: Array, poses: Array, rig: 
     H_transposed = np.swapaxes(H, 1, 2)
     step = np.linalg.solve(H_transposed @ H, H_transposed @ residuals)
     return np.asarray((residuals - H @ step).reshape(count, window, 3))
+
+
+def _is_calibration_larger(noise: MotionNoise) -> bool:
+    """Return whether odometry's white noise is smaller than what lasts of its errors."""
+    return isinstance(noise, TwistNoise) and float(noise.velocity_noise_density.max()) < _LEAST_WHITE_NOISE

@@ -74,12 +74,12 @@ class SlidingWindowFilter:
         )
         self._memory = LandmarkMemory()
         self._noise = MatchedNoise.of(setup, compiled.correction_test(setup.compilation))
-        self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._correlation = ResidualCorrelation.of(setup)
         # Beside odometry, tracks that count for less by their scores leave the pose to the landmarks in the state: with
         # scores msckf-slam gained on some of the UTIAS drives and lost a third on the longest.
         self._scores_tracks = scores_tracks and (setup.motion_kind == "imu" or not landmarks)
         self._learn = compiled.learning(setup.compilation)
-        self._landmark_correlation = LandmarkCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._landmark_correlation = LandmarkCorrelation.of(setup)
         self.bridge = gap_bridge_for(setup.noise, window_s) if setup.settings.noise.bridge_gaps else None
 
     def step(self, packet: Packet) -> Estimate:

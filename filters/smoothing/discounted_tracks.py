@@ -17,16 +17,10 @@ from filters.kalman.track_scores import FEWEST_SIGHTINGS, SOUND
 from filters.smoothing.smart_factors import Sightings
 from toolkit.estimator import Setup
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.measured_motion import MotionNoise, TwistNoise
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import kind_of, linear_factor
 from toolkit.models.gating import chi2_bound
 from toolkit.sequence import StereoFrame, StereoRig
-
-# Odometry with less white noise (m/s/sqrt(Hz)) is stated to be off after a second by less than wheels and cameras are
-# calibrated to, 1 % of 5 m/s. Chosen between what is assumed of odometry that looks free of noise (0.016 at 10 Hz) and
-# the noise of the course's (0.17).
-_LEAST_WHITE_NOISE = 0.05
 
 
 class Discounted(NamedTuple):
@@ -84,14 +78,13 @@ class DiscountedTracks:
     Beside odometry that is what the correlation along tracks and among neighbours leaves, beside an IMU also what they
     tell of a drift. Odometry's noise is stated, or found in its scatter, as white, which says nothing of errors that
     last, such as a wrong radius of the wheels: tracks that count for no more than they tell of a drift leave the drift
-    to it. So do, where its white noise is smaller than such errors, tracks that count for less by their neighbours.
+    to it.
     """
 
     def __init__(self, setup: Setup) -> None:
         self._rig, self._huber = setup.rig, setup.settings.outliers.smoother_huber
-        self._correlation = ResidualCorrelation(setup.rig, setup.settings.noise.match_tracks)
+        self._correlation = ResidualCorrelation.of(setup)
         self._beside_imu = setup.motion_kind == "imu"
-        self._counts_neighbours = not _is_calibration_larger(setup.noise)
 
     @property
     def share(self) -> float:
@@ -142,13 +135,7 @@ class DiscountedTracks:
 
     def _learn(self, along_tracks: "Residuals", in_images: "Residuals") -> None:
         self._correlation.add(*along_tracks.successive())
-        if self._counts_neighbours:
-            self._correlation.add_images(in_images.frames, in_images.uvs_px, in_images.whitened, in_images.H_pose)
-
-
-def _is_calibration_larger(noise: MotionNoise) -> bool:
-    """Return whether odometry's white noise is smaller than what lasts of its errors."""
-    return isinstance(noise, TwistNoise) and float(noise.velocity_noise_density.max()) < _LEAST_WHITE_NOISE
+        self._correlation.add_images(in_images.frames, in_images.uvs_px, in_images.whitened, in_images.H_pose)
 
 
 def seen_often(frames: Iterable[StereoFrame]) -> set[int]:

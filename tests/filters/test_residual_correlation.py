@@ -70,6 +70,29 @@ def learnt_by_frame(rig, correlation, seed=0, seen=ALWAYS, off_px=0.0):
     return found
 
 
+def learnt_of_pairs(rig, correlation, counts_neighbours):
+    """Return what landmarks tell each of which has another beside it, whose track is off by the same pixels."""
+    (track_ids, uvs_px, _, ages), points, poses = tracks_of(rig, correlation, 0)
+    found = LandmarkCorrelation(rig, counts_neighbours=counts_neighbours)
+    ids, points = np.concatenate([track_ids, TRACKS + track_ids]), np.tile(points, (2, 1))
+    for k in range(WINDOW):
+        found.learn_frame(
+            StereoFrame(k, ids, np.tile(uvs_px[:, k], (2, 1)), np.tile(ages[:, k], 2)), ids, points, poses[k]
+        )
+    return found
+
+
+def test_landmarks_count_for_less_by_the_neighbours_that_err_as_one(drive):
+    alone, beside = (learnt_of_pairs(drive.rig, 0.8, counts) for counts in (False, True))
+    assert "neighbours" not in alone.told[0]
+    assert "neighbours as one" in beside.told[0]
+    assert beside.share < 0.6 * alone.share
+
+
+def test_landmarks_whose_tracks_are_white_count_in_full_whatever_errs_as_one(drive):
+    assert learnt_of_pairs(drive.rig, 0.0, True).share == 1.0
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_white_errors_count_in_full(drive, seed):
     found = learnt(drive.rig, 0.0, seed)
