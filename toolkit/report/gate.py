@@ -183,17 +183,12 @@ def _sentence(text: str) -> str:
 
 def check_document(check: Check) -> CheckDocument:
     """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
-    return CheckDocument(
+    return of_attributes(
+        CheckDocument,
+        check,
         schema="vislam.check/2",
-        baseline=check.baseline,
-        passed=check.passed,
         failures=len(check.failures),
-        false_alarm_rate=check.false_alarm_rate,
-        tests=check.tests,
         releases=dict(check.releases),
-        seconds=check.seconds,
-        accept_better=check.accept_better,
-        notes=check.notes,
         verdicts=tuple(of_attributes(VerdictRecord, verdict, _finite) for verdict in check.verdicts),
     )
 
