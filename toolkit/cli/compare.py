@@ -14,6 +14,7 @@ from toolkit.cli.arguments import (
     Interrupted,
     UsageError,
     add_estimators_argument,
+    add_option,
     add_output_arguments,
     add_part_arguments,
     add_repair_arguments,
@@ -89,18 +90,10 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--figures",
-        choices=("few", "all", "none"),
-        default="few",
-        help="which to draw; docs/figures.md shows all there are (default: few)",
-    )
-    parser.add_argument(
-        "--figure-format",
-        choices=("png", "pdf", "svg"),
-        default="png",
-        help="of the figures; pdf and svg stay sharp in a paper (default: png)",
-    )
+    what = "which to draw; docs/figures.md shows all there are"
+    add_option(parser, "--figures", "few", what, choices=("few", "all", "none"))
+    what = "of the figures; pdf and svg stay sharp in a paper"
+    add_option(parser, "--figure-format", "png", what, choices=("png", "pdf", "svg"))
     add_output_arguments(
         parser, "what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import (
     UsageError,
     add_estimators_argument,
+    add_option,
     add_settings_arguments,
     add_workers_argument,
     at_least,
@@ -62,16 +63,9 @@ def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_estimators_argument(parser, "what to measure, see 'vislam list'")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
-    parser.add_argument(
-        "--seeds",
-        metavar="N",
-        type=at_least(FEWEST_SEEDS),
-        default=SEEDS,
-        help=f"seeds of each simulated sequence, from 0 (default: {SEEDS})",
-    )
-    parser.add_argument(
-        "--repeats", metavar="N", type=at_least(1), default=1, help="runs of each recorded sequence (default: 1)"
-    )
+    what = "seeds of each simulated sequence, from 0"
+    add_option(parser, "--seeds", SEEDS, what, metavar="N", type=at_least(FEWEST_SEEDS))
+    add_option(parser, "--repeats", 1, "runs of each recorded sequence", metavar="N", type=at_least(1))
     parser.add_argument(
         "--duration",
         metavar="S",
