@@ -228,9 +228,9 @@ class Sequence:
     observations: Observations
     motion: MotionSamples
     provenance: Provenance
+    gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
     prior: Prior | None = None
     truth: Truth | None = None
-    gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
     bridges: Bridges | None = None
     track_budget: int | None = None
 
