@@ -2,7 +2,8 @@
 
 ``toolkit.compare("drive", ["ekf", "batch"])`` is the whole of it; what the package offers is imported when first used.
 
-Reading order: sequence -> models -> filters/ekf -> filters/batch -> metrics -> experiment -> report.
+Reading order: sequence (what comes in) -> estimator, estimate (what comes out) -> models -> filters/ekf ->
+filters/batch -> runner (one over the other) -> metrics -> experiment -> report; docs/architecture.md has the picture.
 """
 
 from typing import TYPE_CHECKING, Any

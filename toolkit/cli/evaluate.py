@@ -114,8 +114,8 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def _print(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argparse.Namespace) -> None:
-    from toolkit.documents import to_text
     from toolkit.evaluation.document import evaluation_document
+    from toolkit.files.documents import to_text
     from toolkit.report import evaluation_text as texts
     from toolkit.report.prose import width_of_output
 

@@ -100,7 +100,7 @@ def baseline(options: argparse.Namespace) -> int:
     if options.align or options.gap:
         raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.gate.baseline import releases_in_a_name
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
@@ -120,7 +120,7 @@ def baseline(options: argparse.Namespace) -> int:
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.gate.trajectory_baseline import to_text
     from toolkit.gate.trajectory_check import new_trajectory_baseline
     from toolkit.gate.trajectory_files import Scoring
@@ -260,7 +260,7 @@ def check(options: argparse.Namespace) -> int:
     reprojection or speed got worse, an answer moved, or anything is missing. With --trajectories, judge files of
     another system in the same way. See docs/gate.md.
     """
-    from toolkit.files import check_writable
+    from toolkit.files.writing import check_writable
     from toolkit.report.gate import gate_text, write_check
     from toolkit.report.prose import width_of_output
 

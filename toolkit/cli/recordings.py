@@ -74,9 +74,9 @@ def card(options: argparse.Namespace) -> int:
     """Fit the noise of a recording's tracks and say what they are like: how errors along a track are correlated,
     how many are at odds with the motion, how vision's scale compares with the measured motion. No truth is used.
     """
-    from toolkit.documents import to_text
     from toolkit.experiment.recording import recording_card
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.documents import to_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.progress import of_this_process
     from toolkit.report.card import card_record, card_text
     from toolkit.report.prose import width_of_output
@@ -115,7 +115,7 @@ def tracks(options: argparse.Namespace) -> int:
     import msgspec
 
     from toolkit.datasets import load_images
-    from toolkit.files import check_parent
+    from toolkit.files.writing import check_parent
     from toolkit.frontend import track_images
     from toolkit.frontend.stills import write_stills, write_video
     from toolkit.progress import of_this_process

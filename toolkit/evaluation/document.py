@@ -12,13 +12,13 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit import documents
-from toolkit.documents import Count, Value, of_attributes
 from toolkit.errors import DataError
 from toolkit.estimate import Status
 from toolkit.evaluation.scoring import METRICS
 from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.files import documents
+from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import Values
 from toolkit.gate.trajectory_baseline import ScoredSequence
 from toolkit.gate.trajectory_files import Scoring

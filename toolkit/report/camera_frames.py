@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.datasets import tracked_images
-from toolkit.documents import numbers
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.files.documents import numbers
 from toolkit.frontend import ImageRecording
 from toolkit.frontend.cameras import Image
 from toolkit.frontend.images import Unusable

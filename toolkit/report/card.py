@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import UNSET
 
-from toolkit.documents import number, rounded
+from toolkit.files.documents import number, rounded
 from toolkit.geometry import Array
 from toolkit.report.header import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled

@@ -10,9 +10,9 @@ from itertools import groupby, zip_longest
 from pathlib import Path
 from xml.etree import ElementTree
 
-from toolkit.documents import of_attributes, to_text
 from toolkit.errors import printable
-from toolkit.files import write_text
+from toolkit.files.documents import of_attributes, to_text
+from toolkit.files.writing import write_text
 from toolkit.gate.judging import SHOWN
 from toolkit.gate.verdict import Check, Finding, Verdict
 from toolkit.metrics import known_metrics

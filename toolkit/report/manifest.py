@@ -19,9 +19,9 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
-from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
 from toolkit.sequence import Sequence
+from toolkit.threads import THREAD_VARIABLES
 
 _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
 _THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")

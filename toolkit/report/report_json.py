@@ -6,9 +6,9 @@ from typing import TypeVar
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from toolkit.documents import number, numbers, rounded
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.files.documents import number, numbers, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
 from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time

@@ -1,13 +1,13 @@
 """The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
 Reading order: scores (one run of each estimator, or many), report (what the figures draw), card (what the
-tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
+tracks are like), manifest, check. How they are read and written is :mod:`toolkit.files.documents`;
 :mod:`toolkit.report.schemas` writes docs/schemas.
 """
 
 from pathlib import Path
 
-from toolkit.documents import read
+from toolkit.files.documents import read
 from toolkit.report.records.check import OLDER, CheckDocument
 from toolkit.report.records.manifest import Manifest
 from toolkit.report.records.report import CardRecord, Report, SeedsReport

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit.documents import Json, Older
+from toolkit.files.documents import Json, Older
 from toolkit.gate.verdict import FAILURES, Finding
 
 

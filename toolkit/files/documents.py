@@ -16,8 +16,8 @@ import msgspec
 from msgspec import Meta, inspect
 
 from toolkit.errors import DataError, VislamError
+from toolkit.files.reading import read_input
 from toolkit.geometry import Array
-from toolkit.inputs import read_input
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
