@@ -76,13 +76,10 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     """
     unnamed = () if own else defaults()
     named = unnamed if estimators is None else _names("estimators", estimators)
-    both = sorted(set(named) & set(_by_name("own", own)))
-    if both:
-        raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
     plan = Plan(
         sources=(_source(source),),
         estimators=named,
-        own=_by_name("own", own),
+        own=_own_beside(named, own),
         settings=_with_seeds(settings, seed, seeds),
         truth=None if truth is None else Path(truth),
         trajectories={name: Path(file) for name, file in _by_name("trajectories", trajectories).items()},
@@ -95,6 +92,14 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     if resume is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if resume is None else (Path(resume),))[0])
+
+
+def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapping[str, Build]:
+    own = _by_name("own", given)
+    both = sorted(set(named) & set(own))
+    if both:
+        raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
+    return own
 
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
