@@ -16,18 +16,7 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import inverses, products, solved_3
-from filters.kalman.kernels.compiling import (
-    CAMERA,
-    COUNTS,
-    MASK,
-    MATRIX,
-    ROW,
-    STACK,
-    Arrays,
-    compiled,
-    kept,
-    what_was_compiled,
-)
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
@@ -38,6 +27,7 @@ from filters.kalman.kernels.sightings import (
     sighted,
     step,
 )
+from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, IntArray
 
 # Tracks: (uL, uR, v) (F, W, 3) px, which count (F, W), their ages (F, W), what for (F, W), points (F, 3). Then poses
