@@ -18,7 +18,7 @@ from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_o
 from toolkit.experiment.units import Outcome
 from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
-from toolkit.metrics._shared.consistency import nees_band
+from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.messages import note_lines, paired_lines

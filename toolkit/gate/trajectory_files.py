@@ -21,9 +21,9 @@ from toolkit.errors import DataError, printable
 from toolkit.files.reading import unreadable
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Unavailable
-from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_sim3, fit_yaw
-from toolkit.metrics._shared.association import Matched, distance_along, median_period_ns, poses_at
 from toolkit.metrics.ate import position_rmse, rotation_rmse_deg
+from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_sim3, fit_yaw
+from toolkit.metrics.parts.association import Matched, distance_along, median_period_ns, poses_at
 from toolkit.metrics.rpe import hundred_metres_percent
 from toolkit.resampling import NS_PER_S
 

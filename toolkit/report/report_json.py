@@ -11,8 +11,8 @@ from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.files.documents import number, numbers, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import card_record
 from toolkit.report.curves import (
     ErrorCurves,
