@@ -14,7 +14,7 @@ import numpy as np
 
 from filters.kalman import correction, landmark_map, multiview, track_gate, tracks_in_view, triangulation
 from filters.kalman.correction import FrameCorrection
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
 from filters.kalman.landmark_map import LandmarkMap
 from filters.kalman.linearisation import Integrator

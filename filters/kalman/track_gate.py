@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings

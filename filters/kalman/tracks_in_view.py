@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import (
     JointBelief,
     cholesky_root,

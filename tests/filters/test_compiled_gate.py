@@ -11,7 +11,7 @@ import pytest
 
 from filters.kalman import compiled as compiled_parts
 from filters.kalman import multiview, track_gate, tracks_in_view
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.residual_correlation import ResidualCorrelation
