@@ -74,8 +74,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
     used, OutputError where what is to be kept cannot be written.
     """
-    unnamed = () if own else defaults()
-    named = unnamed if estimators is None else _names("estimators", estimators)
+    named = (() if own else defaults()) if estimators is None else _names("estimators", estimators)
     plan = Plan(
         sources=(_source(source),),
         estimators=named,
