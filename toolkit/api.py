@@ -27,7 +27,8 @@ from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.recording import Part
 from toolkit.progress import silent
-from toolkit.report.table import Table, as_markdown, as_text, columns_asked, comparison_table
+from toolkit.report.comparison_table import columns_asked, comparison_table
+from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
 

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
+    from toolkit.report.comparison_table import Columns
     from toolkit.report.run_directory import MadeBy
-    from toolkit.report.table import Columns
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
@@ -209,7 +209,7 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.report.table import columns_asked
+    from toolkit.report.comparison_table import columns_asked
 
     try:
         return columns_asked(names)

@@ -14,6 +14,7 @@ from toolkit.metrics import Evaluation
 from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import card_record
+from toolkit.report.comparison_table import header_lines, sequence_line
 from toolkit.report.curves import (
     ErrorCurves,
     Errors,
@@ -25,7 +26,6 @@ from toolkit.report.curves import (
     shown_output,
     truth_during,
 )
-from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
     note_lines,
