@@ -5,7 +5,7 @@ landmark, and the filter is too sure of itself: its covariance does not grow wit
 """
 
 from filters.kalman.compiled import decoupled_steps
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import TrackedMap
 from filters.kalman.online_output import Filter, OnlineOutput
 from toolkit.estimate import Estimate, Landmarks

@@ -25,7 +25,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from filters.kalman import joint_landmarks
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf

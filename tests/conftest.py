@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from toolkit.linear_algebra import THREAD_VARIABLES
+from toolkit.threads import THREAD_VARIABLES
 
 # Before NumPy is loaded, here and in the workers of these tests: their linear algebra would start a thread for every
 # processor, which fight for the processors of the other workers and take ten times as long.

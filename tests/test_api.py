@@ -20,8 +20,8 @@ from toolkit.errors import DataError, VislamError
 from toolkit.estimator import LADDER, Estimator, Setup, defaults, find
 from toolkit.experiment import Comparison, Plan
 from toolkit.metrics import describe
+from toolkit.report.comparison_table import comparison_table
 from toolkit.report.figures.style import NamedFigure
-from toolkit.report.table import comparison_table
 from toolkit.sequence import Sequence
 from toolkit.settings import SettingsError
 

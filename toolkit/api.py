@@ -27,7 +27,8 @@ from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.recording import Part
 from toolkit.progress import silent
-from toolkit.report.table import Table, as_markdown, as_text, columns_asked, comparison_table
+from toolkit.report.comparison_table import columns_asked, comparison_table
+from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
 
@@ -74,15 +75,11 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     trajectory that cannot, SettingsError for a setting that does not exist, ClusterError for a cluster that cannot be
     used, OutputError where what is to be kept cannot be written.
     """
-    unnamed = () if own else defaults()
-    named = unnamed if estimators is None else _names("estimators", estimators)
-    both = sorted(set(named) & set(_by_name("own", own)))
-    if both:
-        raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
+    named = (() if own else defaults()) if estimators is None else _names("estimators", estimators)
     plan = Plan(
         sources=(_source(source),),
         estimators=named,
-        own=_by_name("own", own),
+        own=_own_beside(named, own),
         settings=_with_seeds(settings, seed, seeds),
         truth=None if truth is None else Path(truth),
         trajectories={name: Path(file) for name, file in _by_name("trajectories", trajectories).items()},
@@ -95,6 +92,14 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     if resume is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
     return Result(run_plan(plan, silent, () if resume is None else (Path(resume),))[0])
+
+
+def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapping[str, Build]:
+    own = _by_name("own", given)
+    both = sorted(set(named) & set(own))
+    if both:
+        raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
+    return own
 
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:

@@ -5,7 +5,7 @@ There are three kinds: measured body twists, the samples of an IMU, and motion t
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
@@ -75,55 +75,52 @@ MotionNoise = TwistNoise | ImuNoise | TwistChangeNoise
 
 
 @dataclass(frozen=True, eq=False)
-class TwistSamples:
+class _TwoVectors:
+    """Samples of two vectors (S, 3) each, the fields that ``VECTORS`` names, at stamps (S,)."""
+
+    VECTORS: ClassVar[tuple[str, str]]
+    t_ns: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self, t_ns=(None,), **dict.fromkeys(self.VECTORS, (None, 3)))
+
+    @property
+    def values(self) -> Array:
+        """Return the samples side by side (S, 6), linear and angular."""
+        return np.hstack([getattr(self, name) for name in self.VECTORS])
+
+    def of(self, t_ns: IntArray, values: Array) -> Self:
+        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
+        vectors = zip(self.VECTORS, (values[:, :3], values[:, 3:]), strict=True)
+        return replace(self, t_ns=t_ns, **dict(vectors))
+
+
+@dataclass(frozen=True, eq=False)
+class TwistSamples(_TwoVectors):
     """Measured body twists: stamps (S,), linear velocity (S, 3) m/s, angular velocity (S, 3) rad/s, IMU frame.
 
     ``pairing`` says which sample describes the motion between two stamps: the one at its start, the one at
     its end, or the mean of both.
     """
 
-    t_ns: IntArray
+    VECTORS = ("v_mps", "w_radps")
     v_mps: Array
     w_radps: Array
     pairing: Pairing = "start"
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self, t_ns=(None,), v_mps=(None, 3), w_radps=(None, 3))
-
-    @property
-    def values(self) -> Array:
-        """Return the samples side by side (S, 6): linear velocity, angular velocity."""
-        return np.hstack([self.v_mps, self.w_radps])
-
-    def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
-        return replace(self, t_ns=t_ns, v_mps=values[:, :3], w_radps=values[:, 3:])
-
 
 @dataclass(frozen=True, eq=False)
-class ImuSamples:
+class ImuSamples(_TwoVectors):
     """Raw IMU samples: stamps (S,), specific force (S, 3) m/s^2, angular velocity (S, 3) rad/s, IMU frame.
 
     ``pairing`` says what stands for the motion: the mean of two neighbours from one stamp to the next, or each sample
     for the time around its stamp (see :func:`toolkit.resampling.cut_at`).
     """
 
-    t_ns: IntArray
+    VECTORS = ("accel_mps2", "gyro_radps")
     accel_mps2: Array
     gyro_radps: Array
     pairing: ImuPairing = "mean"
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self, t_ns=(None,), accel_mps2=(None, 3), gyro_radps=(None, 3))
-
-    @property
-    def values(self) -> Array:
-        """Return the samples side by side (S, 6): specific force, angular velocity."""
-        return np.hstack([self.accel_mps2, self.gyro_radps])
-
-    def of(self, t_ns: IntArray, values: Array) -> Self:
-        """Return samples of the same kind with other stamps (S,) and values (S, 6)."""
-        return replace(self, t_ns=t_ns, accel_mps2=values[:, :3], gyro_radps=values[:, 3:])
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,10 @@ from toolkit.errors import DataError, EstimatorError
 from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
-from toolkit.linear_algebra import on_one_thread
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Packet, Prior, Sequence
 from toolkit.settings import DEFAULTS, Settings
+from toolkit.threads import on_one_thread
 
 # Linux: what is written there sets back the peak that is read here (proc(5)).
 _RESETS_PEAK, _STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")

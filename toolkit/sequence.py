@@ -12,9 +12,8 @@ from typing import Self
 
 import numpy as np
 
-from toolkit.arrays import check_rigid, freeze_arrays, rotation_defect
+from toolkit.arrays import check_rigid, content_digest, freeze_arrays, rotation_defect
 from toolkit.errors import DataError
-from toolkit.files import content_digest
 from toolkit.geometry import (
     Array,
     BoolArray,
@@ -228,9 +227,9 @@ class Sequence:
     observations: Observations
     motion: MotionSamples
     provenance: Provenance
+    gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
     prior: Prior | None = None
     truth: Truth | None = None
-    gravity_world: Array = field(default_factory=lambda: np.array(GRAVITY_WORLD))
     bridges: Bridges | None = None
     track_budget: int | None = None
 
@@ -315,7 +314,7 @@ class Sequence:
     def content_hash(self, digits: int | None = None) -> str:
         """Return a SHA-256 over everything an estimator can see and the truth it is scored on.
 
-        With ``digits``, of the same rounded (:func:`toolkit.files.content_digest`).
+        With ``digits``, of the same rounded (:func:`toolkit.arrays.content_digest`).
         """
         seen = (self.frames_t_ns, self.gravity_world, self.rig, self.noise, self.observations, self.motion)
         further = filter(None, (self.bridges, self.track_budget))

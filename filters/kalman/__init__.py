@@ -1,6 +1,6 @@
 """Parts of the handwritten filters, in NumPy; GTSAM only preintegrates IMU samples, inside the shared models.
 
-Decoupled filters: ``landmark_map`` (one small Gaussian a landmark), ``correction``, ``gate``.
+Decoupled filters: ``landmark_map`` (one small Gaussian a landmark), ``correction``, ``frame_gate``.
 Joint filters: ``joint`` (the belief and its covariance), ``linearisation``, ``joint_landmarks``, ``joint_ekf``; then
 ``inverse_depth`` for ekf-slam, ``invariant`` for riekf and iekf; ``multiview``, ``triangulation``, ``track_gate``,
 ``tracks_in_view`` and ``sliding_window`` for the MSCKFs, with ``track_error_states`` where noise of tracks is stated.

@@ -14,15 +14,15 @@ import numpy as np
 
 from filters.kalman import correction, landmark_map, multiview, track_gate, tracks_in_view, triangulation
 from filters.kalman.correction import FrameCorrection
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief, times_root, transposed_root_times, without_products
 from filters.kalman.landmark_map import LandmarkMap
 from filters.kalman.linearisation import Integrator
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.residual_correlation import ResidualCorrelation
-from filters.kalman.track_gate import TestedTracks, TrackTest, Window
+from filters.kalman.track_gate import TestedTracks, TrackTest, WindowPoses
 from filters.kalman.track_scores import FEWEST_SIGHTINGS as FEWEST_CORRELATED
-from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow, Told
+from filters.kalman.tracks_in_view import FollowedTracks, Information, RootedWindow
 from toolkit.compilation import Compilation
 from toolkit.geometry import Array, BoolArray, IntArray, se3_exp
 from toolkit.measured_motion import ImuMotion, ImuNoise, Motion, MotionNoise, TwistMotion, TwistNoise
@@ -75,7 +75,7 @@ def track_test(compilation: Compilation) -> TrackTest:
     if kernel is None:
         return track_gate.tested
 
-    def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
+    def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bounds: Array) -> TestedTracks:
         """Test tracks as the definition does, and by it where right images are missing."""
         if sightings.left_only.any():
             return track_gate.tested(sightings, window, rig, bounds)
@@ -96,7 +96,7 @@ def track_test(compilation: Compilation) -> TrackTest:
 
 
 def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
-    """Return the two functions of ``tracks_in_view``, which find landmarks of tracks in view and say what they tell."""
+    """Return the two functions of ``tracks_in_view``: the landmarks of tracks in view, and the tracks' information."""
     kernel = _kernel(compilation, "tracks_in_view")
     if kernel is None:
         return tracks_in_view.NUMPY
@@ -114,11 +114,11 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         )
         return FollowedTracks(sightings, joint.clone_frames, points, weights).select(found)
 
-    def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Told:
+    def information(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Information:
         """Gate the newest sightings as the definition does; the gate is asked for its bounds, it counts nothing."""
         counted = tracks.counted
         if counted.left_only.any():
-            return tracks_in_view.told(tracks, window, rig, gate)
+            return tracks_in_view.information(tracks, window, rig, gate)
         arrays = _given((counted.uvs_px, counted.seen, counted.ages, tracks.weights, tracks.points))
         poses, root = _given((window.poses, window.poses_at)), window.root
         threshold = np.inf if gate.huber is None else float(huber_threshold(3, gate.huber))
@@ -127,11 +127,11 @@ def steps_in_view(compilation: Compilation) -> tracks_in_view.Steps:
         to_points, newest, vector = normals[3], normals[5], normals[7]
         eliminated = times_root(to_points, root)
         by_root = (root, newest @ root[-newest.shape[1] :], eliminated)
-        points, weights, in_front, taken, of_poses = kernel.told_by_newest(normals, by_root, rules)
+        points, weights, in_front, taken, of_poses = kernel.information_with_newest(normals, by_root, rules)
         matrix = without_products(transposed_root_times(root, of_poses), eliminated)
-        return Told(points, weights, in_front, matrix, root.T @ vector - eliminated.T @ taken)
+        return Information(points, weights, in_front, matrix, root.T @ vector - eliminated.T @ taken)
 
-    return tracks_in_view.Steps(followed, told)
+    return tracks_in_view.Steps(followed, information)
 
 
 # Has a correlation learn of the residuals of tracks, of points (F, 3) seen from poses (W, 4, 4).

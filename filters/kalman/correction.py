@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap, TrackedMap
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, BoolArray, transposed

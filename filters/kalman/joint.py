@@ -23,7 +23,7 @@ from toolkit.models.state import POSE, Belief, Prediction
 _LEAST_INDEPENDENT = 1e-12
 
 
-class Rows(Protocol):
+class Jacobian(Protocol):
     """A matrix (m, k) that is multiplied from the left: an array, a sparse one, or a triangle."""
 
     def __matmul__(self, right: Any, /) -> Any:
@@ -122,7 +122,7 @@ class JointBelief:
         self._cov[len(before) :, : len(before)], self._cov[: len(before), len(before) :] = cross, cross.T
         self._cov[len(before) :, len(before) :] = _symmetric(jacobian @ cross.T + cov)
 
-    def update(self, H: Rows, residual: Array, columns: slice) -> None:
+    def update(self, H: Jacobian, residual: Array, columns: slice) -> None:
         """Correct everything by whitened residuals (m,) with Jacobian (m, k) to a part of the error state."""
         root, half_gain = self._half_gain(H, columns)
         self._reduce(half_gain)
@@ -148,7 +148,7 @@ class JointBelief:
         self._cov[:first, :first] += others
         self.move(half_gain.T @ divided_by_root(matrix_root, (root.T @ vector)[:, None])[:, 0])
 
-    def reduce_covariance(self, H: Rows, columns: slice) -> None:
+    def reduce_covariance(self, H: Jacobian, columns: slice) -> None:
         """Reduce the covariance by what whitened measurements with Jacobian (m, k) add; the estimates stay."""
         self._reduce(self._half_gain(H, columns)[1])
 
@@ -157,7 +157,7 @@ class JointBelief:
         taken_away = half_gain.T @ half_gain
         self._cov = np.subtract(self._cov, taken_away, out=taken_away)
 
-    def _half_gain(self, H: Rows, columns: slice) -> tuple[Array, Array]:
+    def _half_gain(self, H: Jacobian, columns: slice) -> tuple[Array, Array]:
         """Return the Cholesky root C of the innovations' covariance and C^-1 H P."""
         carried = np.asarray(H @ self._cov[columns])
         innovation_cov = np.asarray(H @ carried[:, columns].T)

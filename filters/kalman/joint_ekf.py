@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.motion_noise import MatchedNoise

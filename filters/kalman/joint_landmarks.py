@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import NUMPY, Images, Linearised

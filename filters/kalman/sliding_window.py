@@ -19,7 +19,7 @@ from collections import deque
 import numpy as np
 
 from filters.kalman import compiled, joint_landmarks, multiview, track_error_states
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation, propagate
 from filters.kalman.motion_noise import MatchedNoise

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import joint_landmarks, multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Linearised, TrackSightings

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import Constraints, Linearised, TrackSightings
@@ -22,7 +22,7 @@ from toolkit.models.gating import FEWEST_SIGHTINGS, MISMATCHED_TRACK_FACTOR, mah
 from toolkit.sequence import StereoRig
 
 
-class Window(NamedTuple):
+class WindowPoses(NamedTuple):
     """The poses (W, 4, 4) that tracks are seen from, those to linearise at, and the covariance (6 W, 6 W) of all."""
 
     poses: Array
@@ -30,7 +30,7 @@ class Window(NamedTuple):
     cov: Array
 
     @classmethod
-    def of(cls, joint: JointBelief, at: Linearisation) -> "Window":
+    def of(cls, joint: JointBelief, at: Linearisation) -> "WindowPoses":
         """Return the window of a joint belief, linearised as chosen."""
         columns = joint.clone_columns
         return cls(joint.clones, at.clones(joint), joint.cov[columns, columns])
@@ -55,7 +55,7 @@ class TestedTracks(NamedTuple):
 
 
 # Tests tracks against a window; the bounds (3 W - 2,) are those of the NIS by degrees of freedom.
-TrackTest = Callable[[TrackSightings, Window, StereoRig, Array], TestedTracks]
+TrackTest = Callable[[TrackSightings, WindowPoses, StereoRig, Array], TestedTracks]
 
 
 class AcceptedTracks(NamedTuple):
@@ -76,7 +76,7 @@ class AcceptedTracks(NamedTuple):
         return AcceptedTracks(self.sightings.joined(other.sightings), *(np.concatenate(pair) for pair in pairs))
 
 
-def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Array) -> TestedTracks:
+def tested(sightings: TrackSightings, window: WindowPoses, rig: StereoRig, bounds: Array) -> TestedTracks:
     """Triangulate tracks, free them of their landmarks and test them, all at once in NumPy: the definition.
 
     ``bounds`` (n,) is the NIS that is just accepted at each number of degrees of freedom.
@@ -107,7 +107,7 @@ def tested(sightings: TrackSightings, window: Window, rig: StereoRig, bounds: Ar
 def _linearised(
     sightings: TrackSightings,
     points: Array,
-    window: Window,
+    window: WindowPoses,
     rig: StereoRig,
     images: multiview.Images = multiview.NUMPY,
 ) -> Linearised:
@@ -151,7 +151,7 @@ class TrackGate:
         images: multiview.Images = multiview.NUMPY,
     ) -> None:
         self._rig, self._test, self._images = rig, test, images
-        self._window = Window.of(joint, at)
+        self._window = WindowPoses.of(joint, at)
 
     def accepted(self, sightings: TrackSightings, gate: FrameGate) -> AcceptedTracks:
         """Return the tracks that pass, some of them without one of their sightings.

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import (
     JointBelief,
     cholesky_root,
@@ -30,7 +30,7 @@ from filters.kalman.joint import (
 )
 from filters.kalman.linearisation import Linearisation
 from filters.kalman.multiview import TrackSightings
-from filters.kalman.track_gate import Window
+from filters.kalman.track_gate import WindowPoses
 from filters.kalman.triangulation import is_determined, lacking, nearest_view
 from toolkit.arrays import is_among
 from toolkit.geometry import Array, BoolArray, IntArray
@@ -79,13 +79,13 @@ class RootedWindow(NamedTuple):
     root: Array
 
     @classmethod
-    def of(cls, window: Window) -> "RootedWindow":
+    def of(cls, window: WindowPoses) -> "RootedWindow":
         """Return a window with the root of its covariance."""
         return cls(window.poses, window.poses_at, regular_root(window.cov))
 
 
-class Told(NamedTuple):
-    """What F tracks tell of W poses: information matrix (6 W, 6 W) and vector (6 W,), free of the landmarks.
+class Information(NamedTuple):
+    """The information of F tracks on W poses, a matrix (6 W, 6 W) and a vector (6 W,), free of the landmarks.
 
     Both are of errors u of unit covariance, of which those of the poses are ``R u``; of the matrix the lower half
     counts. ``weights`` (F,) is what the newest sightings count for, ``points`` (F, 3) the landmarks after a
@@ -102,12 +102,12 @@ class Told(NamedTuple):
 
 # Finds the landmarks of tracks among those known before, or anew.
 Follow = Callable[[FollowedTracks, TrackSightings, JointBelief, StereoRig], FollowedTracks]
-# Gates the newest sightings of tracks and says what the tracks tell of a window.
-Tell = Callable[[FollowedTracks, RootedWindow, StereoRig, FrameGate], Told]
+# Gates the newest sightings of tracks and returns the information of the tracks on a window.
+InformationOf = Callable[[FollowedTracks, RootedWindow, StereoRig, FrameGate], Information]
 
 
-def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Told:
-    """Gate the newest sightings and return what the tracks tell: the definition, in NumPy, all tracks at once."""
+def information(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: FrameGate) -> Information:
+    """Gate the newest sightings and return the information of all tracks: the definition, in NumPy, all at once."""
     rows, usable = _rows(tracks, window, rig)
     points, weights = tracks.points.copy(), np.zeros(len(usable))
     normals = _Normals.of(rows.select(usable))
@@ -119,7 +119,7 @@ def told(tracks: FollowedTracks, window: RootedWindow, rig: StereoRig, gate: Fra
     points[usable] += _no_longer_than(most_m, normals.point_steps())
     matrix, vector = normals.of_clones()
     matrix = transposed_root_times(window.root, times_root(matrix, window.root))
-    return Told(points, weights, usable, matrix, window.root.T @ vector)
+    return Information(points, weights, usable, matrix, window.root.T @ vector)
 
 
 def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelief, rig: StereoRig) -> FollowedTracks:
@@ -138,13 +138,13 @@ def followed(known: FollowedTracks, sightings: TrackSightings, joint: JointBelie
 
 
 class Steps(NamedTuple):
-    """What finds the landmarks of tracks that have two sightings or more, and what says what they tell."""
+    """What finds the landmarks of tracks that have two sightings or more, and what returns their information."""
 
     follow: Follow
-    tell: Tell
+    information: InformationOf
 
 
-NUMPY = Steps(followed, told)
+NUMPY = Steps(followed, information)
 
 
 class TracksInView:
@@ -168,13 +168,13 @@ class TracksInView:
             self._known = tracks
             return joint.core
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber)
-        window = RootedWindow.of(Window.of(joint, self._at))
-        told = self._steps.tell(tracks, window, self._rig, gate)
-        tracks.weights[:, -1] = told.weights
-        self._known = tracks._replace(points=told.points).select(told.usable)
-        if not told.usable.any():
+        window = RootedWindow.of(WindowPoses.of(joint, self._at))
+        found = self._steps.information(tracks, window, self._rig, gate)
+        tracks.weights[:, -1] = found.weights
+        self._known = tracks._replace(points=found.points).select(found.usable)
+        if not found.usable.any():
             return joint.core
-        return _informed(joint, window.root, np.multiply(told.matrix, share, out=told.matrix), share * told.vector)
+        return _informed(joint, window.root, np.multiply(found.matrix, share, out=found.matrix), share * found.vector)
 
 
 class _Rows(NamedTuple):

@@ -72,7 +72,7 @@ class PointsInView(NamedTuple):
         return front
 
 
-class Reduced(NamedTuple):
+class ReducedVision(NamedTuple):
     """Information (6K, 6K) and its vector (6K,) on the poses, and what gives the points' step back."""
 
     information: Array
@@ -119,7 +119,7 @@ class Vision:
         beyond = huber * (norm - huber / 2)
         return float(np.where(norm <= huber, 0.5 * norm**2, beyond).sum())
 
-    def reduced(self) -> Reduced:
+    def reduced(self) -> ReducedVision:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""
         weights = self._root_weights
         weighted = weights[:, None, None] * left_only.whitener(self.sightings.uv_px, self.camera.rig)
@@ -157,7 +157,7 @@ class ChainedVision(Vision):
     Huber's loss is that of what is new.
     """
 
-    def reduced(self) -> Reduced:
+    def reduced(self) -> ReducedVision:
         """Linearise and eliminate the points, as for sightings that stand each for itself."""
         chain, weights, channels = self._chain, self._root_weights[:, None, None], channels_of(self.sightings.uv_px)
         to_pose, to_point = self._predicted.d_uv_d_pose, self._predicted.d_uv_d_point
@@ -198,7 +198,7 @@ class _OfPoses(NamedTuple):
 
 def _eliminated(
     residual: Array, of_poses: Sequence[_OfPoses], J_point: Array, point: IntArray, counts: tuple[int, int]
-) -> Reduced:
+) -> ReducedVision:
     pose_count, point_count = counts
     # Small matrix products are several times as fast on contiguous arrays.
     to_point = np.ascontiguousarray(np.swapaxes(J_point, 1, 2))
@@ -217,7 +217,7 @@ def _eliminated(
     across = coupling.reshape(6 * pose_count, 3 * point_count)
     information = -(across @ across.T)
     _add_of_poses(information.reshape(pose_count, 6, pose_count, 6), of_poses)
-    return Reduced(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
+    return ReducedVision(information, vector.ravel() - across @ whitened_vector.ravel(), across, root, whitened_vector)
 
 
 def _add_of_poses(information: Array, of_poses: Sequence[_OfPoses]) -> None:

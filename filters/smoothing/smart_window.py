@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cholesky
 
-from filters.smoothing.smart_factors import Reduced, RobustCamera, Sightings, Vision, seen_from
+from filters.smoothing.smart_factors import ReducedVision, RobustCamera, Sightings, Vision, seen_from
 from toolkit.geometry import Array, IntArray
 from toolkit.models import stereo
 from toolkit.models.gating import LEAST_DISPARITY_PX
@@ -130,7 +130,7 @@ class System:
 
     information: Array
     vector: Array
-    vision: Reduced
+    vision: ReducedVision
 
     @cached_property
     def root(self) -> Array:

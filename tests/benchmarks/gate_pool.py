@@ -32,7 +32,7 @@ from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.initialization import start_from_measurements
 from toolkit.measured_motion import ImuSamples, MotionNoise, TwistNoise, TwistSamples
 from toolkit.metrics import Evaluation, ate, held_out, nees, nis
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.progress import SILENT
 from toolkit.sequence import Observations, Prior, Sequence
 from toolkit.simulation import SCENARIOS, simulate

@@ -26,7 +26,7 @@ import numpy as np
 from toolkit import compare, runner
 from toolkit.estimator import find
 from toolkit.geometry import Array
-from toolkit.metrics._shared.alignment import fit_yaw
+from toolkit.metrics.parts.alignment import fit_yaw
 from toolkit.sequence import Sequence as Recording
 from toolkit.settings import POLICIES, Outliers, Settings
 from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate

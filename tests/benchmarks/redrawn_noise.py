@@ -27,7 +27,7 @@ from toolkit.experiment.recording import Recording, prepare
 from toolkit.geometry import Array, se3_inverse, se3_log, so3_exp, so3_log, transform
 from toolkit.initialization import start_from_measurements
 from toolkit.measured_motion import ImuNoise
-from toolkit.metrics._shared.alignment import fit_yaw
+from toolkit.metrics.parts.alignment import fit_yaw
 from toolkit.models import stereo
 from toolkit.resampling import NS_PER_S
 from toolkit.runner import run

@@ -16,7 +16,7 @@ import pytest
 
 from toolkit import runner
 from toolkit.experiment import workers
-from toolkit.linear_algebra import THREAD_VARIABLES
+from toolkit.threads import THREAD_VARIABLES
 
 Vislam = Callable[..., int]
 OneLine = Callable[[], str]

@@ -14,9 +14,9 @@ import pytest
 
 from toolkit.datasets.trajectories import euroc, tum
 from toolkit.datasets.trajectories.exchanged_axes import Exchange
-from toolkit.documents import schema
 from toolkit.estimate import Trajectory
 from toolkit.evaluation.document import EvaluationRecord, read_evaluation
+from toolkit.files.documents import schema
 from toolkit.geometry import quaternion_from_rotation, se3, se3_inverse, so3_exp
 
 S = 10**9

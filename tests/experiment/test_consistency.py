@@ -11,7 +11,7 @@ from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.experiment.comparison import Row, consistency_of
 from toolkit.experiment.units import Scored, outcome_of
 from toolkit.metrics import Evaluation, Scores
-from toolkit.metrics._shared.consistency import Nis, nees_band, nis_over_time
+from toolkit.metrics.parts.consistency import Nis, nees_band, nis_over_time
 from toolkit.models.gating import mean_below_bound
 
 NOTHING = np.empty(0)

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from toolkit.datasets import is_drawn_from_a_seed
-from toolkit.documents import parse, to_text
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, in_order
 from toolkit.experiment.statistics import Paired, mean_nees, paired, quantiles_of_all, ratio_of_means, spread_of
 from toolkit.experiment.units import Outcome
+from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
-from toolkit.metrics._shared.consistency import nees_band
+from toolkit.metrics.parts.consistency import nees_band
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.figures import over_seeds as figures
 from toolkit.report.messages import note_lines, paired_lines

@@ -5,7 +5,7 @@ import pytest
 
 from filters.kalman import correction, landmark_map
 from filters.kalman.compiled import decoupled_steps
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap
 from toolkit.compilation import Compilation
 from toolkit.geometry import read_only, se3_exp, transform

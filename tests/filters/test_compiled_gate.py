@@ -11,11 +11,11 @@ import pytest
 
 from filters.kalman import compiled as compiled_parts
 from filters.kalman import multiview, track_gate, tracks_in_view
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.residual_correlation import ResidualCorrelation
-from filters.kalman.track_gate import Window
+from filters.kalman.track_gate import WindowPoses
 from filters.kalman.tracks_in_view import FollowedTracks, RootedWindow
 from filters.kalman.triangulation import nearest_view
 from toolkit.compilation import Compilation
@@ -49,10 +49,10 @@ def flight(window_of_clones):
     sequence, joint = window_of_clones(replace(FLIGHT, duration_s=1.0), 2, WINDOW)
     clones = joint.clone_columns
     joint.update(np.eye(6, 6 * WINDOW, 6 * WINDOW - 6) * 40.0, np.full(6, 0.3), clones)
-    return sequence.rig, Window(joint.clones, AtFirstEstimates().clones(joint), joint.cov[clones, clones])
+    return sequence.rig, WindowPoses(joint.clones, AtFirstEstimates().clones(joint), joint.cov[clones, clones])
 
 
-def sightings_in(rig, window: Window) -> TrackSightings:
+def sightings_in(rig, window: WindowPoses) -> TrackSightings:
     """Return tracks of all lengths and with gaps; some mismatched, one behind the camera, one too far."""
     rng = np.random.default_rng(5)
     rays = np.stack([rng.uniform(-0.6, 0.6, TRACKS), rng.uniform(-0.4, 0.4, TRACKS), np.ones(TRACKS)], axis=1)
@@ -98,7 +98,7 @@ def test_compiled_and_numpy_tell_the_same_of_tracks_in_view(kernels, flight, noi
     tracks = followed_in(rig, window)
     ours, theirs = (
         tell(tracks, RootedWindow.of(window), rig, FrameGate(probability, huber))
-        for tell in (tracks_in_view.told, kernels[1].tell)
+        for tell in (tracks_in_view.information, kernels[1].information)
     )
     assert ours.usable.tolist() == theirs.usable.tolist()
     assert 0 < ours.usable.sum() < TRACKS
@@ -143,7 +143,7 @@ def test_compiled_and_numpy_learn_the_same_correlation_of_residuals(kernels, fli
     assert theirs.share == pytest.approx(ours.share, rel=TOLERANCE)
 
 
-def followed_in(rig, window: Window) -> FollowedTracks:
+def followed_in(rig, window: WindowPoses) -> FollowedTracks:
     """Return the tracks that the newest pose sees, with landmarks a little off and some sightings that count less."""
     sightings = sightings_in(rig, window)
     sightings.seen[:, -1] = True
@@ -176,7 +176,7 @@ def test_compiled_and_numpy_follow_the_same_landmarks(kernels, flight):
 def test_nothing_is_told_by_no_track(kernels, flight):
     rig, window = flight
     none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
-    for tell in (tracks_in_view.told, kernels[1].tell):
+    for tell in (tracks_in_view.information, kernels[1].information):
         nothing = tell(none, RootedWindow.of(window), rig, FrameGate(0.95))
         assert len(nothing.weights) == len(nothing.usable) == 0
         assert not nothing.matrix.any() and not nothing.vector.any()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from filters.kalman.correction import correct_landmarks, correct_pose, updated_by_pose_sightings
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.landmark_map import LandmarkMap
 from toolkit.geometry import Array, se3_exp
 from toolkit.models import stereo

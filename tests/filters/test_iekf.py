@@ -15,7 +15,7 @@ import pytest
 
 from filters import iekf
 from filters.kalman import joint_landmarks
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief, InvariantBelief, inverse_depth, inverse_depth_jacobian
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf

@@ -7,7 +7,7 @@ import pytest
 
 from filters import iekf
 from filters.kalman import joint_landmarks
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.joint import JointBelief
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.track_error_states import TrackErrorBelief, implausible_errors

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.residual_correlation import LandmarkCorrelation, ResidualCorrelation, residuals_left
 from filters.kalman.triangulation import triangulate

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from filters import iekf
 from filters.kalman import joint_landmarks
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.invariant import AnchoredBelief, InvariantBelief
 from filters.kalman.joint import JointBelief
 from filters.kalman.joint_ekf import JointEkf

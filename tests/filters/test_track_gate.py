@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from filters.kalman import multiview
-from filters.kalman.gate import FrameGate
+from filters.kalman.frame_gate import FrameGate
 from filters.kalman.linearisation import AtLatestEstimates
 from filters.kalman.multiview import TrackSightings
 from filters.kalman.track_gate import TrackGate, innovation_covs

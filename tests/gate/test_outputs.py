@@ -8,7 +8,8 @@ from xml.etree import ElementTree
 import pytest
 
 from toolkit.errors import OutputError
-from toolkit.report.gate import check_document, gate_markdown, gate_text, write_check
+from toolkit.gate.verdict import check_document
+from toolkit.report.gate import gate_markdown, gate_text, write_check
 from toolkit.report.records import read_check
 
 

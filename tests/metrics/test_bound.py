@@ -9,8 +9,8 @@ from toolkit.estimate import Trajectory
 from toolkit.geometry import se3_exp, se3_inverse
 from toolkit.initialization import start_from_measurements
 from toolkit.metrics import describe, metrics_called, requests_of, score_run
-from toolkit.metrics._shared import cramer_rao
-from toolkit.metrics._shared.cramer_rao import efficient
+from toolkit.metrics.parts import cramer_rao
+from toolkit.metrics.parts.cramer_rao import efficient
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 
 SHORT = {

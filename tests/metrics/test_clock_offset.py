@@ -5,9 +5,9 @@ import pytest
 
 from toolkit.geometry import Array, se3, se3_exp
 from toolkit.metrics import clock_offset
-from toolkit.metrics._shared.association import Matched, distance_along
-from toolkit.metrics._shared.evaluation import PairsAgainstTruth
-from toolkit.metrics._shared.scores import Scores
+from toolkit.metrics.parts.association import Matched, distance_along
+from toolkit.metrics.parts.evaluation import PairsAgainstTruth
+from toolkit.metrics.parts.scores import Scores
 
 PERIOD_S = 0.1
 ELSEWHERE = se3_exp(np.array([0.4, -0.2, 1.9, 30.0, -4.0, 2.0]))

@@ -10,8 +10,8 @@ from scipy.special import chdtri
 from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.measured_motion import with_noise_scaled
 from toolkit.metrics import Evaluation, correction_trend, score_run
-from toolkit.metrics._shared.scores import Unavailable
 from toolkit.metrics.correction_trend import LIMIT, TREND
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.motion import motion_model, predicted
 from toolkit.models.state import POSE
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate

@@ -8,7 +8,7 @@ import pytest
 from toolkit.estimate import Trajectory
 from toolkit.geometry import about_z, interpolate_poses, se3, se3_exp, se3_inverse, so3_exp
 from toolkit.metrics import Evaluation, score_run
-from toolkit.metrics._shared.consistency import chi2_quantile, nees_band, nees_over_time
+from toolkit.metrics.parts.consistency import chi2_quantile, nees_band, nees_over_time
 from toolkit.sequence import Prior, Truth
 
 POSES = 4000

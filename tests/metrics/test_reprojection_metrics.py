@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 from toolkit.estimate import Landmarks
 from toolkit.geometry import se3_exp, se3_inverse, transform
 from toolkit.metrics import Evaluation, held_out, in_sample, score_run
-from toolkit.metrics._shared import leave_one_out
-from toolkit.metrics._shared.leave_one_out import predict_left_out
-from toolkit.metrics._shared.residuals import CAP_PX
+from toolkit.metrics.parts import leave_one_out
+from toolkit.metrics.parts.leave_one_out import predict_left_out
+from toolkit.metrics.parts.residuals import CAP_PX
 from toolkit.models import stereo
 
 HUBER_SIGMAS = 2.796

@@ -9,7 +9,7 @@ import pytest
 from toolkit import metrics
 from toolkit.errors import VislamError
 from toolkit.metrics import Scores, score_run
-from toolkit.metrics._shared.scores import Unavailable, evaluate
+from toolkit.metrics.parts.scores import Unavailable, evaluate
 from toolkit.models.gating import chi2_bound, mean_below_bound
 
 

@@ -8,8 +8,8 @@ from scipy.optimize import minimize
 
 from toolkit.geometry import about_z, se3, se3_exp, transform
 from toolkit.metrics import score_run
-from toolkit.metrics._shared.alignment import fit_se3, fit_sim3, fit_yaw, place_yaw
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.alignment import fit_se3, fit_sim3, fit_yaw, place_yaw
+from toolkit.metrics.parts.scores import Unavailable
 
 ERRORS = ["ate_none_m", "ate_se3_m", "ate_yaw_m", "ate_sim3_m", "ate_se3_deg", "rpe_1s_m", "rpe_1s_deg"]
 ERRORS += ["rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m", "end_drift_percent"]

@@ -8,7 +8,7 @@ import jsonschema
 import pytest
 
 from toolkit.cli import main
-from toolkit.documents import schema
+from toolkit.files.documents import schema
 from toolkit.report.differences import Change, Differences, DiffRecord, diff_text
 
 DOCUMENTS = Path(__file__).parent / "documents"

@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from toolkit.report.figures import FigureFormat, save
-from toolkit.report.figures.style import NamedFigure, colour_of, line_of_estimator, new_figure
+from toolkit.report.figures.style import NamedFigure, new_figure, stroke_of
 
 BEGINS = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
 
@@ -31,7 +31,7 @@ def test_fourteen_estimators_are_told_apart_and_both_outputs_keep_one_colour() -
     names = [f"e{i}" for i in range(14)]
     comparison = cast(Any, SimpleNamespace(runs=[SimpleNamespace(estimator=name) for name in names]))
     for output in ("causal", "final"):
-        looks = [(colour_of(comparison, name), str(line_of_estimator(comparison, name, output))) for name in names]
+        looks = [str(stroke_of(comparison, name, output)) for name in names]
         assert len(set(looks)) == 14
-    lines = {str(line_of_estimator(comparison, name, output)) for name in names for output in ("causal", "final")}
+    lines = {str(stroke_of(comparison, name, output)["linestyle"]) for name in names for output in ("causal", "final")}
     assert len(lines) == 4

@@ -7,7 +7,7 @@ import msgspec
 from toolkit.estimator import find_all
 from toolkit.experiment.pipeline import decisive_parts, lacking, to_bridge
 from toolkit.experiment.recording import Recording, prepare
-from toolkit.report.header import rules_line
+from toolkit.report.comparison_table import rules_line
 from toolkit.report.messages import note_lines
 from toolkit.settings import DEFAULTS, Noise, Settings
 from toolkit.simulation import DRIVE, DRIVE_IMU, simulate

@@ -9,8 +9,8 @@ import jsonschema
 import msgspec
 import pytest
 
-from toolkit.documents import parse, read, schema, to_line, to_text
 from toolkit.errors import DataError
+from toolkit.files.documents import parse, read, schema, to_line, to_text
 from toolkit.gate import baseline_file, trajectory_baseline
 from toolkit.metrics import describe
 from toolkit.report.records import read_check

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from msgspec import UNSET
 
-from toolkit.documents import parse, to_text
 from toolkit.experiment.comparison import Comparison, Row, consistency_of
+from toolkit.files.documents import parse, to_text
 from toolkit.metrics import Scores, describe
 from toolkit.report.messages import note_lines
 from toolkit.report.records.scores import PROMISED_KEYS, Metrics

@@ -12,17 +12,9 @@ from toolkit.errors import VislamError
 from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, known_metrics
+from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
-from toolkit.report.table import (
-    Table,
-    as_markdown,
-    as_text,
-    change_lines,
-    comparison_table,
-    explained_metrics,
-    heading,
-    shown_metrics,
-)
+from toolkit.report.table import Table, as_markdown, as_text, heading
 from toolkit.sequence import Provenance
 
 Rescored = Callable[[Comparison, Callable[[Row], Scores]], Comparison]

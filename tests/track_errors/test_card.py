@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from toolkit.cli import main
-from toolkit.documents import to_line
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, run
+from toolkit.files.documents import to_line
 from toolkit.report.card import card_lines, card_record, card_text
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.records import read_card

@@ -210,6 +210,14 @@ def _seconds_at_least_zero(number: str, text: str) -> float:
     return value
 
 
+def add_option(
+    parser: argparse.ArgumentParser | argparse._ArgumentGroup, option: str, default: object, what: str, **kind: Any
+) -> None:
+    """Add an option that has a value where none is given, which ends its help; ``kind`` is as argparse has it."""
+    shown = f"{default:g}" if isinstance(default, float) else default
+    parser.add_argument(option, default=default, help=f"{what} (default: {shown})", **kind)
+
+
 def add_part_arguments(parser: argparse.ArgumentParser) -> None:
     """Add what says which frames of a recording are used."""
     after = "after the first frame, as in 10s"
@@ -346,7 +354,7 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sequence", metavar="SEQUENCE", help="a recording's path, or a built-in name")
     add_repair_arguments(parser)
     add_tracks_argument(parser)
-    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="of a simulated sequence (default: 0)")
+    add_option(parser, "--seed", 0, "of a simulated sequence", metavar="N", type=at_least(0))
 
 
 def recording_asked(options: argparse.Namespace) -> "Recording":

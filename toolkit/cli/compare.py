@@ -14,6 +14,7 @@ from toolkit.cli.arguments import (
     Interrupted,
     UsageError,
     add_estimators_argument,
+    add_option,
     add_output_arguments,
     add_part_arguments,
     add_repair_arguments,
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
     from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
+    from toolkit.report.comparison_table import Columns
     from toolkit.report.run_directory import MadeBy
-    from toolkit.report.table import Columns
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
@@ -89,18 +90,10 @@ def _add_seeds(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_what_is_shown(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--figures",
-        choices=("few", "all", "none"),
-        default="few",
-        help="which to draw; docs/figures.md shows all there are (default: few)",
-    )
-    parser.add_argument(
-        "--figure-format",
-        choices=("png", "pdf", "svg"),
-        default="png",
-        help="of the figures; pdf and svg stay sharp in a paper (default: png)",
-    )
+    what = "which to draw; docs/figures.md shows all there are"
+    add_option(parser, "--figures", "few", what, choices=("few", "all", "none"))
+    what = "of the figures; pdf and svg stay sharp in a paper"
+    add_option(parser, "--figure-format", "png", what, choices=("png", "pdf", "svg"))
     add_output_arguments(
         parser, "what metrics.json or seeds.json holds, a line a SEQUENCE, no table", "the run directory has everything"
     )
@@ -144,8 +137,8 @@ def compare(options: argparse.Namespace) -> int:
     """Run estimators on the same measurements of each SEQUENCE and compare them: a table here, and a run directory
     with report, metrics, trajectories, landmarks and figures.
     """
-    from toolkit.documents import to_line
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
+    from toolkit.files.documents import to_line
     from toolkit.progress import of_this_process, print_above
     from toolkit.report.comparison_text import comparison_text
     from toolkit.report.prose import width_of_output
@@ -216,7 +209,7 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.report.table import columns_asked
+    from toolkit.report.comparison_table import columns_asked
 
     try:
         return columns_asked(names)

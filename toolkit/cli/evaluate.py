@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     UsageError,
+    add_option,
     add_output_arguments,
     add_workers_argument,
     at_least,
@@ -35,25 +36,15 @@ def _add_terms(parser: argparse.ArgumentParser) -> None:
         help="pair each pose with the nearest one within so many seconds, as evo does (default: interpolate)",
     )
     parser.add_argument("--offset", metavar="S", type=float, default=0.0, help="added to the trajectories' stamps")
-    parser.add_argument(
-        "--gap",
-        metavar="S",
-        type=positive_seconds,
-        default=5.0,
-        help="the longest time between two poses that counts as covered (default: 5)",
-    )
+    what = "the longest time between two poses that counts as covered"
+    add_option(parser, "--gap", 5.0, what, metavar="S", type=positive_seconds)
     parser.add_argument(
         "--imu",
         action="store_true",
         help="the vertical is measured: where the first pose is placed, only heading and position are",
     )
-    parser.add_argument(
-        "--least-coverage",
-        metavar="PERCENT",
-        type=_percent,
-        default=50.0,
-        help="of the truth's time; a run that covers less counts as failed (default: 50)",
-    )
+    what = "of the truth's time; a run that covers less counts as failed"
+    add_option(parser, "--least-coverage", 50.0, what, metavar="PERCENT", type=_percent)
     parser.add_argument(
         "--runs",
         metavar="N",
@@ -74,13 +65,11 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
         "with SEQUENCE.tum or SEQUENCE/RUN.tum, or a FOLDER that has such a folder for each system",
     )
     _add_terms(parser)
-    parser.add_argument(
-        "--metric", metavar="KEY", default="ate_se3_m", help="what ranks and is tested (default: ate_se3_m)"
-    )
+    add_option(parser, "--metric", "ate_se3_m", "what ranks and is tested", metavar="KEY")
     parser.add_argument(
         "--columns", metavar="KEY,...", type=names, default=(), help="metrics of the table, or all (default: the usual)"
     )
-    parser.add_argument("--format", choices=_FORMATS, default="text", help="of what is printed (default: text)")
+    add_option(parser, "--format", "text", "of what is printed", choices=_FORMATS)
     add_output_arguments(parser, "evaluation.json, and nothing else", "the exit status and --out tell")
     parser.add_argument(
         "--out",
@@ -125,8 +114,8 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def _print(found: EvaluatedSystems, columns: tuple[Metric, ...], options: argparse.Namespace) -> None:
-    from toolkit.documents import to_text
     from toolkit.evaluation.document import evaluation_document
+    from toolkit.files.documents import to_text
     from toolkit.report import evaluation_text as texts
     from toolkit.report.prose import width_of_output
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from toolkit.cli.arguments import (
     UsageError,
     add_estimators_argument,
+    add_option,
     add_settings_arguments,
     add_workers_argument,
     at_least,
@@ -62,16 +63,9 @@ def _baseline_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_estimators_argument(parser, "what to measure, see 'vislam list'")
     parser.add_argument("--out", metavar="FILE", type=Path, help="the baseline (default: named by the releases)")
-    parser.add_argument(
-        "--seeds",
-        metavar="N",
-        type=at_least(FEWEST_SEEDS),
-        default=SEEDS,
-        help=f"seeds of each simulated sequence, from 0 (default: {SEEDS})",
-    )
-    parser.add_argument(
-        "--repeats", metavar="N", type=at_least(1), default=1, help="runs of each recorded sequence (default: 1)"
-    )
+    what = "seeds of each simulated sequence, from 0"
+    add_option(parser, "--seeds", SEEDS, what, metavar="N", type=at_least(FEWEST_SEEDS))
+    add_option(parser, "--repeats", 1, "runs of each recorded sequence", metavar="N", type=at_least(1))
     parser.add_argument(
         "--duration",
         metavar="S",
@@ -106,7 +100,7 @@ def baseline(options: argparse.Namespace) -> int:
     if options.align or options.gap:
         raise UsageError("--align and --gap go with --trajectories (see vislam baseline --help)")
     from toolkit.experiment.workers import usable_cpus
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.gate.baseline import releases_in_a_name
     from toolkit.gate.baseline_file import to_text
     from toolkit.gate.checking import new_baseline
@@ -126,7 +120,7 @@ def baseline(options: argparse.Namespace) -> int:
 
 
 def _baseline_of_trajectories(options: argparse.Namespace) -> int:
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.gate.trajectory_baseline import to_text
     from toolkit.gate.trajectory_check import new_trajectory_baseline
     from toolkit.gate.trajectory_files import Scoring
@@ -266,7 +260,7 @@ def check(options: argparse.Namespace) -> int:
     reprojection or speed got worse, an answer moved, or anything is missing. With --trajectories, judge files of
     another system in the same way. See docs/gate.md.
     """
-    from toolkit.files import check_writable
+    from toolkit.files.writing import check_writable
     from toolkit.report.gate import gate_text, write_check
     from toolkit.report.prose import width_of_output
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from toolkit.cli.arguments import (
     UsageError,
+    add_option,
     add_recording_arguments,
     add_settings_arguments,
     add_topics_argument,
@@ -73,9 +74,9 @@ def card(options: argparse.Namespace) -> int:
     """Fit the noise of a recording's tracks and say what they are like: how errors along a track are correlated,
     how many are at odds with the motion, how vision's scale compares with the measured motion. No truth is used.
     """
-    from toolkit.documents import to_text
     from toolkit.experiment.recording import recording_card
-    from toolkit.files import check_writable, write_text
+    from toolkit.files.documents import to_text
+    from toolkit.files.writing import check_writable, write_text
     from toolkit.progress import of_this_process
     from toolkit.report.card import card_record, card_text
     from toolkit.report.prose import width_of_output
@@ -93,13 +94,11 @@ def card(options: argparse.Namespace) -> int:
 
 def _tracks_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", metavar="FOLDER|BAG", help="a folder with images, as EuRoC's or KITTI's, or a bag")
+    add_topics_argument(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the stills")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument(
-        "--count", metavar="N", type=at_least(1, _MOST_STILLS), default=10, help="how many stills (default: 10)"
-    )
+    add_option(what, "--count", 10, "how many stills", metavar="N", type=at_least(1, _MOST_STILLS))
     what.add_argument("--video", action="store_true", help="a video of every frame instead of stills")
-    add_topics_argument(parser)
     add_settings_arguments(parser)
 
 
@@ -116,7 +115,7 @@ def tracks(options: argparse.Namespace) -> int:
     import msgspec
 
     from toolkit.datasets import load_images
-    from toolkit.files import check_parent
+    from toolkit.files.writing import check_parent
     from toolkit.frontend import track_images
     from toolkit.frontend.stills import write_stills, write_video
     from toolkit.progress import of_this_process
@@ -163,7 +162,7 @@ def _exposure_ms(text: str) -> float:
 def _simulate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenario", choices=SCENARIOS, help="what moves, and where")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="directory of the recording")
-    parser.add_argument("--seed", metavar="N", type=at_least(0), default=0, help="draws every error (default: 0)")
+    add_option(parser, "--seed", 0, "draws every error", metavar="N", type=at_least(0))
     parser.add_argument("--duration", metavar="S", type=positive_seconds, help="seconds (default: the scenario's)")
     images = parser.add_argument_group("images")
     images.add_argument("--images", action="store_true", help="render the images of a stereo pair (flight)")

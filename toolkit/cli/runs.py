@@ -122,7 +122,7 @@ def diff(options: argparse.Namespace) -> int:
     """Tell what differs between two run directories: settings, versions, data, how runs ended, and the metrics that
     moved; over seeds also which of them moved by more than chance.
     """
-    from toolkit.documents import to_text
+    from toolkit.files.documents import to_text
     from toolkit.metrics import known_metrics, metrics_called
     from toolkit.report.differences import diff_document, diff_text, differences
     from toolkit.report.prose import width_of_output
@@ -162,7 +162,7 @@ def reproduce(options: argparse.Namespace) -> int:
     """
     import tempfile
 
-    from toolkit.documents import to_text
+    from toolkit.files.documents import to_text
     from toolkit.report.differences import diff_document, differences
     from toolkit.report.export import unpack_bundle
     from toolkit.report.run_files import read_run

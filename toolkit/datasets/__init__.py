@@ -24,8 +24,8 @@ from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Trajectory
+from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
-from toolkit.inputs import open_input, unreadable
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence, check_stated
 from toolkit.settings import DEFAULTS, Frontend, Tracks

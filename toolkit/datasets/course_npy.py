@@ -21,6 +21,7 @@ from toolkit.datasets.io.image_pairs import facts_of, rig_of
 from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
 from toolkit.datasets.io.sparse import ArrayLayout, Named, corners_of, sightings, sparse_array
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend import (
     Camera,
     ImageRecording,
@@ -32,7 +33,6 @@ from toolkit.frontend import (
 )
 from toolkit.frontend.cache import ImageSpool
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_log
-from toolkit.inputs import is_regular, open_input
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.noise import pixel_covariance, twist_noise
 from toolkit.progress import SILENT, Progress

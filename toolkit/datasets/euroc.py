@@ -39,9 +39,9 @@ from toolkit.datasets.io.image_pairs import (
 from toolkit.datasets.io.tables import columns_of, read_stamps, read_table
 from toolkit.datasets.io.truth import stamps_within, truth_at, truth_near
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular
 from toolkit.frontend import ImageRecording, rectified, track_images
 from toolkit.geometry import Array
-from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuSamples
 from toolkit.progress import Progress
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig

@@ -25,9 +25,9 @@ from toolkit.datasets.io.image_pairs import (
 )
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import ImageRecording, RectifiedPair, already_rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3
-from toolkit.inputs import is_regular, read_text_input
 from toolkit.measured_motion import NoSamples
 from toolkit.models.noise import unmeasured_motion
 from toolkit.progress import SILENT, Progress

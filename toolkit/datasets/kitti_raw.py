@@ -30,9 +30,9 @@ from toolkit.datasets.io.image_pairs import (
     rig_of,
 )
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import Camera, ImageRecording, RectifiedPair, already_rectified, rectified, size_of, track_images
 from toolkit.geometry import Array, IntArray, se3, se3_inverse, so3_exp
-from toolkit.inputs import is_regular, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, NoSamples, TwistSamples
 from toolkit.models.noise import twist_noise, unmeasured_motion
 from toolkit.progress import SILENT, Progress

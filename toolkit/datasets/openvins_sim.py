@@ -21,8 +21,8 @@ from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
+from toolkit.files.reading import read_input, read_text_input
 from toolkit.geometry import IntArray, se3, se3_inverse
-from toolkit.inputs import read_input, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, Truth
 

@@ -20,8 +20,8 @@ from toolkit.datasets.io.tables import NANOSECONDS, SECONDS, Columns, columns_gi
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError, did_you_mean
+from toolkit.files.reading import is_regular, read_text_input
 from toolkit.geometry import Array, IntArray
-from toolkit.inputs import is_regular, read_text_input
 from toolkit.measured_motion import ImuNoise, ImuSamples, MotionNoise, MotionSamples, TwistNoise, TwistSamples
 from toolkit.models.noise import TRACKED_PIXEL_SIGMA_PX, twist_noise
 from toolkit.sequence import GRAVITY_WORLD, ONE_ROW_FOR_BOTH, Observations, Provenance, Sequence, StereoRig, Truth

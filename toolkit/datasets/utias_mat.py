@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations, rigid, stamps_ns
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, open_input, read_input
 from toolkit.geometry import Array, IntArray, se3, so3_exp
-from toolkit.inputs import is_regular, open_input, read_input
 from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.models.noise import GYRO_RANDOM_WALK, pixel_covariance, twist_noise, white_sigma
 from toolkit.resampling import NS_PER_S

@@ -15,9 +15,9 @@ import numpy as np
 from toolkit.datasets.io.fields import check_numeric
 from toolkit.datasets.io.npz_archive import opened
 from toolkit.errors import DataError
-from toolkit.files import check_replaceable, replaced_directory
+from toolkit.files.reading import is_regular, open_input, read_text_input
+from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array
-from toolkit.inputs import is_regular, open_input, read_text_input
 from toolkit.measured_motion import (
     ImuNoise,
     ImuSamples,

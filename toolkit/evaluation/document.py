@@ -12,13 +12,13 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit import documents
-from toolkit.documents import Count, Value, of_attributes
 from toolkit.errors import DataError
 from toolkit.estimate import Status
 from toolkit.evaluation.scoring import METRICS
 from toolkit.evaluation.standings import Cell, EvaluatedRun, EvaluatedSystems, PairedTest, Standing
 from toolkit.experiment.statistics import QuantilesOfAll
+from toolkit.files import documents
+from toolkit.files.documents import Count, Value, of_attributes
 from toolkit.gate.baseline import Values
 from toolkit.gate.trajectory_baseline import ScoredSequence
 from toolkit.gate.trajectory_files import Scoring
@@ -90,9 +90,9 @@ class OverRuns(Struct, frozen=True, kw_only=True):
 class StandingRecord(Struct, frozen=True, kw_only=True):
     """A system over all sequences, best first."""
 
-    estimator: str
-    mean_rank: float
-    wins: Count
+    estimator: Annotated[str, Meta(description="the system's name")]
+    mean_rank: Annotated[float, Meta(description="over the sequences, by the median over the runs; 1 is the best")]
+    wins: Annotated[Count, Meta(description="sequences on which every other system is worse")]
     sequences: Count
     solved: Annotated[Count, Meta(description="sequences with a median over the runs")]
     runs: Count
@@ -103,9 +103,9 @@ class StandingRecord(Struct, frozen=True, kw_only=True):
 class PairedRecord(Struct, frozen=True, kw_only=True):
     """Two systems, paired over the sequences."""
 
-    estimator: str
+    estimator: Annotated[str, Meta(description="the first system's name")]
     other: str
-    better: Count
+    better: Annotated[Count, Meta(description="sequences on which the first is better")]
     worse: Count
     tied: Count
     median_ratio: Annotated[float | None, Meta(description="first to second; null where failures decide it")]
@@ -183,29 +183,12 @@ def _quartiles(found: QuantilesOfAll | None) -> Quartiles | None:
 
 
 def _standing(standing: Standing) -> StandingRecord:
-    return StandingRecord(
-        estimator=standing.system,
-        mean_rank=standing.mean_rank,
-        wins=standing.wins,
-        sequences=standing.sequences,
-        solved=standing.solved,
-        runs=standing.runs,
-        ok=standing.ok,
-        metrics={key: _quartiles(found) for key, found in standing.quantiles.items()},
-    )
+    metrics = {key: _quartiles(found) for key, found in standing.quantiles.items()}
+    return of_attributes(StandingRecord, standing, estimator=standing.system, metrics=metrics)
 
 
 def _paired(test: PairedTest) -> PairedRecord:
-    return PairedRecord(
-        estimator=test.system,
-        other=test.other,
-        better=test.better,
-        worse=test.worse,
-        tied=test.tied,
-        median_ratio=test.median_ratio,
-        p=test.p,
-        p_holm=test.p_holm,
-    )
+    return of_attributes(PairedRecord, test, estimator=test.system)
 
 
 def read_evaluation(path: Path) -> EvaluationRecord:

@@ -33,16 +33,16 @@ from toolkit.errors import DataError
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Poses, matched_poses, time_coverage_percent
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, se3_inverse, so3_log
 from toolkit.metrics import Metric, Scores, Unavailable, ate, clock_offset, coverage, drift, kitti, nees, rpe
-from toolkit.metrics._shared.alignment import place_pose, place_yaw
-from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
-from toolkit.metrics._shared.consistency import (
+from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, distance_along, median_period_ns, poses_at
+from toolkit.metrics.parts.consistency import (
     NOT_MET,
     NOT_PLACED,
     OTHER_WORLD,
     PLACED,
     chi2_quantile,
 )
-from toolkit.metrics._shared.evaluation import AgainstTruth, PairsAgainstTruth
+from toolkit.metrics.parts.evaluation import AgainstTruth, PairsAgainstTruth
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.resampling import NS_PER_S
 

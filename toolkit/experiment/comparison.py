@@ -30,9 +30,9 @@ import numpy as np
 from toolkit.experiment.statistics import MeanNees, QuantilesOfAll, Spread, mean_nees, quantiles_of_all, spread_of
 from toolkit.experiment.units import OUTPUTS, Outcome, Scored
 from toolkit.metrics import Metric, Scores, describe
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
 from toolkit.metrics.correction_trend import LIMIT, TREND
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 from toolkit.settings import DEFAULTS, Settings
 
 if TYPE_CHECKING:

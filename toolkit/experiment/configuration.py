@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean
-from toolkit.inputs import read_text_input
+from toolkit.files.documents import in_words
+from toolkit.files.reading import read_text_input
 from toolkit.settings import Settings, SettingsError, read_toml, settings_of
 
 # The table of a configuration that says what to compare; all others are settings.

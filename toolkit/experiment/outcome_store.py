@@ -21,9 +21,9 @@ from toolkit.estimate import Arithmetic, Output, Status
 from toolkit.experiment.code_version import code_digest, numeric_versions
 from toolkit.experiment.comparison import plain_name
 from toolkit.experiment.units import Outcome, Scored, Unit
-from toolkit.files import LineFile, whole_lines
+from toolkit.files.reading import read_input
+from toolkit.files.writing import LineFile, whole_lines
 from toolkit.geometry import Array
-from toolkit.inputs import read_input
 from toolkit.metrics import Scores, repeated, without_requests
 from toolkit.settings import Settings, as_values
 

@@ -15,13 +15,13 @@ from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
 from toolkit.errors import DataError
 from toolkit.initialization import start_from_measurements, start_from_truth
-from toolkit.linear_algebra import on_one_thread
 from toolkit.models.moving_tracks import without_moving_tracks
 from toolkit.progress import SILENT, Progress
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Prior, Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
+from toolkit.threads import on_one_thread
 from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, in_words
 from toolkit.track_noise import TrackNoise
 

@@ -17,7 +17,7 @@ from toolkit.datasets.trajectories.poses import PosesFile, check_order
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.experiment.comparison import plain_name
-from toolkit.metrics._shared.association import associate, median_period_ns, poses_at
+from toolkit.metrics.parts.association import associate, median_period_ns, poses_at
 from toolkit.sequence import Sequence
 
 _OTHER_TERMS = (

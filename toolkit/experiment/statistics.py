@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
-from toolkit.metrics._shared.scores import Best
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
+from toolkit.metrics.parts.scores import Best
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from toolkit.estimator import Build, find
 from toolkit.experiment.recording import Prepared, Recording, prepare_once
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import Evaluation, Scores, repeated, score_run
-from toolkit.metrics._shared.consistency import body_errors, nees_over_time, nis_over_time
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.consistency import body_errors, nees_over_time, nis_over_time
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.progress import Progress
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings

@@ -29,8 +29,8 @@ from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
 from toolkit.errors import SystemLimitError
-from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress
+from toolkit.threads import THREAD_VARIABLES
 
 T = TypeVar("T")
 R = TypeVar("R")

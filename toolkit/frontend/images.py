@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.errors import DataError
+from toolkit.files.reading import read_input
 from toolkit.frontend.cameras import Image
-from toolkit.inputs import read_input
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _LFS_POINTER = b"version https://git-lfs"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.errors import DataError, OutputError
-from toolkit.files import replaced_directory
+from toolkit.files.writing import replaced_directory
 from toolkit.frontend.cameras import Image
 from toolkit.frontend.images import Unusable
 from toolkit.frontend.tracking import ImageRecording, ImageTracks, read_pairs

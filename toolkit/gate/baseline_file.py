@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 
-from toolkit import documents
 from toolkit.estimate import ArithmeticOfRuns, Output, Status
+from toolkit.files import documents
 from toolkit.gate.baseline import (
     Baseline,
     BaselineError,

@@ -31,9 +31,9 @@ from toolkit.gate.measuring import recordings_of
 from toolkit.gate.significance import POWER, holm
 from toolkit.gate.verdict import Finding, Verdict
 from toolkit.geometry import Array
-from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import Progress, ProgressFor
 from toolkit.settings import changes_of
+from toolkit.threads import THREAD_VARIABLES
 
 # Slower by 5 % is accepted; slower by 15 % must be found.
 MARGIN, TO_SEE = 0.05, 0.15

@@ -24,7 +24,7 @@ from scipy.special import stdtr, stdtrit
 from toolkit.gate.baseline import Criterion
 from toolkit.gate.verdict import FAILURES, Finding, Verdict
 from toolkit.geometry import Array
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band
 
 POWER = 0.95
 # Its mean over runs scatters by chance; a NIS is a mean over so many innovations that it does not.

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, to_builtins
 
-from toolkit import documents
+from toolkit.files import documents
 from toolkit.gate.baseline import FALSE_ALARM_RATE, BaselineError, Values
 from toolkit.gate.baseline_file import MetricValues, Percent, json_text
 from toolkit.gate.trajectory_files import TIME_COVERAGE, Align, Scoring

@@ -5,7 +5,7 @@ say of it), ``ORDER`` (where it stands among other files) and ``score(evaluation
 its metrics belong to the causal output alone, where they do. ``GROUP`` is a name that stands for all of them where a
 table's columns are asked for. ``ON_REQUEST`` names the setting ``metrics.<name>`` without which metrics that take long
 are not computed.
-Read :mod:`toolkit.metrics._shared.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
+Read :mod:`toolkit.metrics.parts.evaluation`, then ``ate``, then the others; docs/metrics.md defines each number.
 
 A package of another distribution is found where it is announced under the entry-point group ``toolkit.metrics``.
 """
@@ -19,8 +19,8 @@ import numpy as np
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import VislamError, did_you_mean
 from toolkit.estimate import Output, Run
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 from toolkit.sequence import Sequence
 
 __all__ = [

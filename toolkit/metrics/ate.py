@@ -3,11 +3,11 @@
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics._shared.alignment import Alignment, fit_sim3, fit_yaw
-from toolkit.metrics._shared.association import Matched
-from toolkit.metrics._shared.evaluation import AgainstTruth
-from toolkit.metrics._shared.residuals import angles_deg, lengths, rmse
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.alignment import Alignment, fit_sim3, fit_yaw
+from toolkit.metrics.parts.association import Matched
+from toolkit.metrics.parts.evaluation import AgainstTruth
+from toolkit.metrics.parts.residuals import angles_deg, lengths, rmse
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 10
 METRICS = (

@@ -1,7 +1,7 @@
 """How close to the limit: the Cramér-Rao bound of the recording, and what the estimator loses against it.
 
 Van Trees, "Detection, estimation and modulation theory", part I (1968), section 2.4; how bound and efficient estimate
-are computed is in :mod:`toolkit.metrics._shared.cramer_rao`. The error of an unbiased estimator is that of the
+are computed is in :mod:`toolkit.metrics.parts.cramer_rao`. The error of an unbiased estimator is that of the
 efficient one on the same measurements and a part ``d`` that is not correlated with it, so its covariance is the bound P
 and that of d. The raw error of one run shows mostly the draw of noise that both share, that of the start above all.
 
@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics._shared.consistency import body_errors, stated_errors
-from toolkit.metrics._shared.cramer_rao import claimed_bound, efficient
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
-from toolkit.metrics._shared.state_errors import NO_SUCH_BLOCK, state_errors
+from toolkit.metrics.parts.consistency import body_errors, stated_errors
+from toolkit.metrics.parts.cramer_rao import claimed_bound, efficient
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.state_errors import NO_SUCH_BLOCK, state_errors
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.motion import motion_model
 from toolkit.models.state import POSE, POSITION, ROTATION, Layout

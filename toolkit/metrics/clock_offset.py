@@ -12,10 +12,10 @@ import numpy as np
 
 from toolkit.geometry import Array, BoolArray, skew
 from toolkit.jackknife import STRETCHES, jackknife_error
-from toolkit.metrics._shared.alignment import fit_se3
-from toolkit.metrics._shared.evaluation import AgainstTruth
-from toolkit.metrics._shared.residuals import lengths, rmse
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.alignment import fit_se3
+from toolkit.metrics.parts.evaluation import AgainstTruth
+from toolkit.metrics.parts.residuals import lengths, rmse
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.resampling import NS_PER_S
 
 ORDER = 45

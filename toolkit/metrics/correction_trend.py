@@ -16,8 +16,8 @@ from scipy.special import chdtri
 
 from toolkit.estimate import Trajectory
 from toolkit.geometry import Array
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models.corrections import Correction, CorrectionTest
 from toolkit.models.predicted_steps import PredictedStep, predicted_steps
 from toolkit.models.state import Belief

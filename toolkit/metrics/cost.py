@@ -4,8 +4,8 @@ import numpy as np
 
 from toolkit.estimate import Timings
 from toolkit.geometry import Array
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 90
 METRICS = (

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 80
 METRICS = (

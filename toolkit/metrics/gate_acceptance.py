@@ -6,9 +6,9 @@ not remain. Of a consistent estimator without outliers the gate accepts its own 
 
 import numpy as np
 
-from toolkit.metrics._shared.consistency import INNOVATIONS_ARE_CAUSAL
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.consistency import INNOVATIONS_ARE_CAUSAL
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
 
 ORDER = 72
 CAUSAL_ONLY = INNOVATIONS_ARE_CAUSAL

@@ -4,10 +4,10 @@ Needs no ground truth, and overfitting does not lower it: the points come from t
 """
 
 from toolkit.geometry import Array
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS
-from toolkit.metrics._shared.residuals import pixel_metrics, pixel_scores
-from toolkit.metrics._shared.scores import Scores, Unavailable
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.leave_one_out import FEWEST_VIEWS
+from toolkit.metrics.parts.residuals import pixel_metrics, pixel_scores
+from toolkit.metrics.parts.scores import Scores, Unavailable
 
 ORDER = 60
 METRICS = pixel_metrics(

@@ -12,9 +12,9 @@ import numpy as np
 
 from toolkit.estimate import Landmarks, Run, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.leave_one_out import FEWEST_VIEWS, errors_left_out
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.leave_one_out import FEWEST_VIEWS, errors_left_out
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models.motion import belief_at, integrated, motion_model
 from toolkit.sequence import Sequence
 

@@ -4,9 +4,9 @@ import numpy as np
 
 from toolkit.arrays import rows_of
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, transform
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.residuals import pixel_metrics, pixel_scores, reprojection_errors_px
-from toolkit.metrics._shared.scores import Scores, Unavailable
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.residuals import pixel_metrics, pixel_scores, reprojection_errors_px
+from toolkit.metrics.parts.scores import Scores, Unavailable
 from toolkit.models import stereo
 
 ORDER = 50

@@ -8,9 +8,9 @@ and their errors are divided by the nominal length; the mean is over all segment
 import numpy as np
 
 from toolkit.geometry import Array
-from toolkit.metrics._shared.evaluation import AgainstTruth
-from toolkit.metrics._shared.residuals import angles_deg, lengths, relative_errors
-from toolkit.metrics._shared.scores import Metric, Scores, Unavailable
+from toolkit.metrics.parts.evaluation import AgainstTruth
+from toolkit.metrics.parts.residuals import angles_deg, lengths, relative_errors
+from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 
 ORDER = 30
 METRICS = (

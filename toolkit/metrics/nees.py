@@ -5,9 +5,9 @@ Bar-Shalom, Li and Kirubarajan, "Estimation with applications to tracking and na
 
 import numpy as np
 
-from toolkit.metrics._shared.consistency import PLACED, POSE_DOF, nees_band, nees_over_time
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores
+from toolkit.metrics.parts.consistency import PLACED, POSE_DOF, nees_band, nees_over_time
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores
 
 ORDER = 75
 METRICS = (

@@ -5,9 +5,9 @@ An innovation that a chi-square gate lets through is a truncated variable: its s
 (:func:`toolkit.models.gating.mean_below_bound`), where the estimator reports it, and else by the degrees of freedom.
 """
 
-from toolkit.metrics._shared.consistency import INNOVATIONS_ARE_CAUSAL, nis_over_time
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Metric, Scores, evaluate
+from toolkit.metrics.parts.consistency import INNOVATIONS_ARE_CAUSAL, nis_over_time
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Metric, Scores, evaluate
 
 ORDER = 70
 CAUSAL_ONLY = INNOVATIONS_ARE_CAUSAL

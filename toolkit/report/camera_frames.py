@@ -10,16 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.datasets import tracked_images
-from toolkit.documents import numbers
 from toolkit.errors import DataError
 from toolkit.experiment.comparison import Comparison, Row
+from toolkit.files.documents import numbers
 from toolkit.frontend import ImageRecording
 from toolkit.frontend.cameras import Image
 from toolkit.frontend.images import Unusable
 from toolkit.frontend.tracking import read_pairs
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.leave_one_out import errors_left_out
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.leave_one_out import errors_left_out
 from toolkit.report.curves import seconds
 from toolkit.report.records.report import CameraFrame, TrackErrors
 from toolkit.sequence import Sequence

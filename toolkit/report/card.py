@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import UNSET
 
-from toolkit.documents import number, rounded
+from toolkit.files.documents import number, rounded
 from toolkit.geometry import Array
-from toolkit.report.header import sequence_line
+from toolkit.report.comparison_table import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.records.report import CardRecord
 from toolkit.report.table import MISSING, Table, as_text

@@ -9,7 +9,7 @@ from toolkit.audit import Audit, Finding
 from toolkit.errors import printable
 from toolkit.experiment.comparison import Comparison
 from toolkit.report.card import card_lines
-from toolkit.report.header import header_lines, sequence_line
+from toolkit.report.comparison_table import Columns, comparison_table, explained_metrics, header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
     finding_lines,
@@ -20,7 +20,7 @@ from toolkit.report.messages import (
     undecided_lines,
 )
 from toolkit.report.prose import WIDTH, Width, filled, in_markdown, markdown_section, section
-from toolkit.report.table import Columns, Table, as_markdown, as_text, comparison_table, explained_metrics
+from toolkit.report.table import Table, as_markdown, as_text
 
 _READ_BEFORE = """\
 Causal and held-out are said of what an estimator is given. Before its first packet, the same for all: with raw IMU

@@ -14,10 +14,10 @@ from toolkit.estimate import Output, Run, Trajectory
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.geometry import Array, IntArray, se3_inverse, so3_log, yaw_of
 from toolkit.metrics import Evaluation
-from toolkit.metrics._shared.alignment import Alignment, fit_se3, fit_yaw
-from toolkit.metrics._shared.association import associate, finite_poses, median_period_ns
-from toolkit.metrics._shared.consistency import POSE_DOF, body_errors
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.alignment import Alignment, fit_se3, fit_yaw
+from toolkit.metrics.parts.association import associate, finite_poses, median_period_ns
+from toolkit.metrics.parts.consistency import POSE_DOF, body_errors
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.sequence import Sequence, Truth
 

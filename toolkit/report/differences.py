@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, to_builtins
 
-from toolkit.documents import of_attributes
 from toolkit.estimate import Status
+from toolkit.files.documents import of_attributes
 from toolkit.gate.baseline import FALSE_ALARM_RATE, Criterion
 from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, Where, holm, moved_p
 from toolkit.geometry import Array

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from toolkit.documents import to_text
 from toolkit.errors import DataError
 from toolkit.evaluation.document import evaluation_document, read_evaluation
 from toolkit.evaluation.standings import EvaluatedSystems
-from toolkit.files import check_replaceable, replaced_directory
+from toolkit.files.documents import to_text
+from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.report.evaluation_text import evaluation_csv, evaluation_markdown
 from toolkit.report.html.leaderboard import leaderboard_page
 

@@ -14,13 +14,13 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct
 
-from toolkit import documents
 from toolkit.datasets.trajectories import FORMATS, tum
 from toolkit.errors import DataError, did_you_mean
 from toolkit.estimate import Output, Trajectory
 from toolkit.experiment.outcome_store import OUTCOMES
-from toolkit.files import replaced_file, write_text
-from toolkit.inputs import open_input
+from toolkit.files import documents
+from toolkit.files.reading import open_input
+from toolkit.files.writing import replaced_file, write_text
 from toolkit.report.records import Report
 from toolkit.report.run_directory import MANIFEST
 from toolkit.report.run_files import RunFiles, SeedsFiles, read_run

@@ -3,21 +3,19 @@
 And the files it leaves behind, each only where it is asked for: JUnit XML, Markdown and JSON.
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from itertools import groupby, zip_longest
 from pathlib import Path
 from xml.etree import ElementTree
 
-from toolkit.documents import of_attributes, to_text
 from toolkit.errors import printable
-from toolkit.files import write_text
+from toolkit.files.documents import to_text
+from toolkit.files.writing import write_text
 from toolkit.gate.judging import SHOWN
-from toolkit.gate.verdict import Check, Finding, Verdict
+from toolkit.gate.verdict import Check, Finding, Verdict, check_document
 from toolkit.metrics import known_metrics
 from toolkit.report.prose import WIDTH, Width, section
-from toolkit.report.records.check import CheckDocument, VerdictRecord
 from toolkit.report.table import MISSING, Table, as_markdown, as_text, number
 
 _FAILED: Mapping[Finding, str] = {
@@ -179,27 +177,6 @@ def gate_markdown(check: Check) -> str:
 
 def _sentence(text: str) -> str:
     return text[0].upper() + text[1:] + "."
-
-
-def check_document(check: Check) -> CheckDocument:
-    """Return a check as a record; what is not finite is null, and the words of the verdict say it."""
-    return CheckDocument(
-        schema="vislam.check/2",
-        baseline=check.baseline,
-        passed=check.passed,
-        failures=len(check.failures),
-        false_alarm_rate=check.false_alarm_rate,
-        tests=check.tests,
-        releases=dict(check.releases),
-        seconds=check.seconds,
-        accept_better=check.accept_better,
-        notes=check.notes,
-        verdicts=tuple(of_attributes(VerdictRecord, verdict, _finite) for verdict in check.verdicts),
-    )
-
-
-def _finite(value: object) -> object:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def gate_junit(check: Check) -> str:

@@ -19,9 +19,9 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.units import arithmetic_of
 from toolkit.experiment.workers import usable_cpus
-from toolkit.linear_algebra import THREAD_VARIABLES
-from toolkit.report.records.manifest import Manifest, Recording, SeedsUsed
+from toolkit.report.records.manifest import Manifest, RecordingRecord, SeedsUsed
 from toolkit.sequence import Sequence
+from toolkit.threads import THREAD_VARIABLES
 
 _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "matplotlib"}
 _THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")
@@ -83,8 +83,8 @@ def _threads(comparison: Comparison) -> dict[str, int | str | None]:
     return {"cpus": usable_cpus(), "workers": comparison.workers, "per_worker": 1, **variables}
 
 
-def _recording(sequence: Sequence) -> Recording:
-    return Recording(
+def _recording(sequence: Sequence) -> RecordingRecord:
+    return RecordingRecord(
         name=sequence.name,
         hash=sequence.content_hash(),
         format=sequence.provenance.format,

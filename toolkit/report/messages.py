@@ -12,7 +12,8 @@ from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
 from toolkit.metrics.gate_acceptance import ACCEPTED, refuses_much
 from toolkit.metrics.held_out_over_motion import RATIO
-from toolkit.report.table import Columns, cell, explained_metrics, number, shown_metrics
+from toolkit.report.comparison_table import Columns, explained_metrics, shown_metrics
+from toolkit.report.table import cell, number
 
 # A consistent estimator is in its band at 95 % of the frames on average; a share below this is remarked on.
 _MOSTLY_PERCENT = 80.0

@@ -6,14 +6,15 @@ from typing import TypeVar
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from toolkit.documents import number, numbers, rounded
 from toolkit.estimate import Output, Run
 from toolkit.experiment.comparison import Comparison, Row, plain_name
+from toolkit.files.documents import number, numbers, rounded
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.card import card_record
+from toolkit.report.comparison_table import header_lines, sequence_line
 from toolkit.report.curves import (
     ErrorCurves,
     Errors,
@@ -25,7 +26,6 @@ from toolkit.report.curves import (
     shown_output,
     truth_during,
 )
-from toolkit.report.header import header_lines, sequence_line
 from toolkit.report.messages import (
     consistency_lines,
     note_lines,

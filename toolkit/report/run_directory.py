@@ -10,14 +10,14 @@ import msgspec
 from msgspec import UNSET
 
 from toolkit.datasets.trajectories import tum
-from toolkit.documents import to_line, to_text
 from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Trajectory
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.experiment.configuration import Configuration
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
 from toolkit.experiment.pipeline import PreparedCase
-from toolkit.files import check_parent, check_replaceable, replaced_directory
+from toolkit.files.documents import to_line, to_text
+from toolkit.files.writing import check_parent, check_replaceable, replaced_directory
 from toolkit.report import report_json
 from toolkit.report.camera_frames import camera_frames
 from toolkit.report.comparison_text import report_text

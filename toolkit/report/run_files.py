@@ -13,8 +13,8 @@ from msgspec import UNSET
 from toolkit.errors import DataError
 from toolkit.estimate import Output
 from toolkit.experiment.outcome_store import OUTCOMES, files_of_ours
+from toolkit.files.reading import read_input
 from toolkit.geometry import Array
-from toolkit.inputs import read_input
 from toolkit.report.records import (
     Manifest,
     Metrics,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import msgspec
 
-from toolkit.documents import schema
 from toolkit.evaluation.document import EvaluationRecord
+from toolkit.files.documents import schema
 from toolkit.gate.baseline_file import BaselineRecord
 from toolkit.gate.trajectory_baseline import TrajectoryBaselineRecord
 from toolkit.report.differences import DiffRecord

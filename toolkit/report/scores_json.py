@@ -6,9 +6,9 @@ from dataclasses import asdict, fields
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from toolkit.documents import Value, of_attributes
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.experiment.statistics import Spread
+from toolkit.files.documents import Value, of_attributes
 from toolkit.metrics import Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
 from toolkit.report.records.scores import (

@@ -1,23 +1,16 @@
-"""Tables for a terminal and for Markdown, and the comparison of one sequence as such a table.
+"""Tables for a terminal, for Markdown and for LaTeX, and a metric's heading and value as they stand in one.
 
-Which metrics have a column, under which heading and with how many decimals, is said by their own records in
-:mod:`toolkit.metrics`; tabulate renders the cells.
+Under which heading and with how many decimals is said by the metrics' own records; tabulate renders the cells.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
 
 from tabulate import SEPARATING_LINE, DataRow, Line, TableFormat, tabulate
 
 from toolkit.errors import printable
-from toolkit.metrics import Metric, known_metrics, metrics_called
+from toolkit.metrics import Metric
 from toolkit.report.prose import in_markdown
-
-if TYPE_CHECKING:
-    from toolkit.experiment.comparison import Comparison, Row
 
 MISSING = "-"
 _WIDEST_NUMBER = 5
@@ -38,15 +31,6 @@ _LATEX = {character: rf"\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
     "±": r"$\pm$",
 }
-# The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
-_BANDED = "nees_pose_mean"
-
-# What comes first in the table of a real drive: its drift, and the error that keeps the vertical. After an SE(3) fit
-# good estimators differ by luck there (one model solved twice differed by a metre). The drift says what the RPE would.
-_LEADING, _SAID_BY_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
-
-# The columns of a table: None for the usual ones, "all", or metrics by key or name.
-Columns = None | Literal["all"] | tuple[str, ...]
 
 
 class Table(NamedTuple):
@@ -63,125 +47,6 @@ class Table(NamedTuple):
     under: tuple[str, ...] = ()
     marks: tuple[str, ...] = ()
     best: frozenset[tuple[int, int]] = frozenset()
-
-
-class _Column(NamedTuple):
-    """Three lines of heading, and the cell of a row."""
-
-    heading: tuple[str, ...]
-    cell: Callable[[Row], str]
-
-
-def columns_asked(names: tuple[str, ...]) -> Columns:
-    """Return the columns that some names ask for: the usual ones where there are none, all for the one word "all".
-
-    Raises VislamError for a name that is no metric's.
-    """
-    if names == ("all",):
-        return "all"
-    metrics_called(names)
-    return names or None
-
-
-def comparison_table(comparison: Comparison, columns: Columns = None) -> Table:
-    """Return one row for each kind of output that differs from the others of its estimator.
-
-    Over seeds a cell is the mean over the runs that are ok. Under the table of a ladder stands what each estimator
-    changes. Raises VislamError for an unknown column.
-    """
-    ends = _ok_of(comparison) if comparison.over_seeds else _Column(("status", "", ""), lambda row: row.status)
-    chosen = (ends, *_metric_columns(comparison, columns))
-    rows = tuple((row.estimator, row.label, *(column.cell(row) for column in chosen)) for row in comparison.lines)
-    headings = (("estimator", "", ""), ("output", "", ""), *(column.heading for column in chosen))
-    under = change_lines((name, comparison.changes.get(name, "")) for name in comparison.estimators)
-    marks = tuple(row.mark for row in comparison.lines)
-    return Table(headings, rows, 2 if comparison.over_seeds else 3, tuple(under), marks)
-
-
-def _ok_of(comparison: Comparison) -> _Column:
-    """Return the column of how many runs ended well."""
-    return _Column(("ok", "of", str(len(comparison.seeds))), lambda row: str(row.counts["ok"]))
-
-
-def _metric_columns(comparison: Comparison, columns: Columns) -> Iterator[_Column]:
-    """Yield a column for each metric; over seeds also the spread of the first, and how long the NEES is in its band."""
-    for i, metric in enumerate(shown_metrics(comparison, columns)):
-        yield _Column(heading(metric), partial(_value, metric=metric))
-        if comparison.over_seeds and i == 0:
-            yield _Column((metric.heading[0], "std", metric.unit), partial(_std, metric=metric))
-        if comparison.over_seeds and metric.key == _BANDED:
-            yield _Column(("NEES", "band", "%"), _in_band)
-
-
-def _value(row: Row, metric: Metric) -> str:
-    return cell(row.value(metric.key), metric)
-
-
-def _std(row: Row, metric: Metric) -> str:
-    spread = row.spread(metric.key)
-    return cell(None if spread is None else spread.std, metric)
-
-
-def _in_band(row: Row) -> str:
-    nees = row.mean_nees
-    return MISSING if nees is None else number(nees.in_band_percent, 1)
-
-
-def shown_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
-    """Return the metrics that have a column; without any value a metric has one only if it is named.
-
-    Pairs and coverage, whose records say so, are a column where rows differ; else :func:`shared_values` has them.
-    """
-    if columns is not None and columns != "all":
-        return metrics_called(columns)
-    valued = [metric for metric in known_metrics() if any(v is not None for v in _values(comparison, metric))]
-    if columns == "all":
-        return tuple(valued)
-    if comparison.over_seeds:
-        return tuple(metric for metric in valued if metric.over_seeds)
-    differing = [m for m in valued if m.table == "where rows differ" and len(set(_values(comparison, m))) > 1]
-    usual = [metric for metric in valued if metric.table == "always"]
-    return (*differing, *(_for_a_drive(valued, usual) if _is_real(comparison) else usual))
-
-
-def _is_real(comparison: Comparison) -> bool:
-    return comparison.sequence.provenance.format != "simulated"
-
-
-def _for_a_drive(valued: Sequence[Metric], usual: Sequence[Metric]) -> Sequence[Metric]:
-    """Return the columns of a recording: those of a drive where it is long enough for the KITTI benchmark's drift."""
-    leading = [metric for key in _LEADING for metric in valued if metric.key == key]
-    if len(leading) < len(_LEADING):
-        return usual
-    return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SAID_BY_DRIFT))]
-
-
-def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
-    """Return the metrics whose missing values a reader of the table wants explained."""
-    if columns is None and comparison.over_seeds:
-        return tuple(metric for metric in known_metrics() if metric.over_seeds)
-    if columns is None:
-        shown = shown_metrics(comparison)
-        return tuple(metric for metric in known_metrics() if metric in shown or metric.table != "on request")
-    return known_metrics() if columns == "all" else metrics_called(columns)
-
-
-def shared_values(comparison: Comparison, columns: Columns = None) -> Iterator[str]:
-    """Yield, in words, pairs and coverage where they have no column: one value, or from the least to the most."""
-    shown = shown_metrics(comparison, columns)
-    for metric in known_metrics():
-        values = sorted({value for value in _values(comparison, metric) if value is not None})
-        if metric.table == "where rows differ" and metric not in shown and values:
-            ends = " to ".join(dict.fromkeys(cell(value, metric) for value in (values[0], values[-1])))
-            yield " ".join(filter(None, (metric.name, ends, metric.unit)))
-
-
-def change_lines(changes: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Yield a line for each estimator that changes something against the rung before, aligned; none off a ladder."""
-    given = [(name, change) for name, change in changes if change]
-    width = max((len(name) for name, _ in given), default=0)
-    for name, change in given:
-        yield f"{name:<{width}}  {change}"
 
 
 def heading(metric: Metric) -> tuple[str, str, str]:
@@ -280,7 +145,3 @@ def _with_mark(row: tuple[str, ...], mark: str) -> tuple[str, ...]:
 
 def _sides(table: Table) -> list[Literal["left", "right"]]:
     return ["left" if i < table.labels else "right" for i in range(len(table.headings))]
-
-
-def _values(comparison: Comparison, metric: Metric) -> list[float | None]:
-    return [row.value(metric.key) for row in comparison.lines]

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from toolkit.documents import of_attributes
+from toolkit.files.documents import of_attributes
 from toolkit.report.prose import WIDTH, Width, filled
 from toolkit.report.table import Table, as_text
 from toolkit.verify.verification import Result, Verification

@@ -11,9 +11,9 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 import msgspec
 from msgspec import Meta, Struct
 
-from toolkit.documents import in_words
 from toolkit.errors import DataError, did_you_mean, no_such
-from toolkit.inputs import read_text_input
+from toolkit.files.documents import in_words
+from toolkit.files.reading import read_text_input
 from toolkit.settings.records import POLICIES, Settings, SettingsError
 
 _POLICY = "outliers.policy"

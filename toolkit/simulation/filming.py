@@ -20,7 +20,7 @@ import numpy as np
 
 from toolkit.arrays import rows_of
 from toolkit.errors import OutputError
-from toolkit.files import check_replaceable, replaced_directory
+from toolkit.files.writing import check_replaceable, replaced_directory
 from toolkit.geometry import Array, quaternion_from_rotation, se3, se3_inverse, so3_exp, transform
 from toolkit.measured_motion import ImuNoise, ImuSamples
 from toolkit.models import stereo

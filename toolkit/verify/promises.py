@@ -12,7 +12,7 @@ import numpy as np
 from toolkit.estimate import Estimate, Finished, Run
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
-from toolkit.metrics._shared.consistency import POSE_DOF, chi2_quantile
+from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
 from toolkit.sequence import Packet, Sequence
 
 # Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.

@@ -13,7 +13,7 @@ from typing import cast
 from toolkit.discovery import shown_name
 from toolkit.errors import DataError, EstimatorError, no_such, printable
 from toolkit.estimator import Build, discover
-from toolkit.inputs import open_input
+from toolkit.files.reading import open_input
 
 _MODULE = re.compile(r"\w+(\.\w+)+")
 

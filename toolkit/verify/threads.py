@@ -13,9 +13,9 @@ from dataclasses import replace
 
 from toolkit import runner
 from toolkit.errors import EstimatorError
-from toolkit.linear_algebra import THREAD_VARIABLES
 from toolkit.progress import SILENT
 from toolkit.simulation import DRIVE, FLIGHT, simulate
+from toolkit.threads import THREAD_VARIABLES
 from toolkit.verify.promises import arrays_of
 from toolkit.verify.subject import subject_of
 

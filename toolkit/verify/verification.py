@@ -16,7 +16,7 @@ from toolkit.errors import EstimatorError
 from toolkit.estimator import Build
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.metrics import Evaluation, Unavailable
-from toolkit.metrics._shared.consistency import nees_over_time
+from toolkit.metrics.parts.consistency import nees_over_time
 from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, faults, simulate

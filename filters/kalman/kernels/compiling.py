@@ -28,15 +28,6 @@ from numba.core.typed_passes import (
 from numba.core.typing.context import Context
 from numba.core.untyped_passes import FixupArgs, GenericRewrites, IRProcessing, ReconstructSSA, TranslateByteCode
 
-Arrays = tuple[Any, ...]
-ROW, MATRIX, STACK = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
-MASK, COUNTS = types.boolean[:, ::1], types.int64[:, ::1]
-# Poses (W, 4, 4), poses to linearise at (W, 4, 4), covariance of their errors (6 W, 6 W).
-WINDOW = types.Tuple((STACK, STACK, MATRIX))
-# fx, fy, cx, cy px and baseline m (5,); T_imu_cam (1, 4, 4); whitener (3, 3); variances (3, 3) px^2 of white noise,
-# walk and offset, a channel a column, and the channels (3, 3), both (0, 3) where the noise of tracks is white.
-CAMERA = types.Tuple((ROW, STACK, MATRIX, MATRIX, MATRIX))
-
 # No fast mathematics: were sums taken in any order, what a process has compiled and what it has found on disk would
 # round another way. What is not called from Python needs no wrapper for it, which is half of the compilation.
 _OPTIONS = {"error_model": "numpy", "no_cfunc_wrapper": True}

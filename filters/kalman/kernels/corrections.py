@@ -11,19 +11,10 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import inverses, products, reflect_both_sides, solved_3
-from filters.kalman.kernels.compiling import (
-    CAMERA,
-    MASK,
-    MATRIX,
-    ROW,
-    STACK,
-    Arrays,
-    compiled,
-    kept,
-    what_was_compiled,
-)
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.rigid_motions import exponential, logarithm
 from filters.kalman.kernels.sightings import add_products, linearise, sighted
+from filters.kalman.kernels.signatures import CAMERA, MASK, MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
 
 # (uL, uR, v) (F, W, 3) px and which were seen (F, W); points (F, 3); poses (W, 4, 4); camera; how many sightings a

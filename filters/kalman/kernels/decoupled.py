@@ -11,9 +11,10 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import cholesky, inverses, moved, products, solve
-from filters.kalman.kernels.compiling import MATRIX, ROW, STACK, Arrays, compiled, kept, what_was_compiled
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.rigid_motions import exponential
 from filters.kalman.kernels.sightings import linearise
+from filters.kalman.kernels.signatures import MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, IntArray
 
 # fx, fy, cx, cy px and baseline m (5,), T_imu_cam (1, 4, 4), noise px^2 of sightings by both images and by the left

@@ -10,8 +10,9 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import clear, multiply, transpose
-from filters.kalman.kernels.compiling import MATRIX, ROW, STACK, Arrays, compiled, kept, what_was_compiled
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.rigid_motions import coefficients, skew
+from filters.kalman.kernels.signatures import MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array
 
 # Lengths s (n,) of steps, specific forces and turn rates (n, 3) in their middles. Variances (5,) of accelerometer,

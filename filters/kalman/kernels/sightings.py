@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from filters.kalman.kernels.algebra import cholesky, moved, solved_3
-from filters.kalman.kernels.compiling import Arrays, compiled
+from filters.kalman.kernels.compiling import compiled
+from filters.kalman.kernels.signatures import Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
 
 

@@ -23,18 +23,7 @@ from filters.kalman.kernels.algebra import (
     solved_3,
     transpose,
 )
-from filters.kalman.kernels.compiling import (
-    CAMERA,
-    COUNTS,
-    MASK,
-    ROW,
-    STACK,
-    WINDOW,
-    Arrays,
-    compiled,
-    kept,
-    what_was_compiled,
-)
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
@@ -47,6 +36,7 @@ from filters.kalman.kernels.sightings import (
     refine,
     sighted,
 )
+from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, ROW, STACK, WINDOW, Arrays
 from toolkit.geometry import Array, BoolArray, IntArray
 
 # Sightings: (uL, uR, v) (F, W, 3) px, which were seen (F, W), their ages (F, W). Then window and camera, rules as

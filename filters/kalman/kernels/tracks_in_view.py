@@ -7,7 +7,7 @@ is left on the poses, ``J^T J - B^T V B`` and ``J^T r - B^T V H_f^T r`` (Triggs,
 
 :func:`follow` finds the landmarks of the frame before. What is told takes two kernels, for between them BLAS takes the
 rows of all tracks at once to errors whose covariance is one: :func:`normals_of_tracks` forms B without the newest
-sightings, :func:`told_by_newest` tests and adds these.
+sightings, :func:`information_with_newest` tests and adds these.
 """
 
 import math
@@ -16,18 +16,7 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import inverses, products, solved_3
-from filters.kalman.kernels.compiling import (
-    CAMERA,
-    COUNTS,
-    MASK,
-    MATRIX,
-    ROW,
-    STACK,
-    Arrays,
-    compiled,
-    kept,
-    what_was_compiled,
-)
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.sightings import (
     add_products,
     decorrelate,
@@ -38,6 +27,7 @@ from filters.kalman.kernels.sightings import (
     sighted,
     step,
 )
+from filters.kalman.kernels.signatures import CAMERA, COUNTS, MASK, MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array, IntArray
 
 # Tracks: (uL, uR, v) (F, W, 3) px, which count (F, W), their ages (F, W), what for (F, W), points (F, 3). Then poses
@@ -166,10 +156,11 @@ def put_newest(f: int, where: IntArray, rows: Arrays, dense: bool, A_newest: Arr
 def normals_of_tracks(tracks: Arrays, window: Arrays, camera: Arrays, rules: Array) -> Arrays:
     """Return the normal equations of F tracks without their newest sightings, and the rows of these.
 
-    These are, for :func:`told_by_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]`` (F + 1,
-    10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the newest pose
-    or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, a block (W, 6, 6) a pose or
-    the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that a camera has behind it adds nothing.
+    These are, for :func:`information_with_newest`: points (F, 3); the least depth (F,) of each; ``[H_f r]^T [H_f r]``
+    (F + 1, 10) as ``solved_3`` takes it; B (3 F, 6 W); the newest rows, ``[H_f r]`` (3 F, 4) and J, (3 F, 6) to the
+    newest pose or, where the noise of tracks is correlated, (3 F, 6 W) to all; ``J^T J`` of the others, a block
+    (W, 6, 6) a pose or the whole (1, 6 W, 6 W), in its lower half; ``J^T r`` (6 W,). A track that a camera has behind
+    it adds nothing.
     """
     uvs_px, counted, ages, weights, points = tracks
     poses, poses_at = window
@@ -300,8 +291,8 @@ def blocks_times_root(D: Array, R: Array) -> Array:
 
 
 @kept(NEWEST_SIGNATURE)
-def told_by_newest(normals: Arrays, by_root: Arrays, rules: Array) -> Arrays:
-    """Gate the newest sightings of F tracks and finish what the tracks tell; see :data:`NEWEST_SIGNATURE`.
+def information_with_newest(normals: Arrays, by_root: Arrays, rules: Array) -> Arrays:
+    """Gate the newest sightings of F tracks and finish their information; see :data:`NEWEST_SIGNATURE`.
 
     Returns points (F, 3) after a step, what the newest sightings count for (F,), which tracks all their cameras have
     in front (F,), what the landmarks take of the vector, e (3 F,), and ``J^T J R`` (6 W, 6 W) of all sightings, whose

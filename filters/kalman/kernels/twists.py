@@ -4,8 +4,9 @@ import numpy as np
 from numba import types
 
 from filters.kalman.kernels.algebra import multiply, multiply_transposed, products
-from filters.kalman.kernels.compiling import MATRIX, ROW, STACK, Arrays, compiled, kept, what_was_compiled
+from filters.kalman.kernels.compiling import compiled, kept, what_was_compiled
 from filters.kalman.kernels.rigid_motions import adjoint_of_inverse, exponential, right_jacobian
+from filters.kalman.kernels.signatures import MATRIX, ROW, STACK, Arrays
 from toolkit.geometry import Array
 
 # Lengths s (n,) of twists, their turn rates and velocities (n, 3), what the noise of velocity and turn rate is

@@ -15,9 +15,9 @@ from toolkit.datasets.io.bag_reader import Bag, Held, Message, Topic
 from toolkit.datasets.io.bag_topics import Chosen
 from toolkit.datasets.io.euroc_calibration import kalibr_noise, read_calibration
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular
 from toolkit.frontend import RectifiedPair, already_rectified, rectified
 from toolkit.geometry import Array, se3
-from toolkit.inputs import is_regular
 from toolkit.measured_motion import MotionNoise, MotionSamples, TwistSamples
 from toolkit.models.noise import mems_imu, twist_noise
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from toolkit.errors import DataError, VislamError, printable
-from toolkit.inputs import is_regular, open_input
+from toolkit.files.reading import is_regular, open_input
 
 Kind = Literal["ros1", "mcap", "sqlite", "folder"]
 _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}

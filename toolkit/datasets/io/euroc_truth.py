@@ -16,8 +16,8 @@ from toolkit.datasets.io.truth import load_truth
 from toolkit.datasets.io.yaml_fields import read_fields
 from toolkit.datasets.trajectories.poses import checked_poses
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
-from toolkit.inputs import is_regular
 from toolkit.measured_motion import ImuSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Truth

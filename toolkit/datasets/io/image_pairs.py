@@ -12,9 +12,9 @@ import numpy as np
 from toolkit.datasets.io.fields import check_frame_count, probable_unit_of_ns
 from toolkit.datasets.io.tables import read_stamps
 from toolkit.errors import DataError
+from toolkit.files.reading import is_regular, read_text_input
 from toolkit.frontend import ImageTracks, RectifiedPair, StampedPair
 from toolkit.geometry import Array, IntArray
-from toolkit.inputs import is_regular, read_text_input
 from toolkit.models.noise import pixel_covariance
 from toolkit.sequence import StereoRig
 from toolkit.settings import Tracks

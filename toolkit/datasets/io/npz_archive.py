@@ -21,7 +21,7 @@ import numpy.typing as npt
 from toolkit.datasets.io.fields import Fields
 from toolkit.datasets.io.sparse import ArrayLayout, Named, SparseArray, sparse_array
 from toolkit.errors import DataError
-from toolkit.inputs import is_regular, open_input
+from toolkit.files.reading import is_regular, open_input
 
 # A dense array of a recording is far smaller: an hour of IMU samples at 1 kHz has 200 MB.
 _MOST_BYTES = 2 << 30

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from toolkit.errors import DataError, printable
-from toolkit.inputs import open_input
+from toolkit.files.reading import open_input
 
 MAGIC = b"\x93NUMPY"
 # Shorter byte strings are kept in memory.

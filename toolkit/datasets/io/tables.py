@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from toolkit.datasets.io.fields import probable_unit, probable_unit_of_ns, stamps_ns
 from toolkit.errors import DataError, nearest, printable
+from toolkit.files.reading import is_regular, open_input, read_input, read_text_input
 from toolkit.geometry import Array, IntArray
-from toolkit.inputs import is_regular, open_input, read_input, read_text_input
 from toolkit.resampling import NS_PER_S
 
 _LONGEST_LINE = 1 << 16

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError, printable
-from toolkit.inputs import is_regular, open_input
+from toolkit.files.reading import is_regular, open_input
 
 _ARCHIVES = {
     b"\x1f\x8b": "gzip",

@@ -13,7 +13,7 @@ import yaml
 
 from toolkit.datasets.io.fields import Fields
 from toolkit.errors import DataError
-from toolkit.inputs import read_text_input
+from toolkit.files.reading import read_text_input
 
 _DIALECT = "%YAML:"
 # A calibration of a rig of many cameras takes some thousand characters.

@@ -1,8 +1,9 @@
 """Trajectories in the files that other programs read and write: one module a format, its reader beside its writer.
 
 The formats are ``tum``, ``kitti``, ``euroc`` and ``openvins``, made of ``rows`` (lines as cells) and ``poses`` (what is
-read, and its checks); ``belonging`` checks that a file is of a recording. Poses are ``T_world_imu`` in all of them. A
-format is a :class:`TrajectoryFormat`; a file is recognised from its content, never from its name.
+read, and its checks); ``belonging`` checks that a file is of a recording, ``exchanged_axes`` that its axes are. Poses
+are ``T_world_imu`` in all of them. A format is a :class:`TrajectoryFormat`; a file is recognised from its content, not
+its name.
 """
 
 from collections.abc import Mapping

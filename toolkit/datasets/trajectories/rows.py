@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.errors import DataError
+from toolkit.files.reading import read_text_input
 from toolkit.geometry import Array, IntArray
-from toolkit.inputs import read_text_input
 from toolkit.resampling import NS_PER_S
 
 _LARGEST_NS = 2**63 - 1

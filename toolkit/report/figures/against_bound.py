@@ -15,13 +15,12 @@ from toolkit.report.figures.style import (
     TRUTH_COLOUR,
     Entry,
     NamedFigure,
-    colour_of,
     entries_of,
     legend_below,
     line_of,
-    line_of_estimator,
     new_figure,
     shown_as,
+    stroke_of,
     style_axes,
 )
 
@@ -72,11 +71,11 @@ def _figure(comparison: Comparison, found: list[tuple[Row, AgainstBound]]) -> Na
 def _plot_estimator(
     axes: Axes, comparison: Comparison, row: Row, one: AgainstBound, block: slice, scale: float
 ) -> None:
-    colour, t_s = colour_of(comparison, row.estimator), comparison.sequence.elapsed_s(one.t_ns)
-    line, label = line_of_estimator(comparison, row.estimator, shown_as(row)), f"{row.estimator} {row.label}"
+    t_s, label = comparison.sequence.elapsed_s(one.t_ns), f"{row.estimator} {row.label}"
+    stroke = stroke_of(comparison, row.estimator, shown_as(row))
     lost = np.linalg.norm(one.excess[:, block], axis=1)
-    axes.plot(t_s, scale * lost, color=colour, linestyle=line, linewidth=1.6, label=label)
-    axes.plot(t_s, scale * _sigma(one.stated, block), color=colour, linestyle=line, linewidth=_STATED_WIDTH)
+    axes.plot(t_s, scale * lost, linewidth=1.6, label=label, **stroke)
+    axes.plot(t_s, scale * _sigma(one.stated, block), linewidth=_STATED_WIDTH, **stroke)
 
 
 def _plot_bounds(

@@ -9,7 +9,7 @@ import numpy as np
 
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Evaluation, Unavailable
-from toolkit.metrics._shared.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
+from toolkit.metrics.parts.consistency import POSE_DOF, nees_band, nees_over_time, nis_over_time
 from toolkit.report.figures.panels import Drawn, Normalised, figure_with_bands
 from toolkit.report.figures.style import NamedFigure, shown_as
 

@@ -20,7 +20,7 @@ from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable, in_sample
-from toolkit.metrics._shared.residuals import rmse
+from toolkit.metrics.parts.residuals import rmse
 from toolkit.report.curves import alignment_words, errors_to, onto_truth, shown_output, truth_during
 from toolkit.report.figures.style import (
     LABEL_PT,

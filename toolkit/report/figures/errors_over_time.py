@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row, plain_name
 from toolkit.geometry import Array
-from toolkit.metrics._shared.residuals import rmse
+from toolkit.metrics.parts.residuals import rmse
 from toolkit.models.state import POSITION, ROTATION
 from toolkit.report.curves import Components, ErrorCurves, Errors, components, error_curves, reference_estimate
 from toolkit.report.figures.panels import COLOUR_OF, scale_by_decades
@@ -22,12 +22,11 @@ from toolkit.report.figures.style import (
     ZERO_COLOUR,
     Entry,
     NamedFigure,
-    colour_of,
     entries_of,
     legend_below,
     line_of,
-    line_of_estimator,
     new_figure,
+    stroke_of,
     style_axes,
     width_of,
 )
@@ -57,12 +56,9 @@ def _figure(comparison: Comparison, curves: ErrorCurves) -> NamedFigure:
     position, heading = figure.subplots(2, 1, sharex=True)
     for row, errors in curves.of_rows:
         t_s, width = comparison.sequence.elapsed_s(errors.t_ns), width_of(comparison, row.estimator)
-        look = {
-            "color": colour_of(comparison, row.estimator),
-            "linestyle": line_of_estimator(comparison, row.estimator, row.output),
-        }
-        position.plot(t_s, errors.position_m, linewidth=width, **look)
-        heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **look)
+        stroke = stroke_of(comparison, row.estimator, row.output)
+        position.plot(t_s, errors.position_m, linewidth=width, **stroke)
+        heading.plot(t_s, _without_wraps(errors.heading_deg), linewidth=width, **stroke)
     style_axes(position, f"{comparison.name}: position {curves.what}", "", "position [m]")
     style_axes(heading, f"heading {curves.what}", "time [s]", "heading [deg]")
     _limit_position(position, curves.of_rows)

@@ -10,10 +10,9 @@ from toolkit.report.curves import running_median
 from toolkit.report.figures.style import (
     Entry,
     NamedFigure,
-    colour_of,
     legend_below,
-    line_of_estimator,
     new_figure,
+    stroke_of,
     style_axes,
     width_of,
 )
@@ -31,16 +30,13 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
     entries = []
     for run, timings in timed:
         step_ms = np.maximum(timings.step_s * _MS, 1e-4)
-        colour = colour_of(comparison, run.estimator)
-        axes.plot(step_ms, ".", color=colour, markersize=2.5, alpha=0.35)
+        stroke = stroke_of(comparison, run.estimator, "final")
+        axes.plot(step_ms, ".", color=stroke["color"], markersize=2.5, alpha=0.35)
         cpu_ms = _MS * timings.cpu_s / timings.step_s.size
         told = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
         if timings.finish_s > timings.step_s.sum():
             told += f", end {timings.finish_s:.1f} s"
-        line = line_of_estimator(comparison, run.estimator, "final")
-        (median,) = axes.plot(
-            running_median(step_ms), color=colour, linestyle=line, linewidth=width_of(comparison, run.estimator)
-        )
+        (median,) = axes.plot(running_median(step_ms), linewidth=width_of(comparison, run.estimator), **stroke)
         entries.append(Entry(told, (median,)))
     axes.set_yscale("log")
     low, high = axes.get_ylim()

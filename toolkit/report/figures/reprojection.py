@@ -13,8 +13,8 @@ from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, held_out, in_sample
-from toolkit.metrics._shared.residuals import CAP_PX
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.residuals import CAP_PX
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.report.curves import shown_output
 from toolkit.report.figures.panels import annotate, finish, panels_of
 from toolkit.report.figures.style import MUTED_COLOUR, Entry, NamedFigure, colour_of

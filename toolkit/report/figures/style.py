@@ -4,7 +4,7 @@ Figures are as wide as two columns of a paper and are to be set at that width: l
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, TypedDict
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -53,14 +53,22 @@ def line_of(output: Output) -> Dashes:
     return _LINE_OF[output][0]
 
 
-def line_of_estimator(comparison: Comparison, estimator: str, output: Output) -> Dashes:
-    """Return the line style of one kind of output of an estimator: other dashes where its colour is another's too.
+class Stroke(TypedDict):
+    """How a line is drawn, as matplotlib's arguments."""
+
+    color: str
+    linestyle: Dashes
+
+
+def stroke_of(comparison: Comparison, estimator: str, output: Output) -> Stroke:
+    """Return colour and dashes of one kind of output of an estimator: other dashes where its colour is another's too.
 
     Both outputs keep the estimator's colour, so that twice as many estimators as there are colours are told apart.
     """
     order = [run.estimator for run in comparison.runs]
     styles = _LINE_OF[output]
-    return styles[order.index(estimator) // len(_COLOURS) % len(styles)]
+    dashes = styles[order.index(estimator) // len(_COLOURS) % len(styles)]
+    return Stroke(color=colour_of(comparison, estimator), linestyle=dashes)
 
 
 def shown_as(row: Row) -> Output:
@@ -116,8 +124,7 @@ def entries_of(comparison: Comparison, drawn: Iterable[tuple[str, Output]]) -> l
 
 
 def _sample(comparison: Comparison, name: str, output: Output) -> Line2D:
-    dashes = line_of_estimator(comparison, name, output)
-    return Line2D([], [], color=colour_of(comparison, name), linestyle=dashes, linewidth=1.8)
+    return Line2D([], [], linewidth=1.8, **stroke_of(comparison, name, output))
 
 
 def legend(owner: Figure | Axes, entries: Sequence[Entry], columns: int = 0, **place: Any) -> Legend:

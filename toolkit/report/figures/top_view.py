@@ -23,8 +23,8 @@ from toolkit.report.figures.style import (
     NamedFigure,
     colour_of,
     legend,
-    line_of_estimator,
     new_figure,
+    stroke_of,
     style_axes,
     width_of,
 )
@@ -232,8 +232,8 @@ def _entries(
     """Return the legend's entries: the truth, the estimators in their order, whose landmarks there are."""
     entries = [] if truth is None else [Entry.of_line("truth", TRUTH_COLOUR, width=_TRUTH_WIDTH)]
     for name, run in runs.items():
-        line = line_of_estimator(comparison, name, shown_output(run))
-        entries.append(Entry.of_line(f"{name}{_trouble(run)}", colour_of(comparison, name), line, 1.8))
+        line = Line2D([], [], linewidth=1.8, **stroke_of(comparison, name, shown_output(run)))
+        entries.append(Entry(f"{name}{_trouble(run)}", (line,)))
     if mapper is not None and len(mapper.landmarks):
         dot = Line2D([], [], color=LANDMARK_COLOUR, linestyle="", marker="o", markersize=3.0)
         entries.append(Entry(f"landmarks of {mapper.estimator}", (dot,)))
@@ -282,8 +282,7 @@ def _draw_tracks(
     output = {run.estimator: shown_output(run) for run in comparison.runs}
     for name, track in tracks.items():
         width = _LINE_WIDTH if len(tracks) == 1 else width_of(comparison, name)
-        line = line_of_estimator(comparison, name, output[name])
-        axes.plot(*track.xy.T, color=colour_of(comparison, name), linewidth=width, linestyle=line, zorder=3)
+        axes.plot(*track.xy.T, linewidth=width, zorder=3, **stroke_of(comparison, name, output[name]))
 
 
 def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:

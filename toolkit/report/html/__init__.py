@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from toolkit.errors import printable
-from toolkit.files import write_text
+from toolkit.files.writing import write_text
 
 __all__ = ["write_html"]
 # In the order in which they build upon each other; together they are the body of one function.

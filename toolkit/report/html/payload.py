@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType, to_builtins
 from msgspec.structs import asdict
 
-from toolkit.documents import number, numbers
+from toolkit.files.documents import number, numbers
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves

@@ -1,14 +1,14 @@
 """The JSON documents a comparison or a check leaves behind, as typed records, each read from its file by a function.
 
-Reading order: scores (one run of each estimator, or many), report (what the figures draw), card (what the
-tracks are like), manifest, check. How they are read and written is :mod:`toolkit.documents`;
-:mod:`toolkit.report.schemas` writes docs/schemas.
+Reading order: scores (one run of each estimator, or many), report (what the figures draw, what the tracks are like),
+manifest; a check's are in :mod:`toolkit.gate.verdict`. How they are read and written is
+:mod:`toolkit.files.documents`; :mod:`toolkit.report.schemas` writes docs/schemas.
 """
 
 from pathlib import Path
 
-from toolkit.documents import read
-from toolkit.report.records.check import OLDER, CheckDocument
+from toolkit.files.documents import read
+from toolkit.gate.verdict import OLDER_CHECKS, CheckDocument
 from toolkit.report.records.manifest import Manifest
 from toolkit.report.records.report import CardRecord, Report, SeedsReport
 from toolkit.report.records.scores import Metrics, Seeds
@@ -60,7 +60,7 @@ def read_manifest(path: Path) -> Manifest:
 
 def read_check(path: Path) -> CheckDocument:
     """Read what ``vislam check --json`` wrote; raises DataError, in one line with the place, where it is not that."""
-    return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER)
+    return read(path, CheckDocument, remedy="repeat vislam check", older=OLDER_CHECKS)
 
 
 def read_card(path: Path) -> CardRecord:

@@ -11,7 +11,7 @@ from toolkit.settings import Settings
 Versions = Annotated[dict[str, str | None], Meta(description="by package; null where it is not installed")]
 
 
-class Recording(Struct, frozen=True, kw_only=True):
+class RecordingRecord(Struct, frozen=True, kw_only=True):
     """The recording that was read; over seeds, that of the first."""
 
     name: Annotated[str, Meta(description="the sequence's name")]
@@ -37,7 +37,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     date: Annotated[str, Meta(description="ISO 8601, UTC")]
     versions: Versions
     git_revision: Annotated[str | None, Meta(description="-dirty where edited; null outside a checkout")]
-    sequence: Recording
+    sequence: RecordingRecord
     start: Annotated[str, Meta(description="where every run started")]
     estimators: Annotated[tuple[str, ...], Meta(description="that ran here")]
     references: (

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.documents import Count, Value
 from toolkit.estimate import Output, Status
+from toolkit.files.documents import Count, Value
 from toolkit.metrics import contract_keys
 
 # The keys every document of the contracts has, whatever metrics were added since: those of their first version, as the

@@ -3,8 +3,8 @@
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, so3_log
-from toolkit.metrics._shared.association import Matched
-from toolkit.metrics._shared.scores import InTable, Metric, Scores, Unavailable
+from toolkit.metrics.parts.association import Matched
+from toolkit.metrics.parts.scores import InTable, Metric, Scores, Unavailable
 from toolkit.sequence import is_left_only
 
 # An observation further off than this is lost, and how far is of no further meaning. A point behind the camera, or

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from toolkit.geometry import Array, about_z, se3, se3_inverse
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.scores import Unavailable
 
 # Ratio of the second to the first singular value of the covariance below which the positions lie on a line: the
 # squared sideways extent is then 1e-12 of the squared length, a micrometre in a metre.

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse
-from toolkit.metrics._shared.association import finite_poses
-from toolkit.metrics._shared.residuals import reprojection_errors_px
+from toolkit.metrics.parts.association import finite_poses
+from toolkit.metrics.parts.residuals import reprojection_errors_px
 from toolkit.models import left_only
 from toolkit.sequence import Observations, StereoRig
 

@@ -16,8 +16,8 @@ import msgspec
 from msgspec import Meta, inspect
 
 from toolkit.errors import DataError, VislamError
+from toolkit.files.reading import read_input
 from toolkit.geometry import Array
-from toolkit.inputs import read_input
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Json = dict[str, Any]
@@ -48,9 +48,10 @@ def _as_it_is(value: Any) -> Any:
     return value
 
 
-def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is) -> Record:
-    """Return the record whose fields are ``made`` of the attributes that a value has of the same names."""
-    return record(**{name: made(getattr(value, name)) for name in record.__struct_fields__})
+def of_attributes(record: type[Record], value: object, made: Callable[[Any], Any] = _as_it_is, **given: Any) -> Record:
+    """Return the record whose fields are given, or ``made`` of the attributes that a value has of the same names."""
+    rest = [name for name in record.__struct_fields__ if name not in given]
+    return record(**given, **{name: made(getattr(value, name)) for name in rest})
 
 
 def rounded(value: float) -> float:

@@ -14,8 +14,8 @@ from toolkit.datasets.io.npz_archive import opened
 from toolkit.datasets.trajectories import read_poses
 from toolkit.errors import DataError, VislamError
 from toolkit.experiment.configuration import read_configuration
+from toolkit.files.reading import read_input
 from toolkit.gate.baseline_file import load_baseline
-from toolkit.inputs import read_input
 
 
 def _archive(path: Path) -> None:
@@ -70,7 +70,7 @@ def test_the_remedy_is_that_of_the_reason(number: int, remedy: str, monkeypatch:
 
 def test_a_truncated_archive_is_not_a_wrong_path(tmp_path: Path) -> None:
     path = tmp_path / "cut.npz"
-    path.write_bytes((Path(__file__).parents[1] / "data/drive_small/recording.npz").read_bytes()[:5000])
+    path.write_bytes((Path(__file__).parents[2] / "data/drive_small/recording.npz").read_bytes()[:5000])
     with pytest.raises(DataError, match="damaged or truncated") as told:
         _archive(path)
     assert "path" not in str(told.value).removeprefix(str(path))
@@ -80,7 +80,7 @@ def test_a_truncated_archive_is_not_a_wrong_path(tmp_path: Path) -> None:
 def test_an_archive_with_two_arrays_of_one_name_is_refused_instead_of_taking_either(tmp_path: Path) -> None:
     import zipfile
 
-    shutil.copy(Path(__file__).parents[1] / "data/drive_small/recording.npz", tmp_path / "two.npz")
+    shutil.copy(Path(__file__).parents[2] / "data/drive_small/recording.npz", tmp_path / "two.npz")
     with zipfile.ZipFile(tmp_path / "two.npz", "a") as archive:
         name = archive.namelist()[0]
         archive.writestr(name, archive.read(name))

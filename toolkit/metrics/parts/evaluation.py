@@ -8,10 +8,10 @@ import numpy as np
 from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Run, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
-from toolkit.metrics._shared.alignment import Alignment, fit_se3, place_pose, place_yaw
-from toolkit.metrics._shared.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
-from toolkit.metrics._shared.leave_one_out import errors_left_out
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.alignment import Alignment, fit_se3, place_pose, place_yaw
+from toolkit.metrics.parts.association import STAMP_TOLERANCE_NS, Matched, associate, finite_poses, median_period_ns
+from toolkit.metrics.parts.leave_one_out import errors_left_out
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.sequence import Sequence
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.arrays import content_digest
 from toolkit.errors import OutputError
-from toolkit.files import check_writable, content_digest, replaced_file, uninterrupted
+from toolkit.files.writing import check_writable, replaced_file, uninterrupted
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import pytest
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from toolkit.documents import parse, read, to_line, to_text
 from toolkit.errors import DataError, OutputError
+from toolkit.files.documents import parse, read, to_line, to_text
 
 
 class Leaf(Struct, frozen=True, kw_only=True):

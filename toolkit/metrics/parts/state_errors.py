@@ -6,9 +6,9 @@ Every error is what takes the estimate to the truth, in the body frame.
 import numpy as np
 
 from toolkit.geometry import Array, se3_log
-from toolkit.metrics._shared.consistency import StatedErrors
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.consistency import StatedErrors
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.imu import IMU_LAYOUT
 from toolkit.models.state import POSE, Layout
 from toolkit.models.twist import TWIST_LAYOUT

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from toolkit.geometry import Array, BoolArray, IntArray, se3_inverse, se3_log
-from toolkit.metrics._shared.alignment import place_pose, place_yaw
-from toolkit.metrics._shared.association import finite_poses, median_period_ns, true_poses_at
-from toolkit.metrics._shared.evaluation import Evaluation
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.association import finite_poses, median_period_ns, true_poses_at
+from toolkit.metrics.parts.evaluation import Evaluation
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.sequence import Sequence
 

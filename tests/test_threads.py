@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info
 def test_libraries_run_on_one_thread_those_too_that_are_loaded_after_the_first_time() -> None:
     program = textwrap.dedent("""
         from threadpoolctl import threadpool_info
-        from toolkit.linear_algebra import on_one_thread
+        from toolkit.threads import on_one_thread
 
         def threads():
             return {one["filepath"]: one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}

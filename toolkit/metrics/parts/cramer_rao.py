@@ -25,9 +25,9 @@ from toolkit.arrays import rows_of
 from toolkit.estimate import Output, Trajectory
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.initialization import start_from_measurements
-from toolkit.metrics._shared.alignment import place_pose, place_yaw
-from toolkit.metrics._shared.consistency import starts_in_the_truths_world
-from toolkit.metrics._shared.scores import Unavailable
+from toolkit.metrics.parts.alignment import place_pose, place_yaw
+from toolkit.metrics.parts.consistency import starts_in_the_truths_world
+from toolkit.metrics.parts.scores import Unavailable
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import L, StereoFactors
 from toolkit.models.gating import chi2_bound

@@ -1,23 +1,18 @@
-"""Writing at once or not at all, a file that grows by whole lines, and hashes of what is in memory.
+"""Writing at once or not at all, and a file that grows by whole lines.
 
 A directory or a file appears complete or not at all: it is written beside its place and then renamed into it.
 """
 
 import errno
 import fcntl
-import hashlib
 import os
 import shutil
 import signal
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 
-import numpy as np
-
 from toolkit.errors import OutputError
-from toolkit.geometry import Array
 
 # Returns what in a directory was written by us and may be replaced: files by their relative path, folders with a slash.
 Owner = Callable[[Path], Collection[str]]
@@ -289,38 +284,3 @@ def _unwritable(target: Path, error: OSError, kind: str = "directory") -> Output
     in_the_way = next((parent for parent in target.parents if os.path.isfile(parent)), None)  # noqa: PTH113
     why = f"{in_the_way} is a file" if in_the_way else error.strerror or error
     return OutputError(f"{target} cannot be written ({why}); choose another {kind} with --out")
-
-
-def content_digest(values: Iterable[object], digits: int | None = None) -> str:
-    """Return the SHA-256, in hexadecimal digits, over arrays, numbers, texts and the fields of dataclasses.
-
-    With ``digits``, what is a float is rounded before: a number to so many digits, an array to as many of its largest
-    value. Every array counts with its shape.
-    """
-    digest = hashlib.sha256()
-    for value in values:
-        _feed(digest, value, digits)
-    return digest.hexdigest()
-
-
-def _feed(digest: "hashlib._Hash", value: object, digits: int | None) -> None:
-    if isinstance(value, np.ndarray):
-        counted = value if digits is None or value.dtype.kind != "f" else _rounded(value, digits)
-        digest.update(str(value.shape).encode())
-        digest.update(np.ascontiguousarray(counted).data)
-    elif is_dataclass(value):
-        for field in fields(value):
-            _feed(digest, getattr(value, field.name), digits)
-    elif digits is not None and isinstance(value, float):
-        digest.update(f"{value:.{digits}g}".encode())
-    else:
-        digest.update(repr(value).encode())
-
-
-def _rounded(array: Array, digits: int) -> Array:
-    """Return an array rounded to so many digits of its largest value, without -0.0, whose bits are not those of 0."""
-    finite = np.abs(array[np.isfinite(array)])
-    largest = float(finite.max()) if finite.size else 0.0
-    if largest == 0.0:
-        return array + 0.0
-    return np.round(array, digits - 1 - int(np.floor(np.log10(largest)))) + 0.0
