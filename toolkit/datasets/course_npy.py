@@ -16,10 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, observations, stamps_ns
+from toolkit.datasets.io.fields import (
+    Fields,
+    camera_matrix,
+    check_frame_count,
+    observations,
+    rectified_observations,
+    stamps_ns,
+)
 from toolkit.datasets.io.image_pairs import facts_of, rig_of
 from toolkit.datasets.io.plain_pickle import MAGIC, StoredArray, read_dict
-from toolkit.datasets.io.sparse import ArrayLayout, Named, corners_of, sightings, sparse_array
+from toolkit.datasets.io.sparse import ArrayLayout, Named, corners_of, sparse_array
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input
 from toolkit.frontend import (
@@ -192,7 +199,7 @@ def _sightings(parts: _Parts, features: StoredArray) -> Observations:
             Named(parts.path, _FEATURES), layout, (4, None, parts.t_ns.size), stream, filler=_NOT_SEEN
         )
     frame, track, corners_px = corners_of(sparse)
-    return sightings(parts.path, frame, track, _as_one_camera(parts, corners_px))
+    return rectified_observations(parts.path, frame, track, _as_one_camera(parts, corners_px))
 
 
 def _as_one_camera(parts: _Parts, corners_px: Array) -> Array:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, stamps_ns
+from toolkit.datasets.io.fields import Fields, camera_matrix, check_frame_count, rectified_observations, stamps_ns
 from toolkit.datasets.io.npz_archive import NpzArchive, array_names, opened
-from toolkit.datasets.io.sparse import corners_of, sightings
+from toolkit.datasets.io.sparse import corners_of
 from toolkit.errors import DataError, nearest
 from toolkit.geometry import Array, se3_inverse
 from toolkit.measured_motion import TwistSamples
@@ -95,4 +95,4 @@ def _sightings(path: Path, archive: NpzArchive, frame_count: int) -> Observation
         nothing = np.empty(0, dtype=np.int64)
         return Observations(nothing, nothing, np.empty((0, 3)))
     features = archive.sparse("features", (4, None, frame_count), filler=_NOT_SEEN)
-    return sightings(path, *corners_of(features))
+    return rectified_observations(path, *corners_of(features))

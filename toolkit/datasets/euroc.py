@@ -20,7 +20,7 @@ import numpy as np
 
 from toolkit.datasets.io.euroc_calibration import (
     PIXEL_SIGMA_PX,
-    Calibration,
+    AslCalibration,
     published,
     read_calibration,
 )
@@ -218,7 +218,7 @@ def _with_images(layout: _Layout) -> Path:
 
 
 def _filmed(
-    layout: _Layout, mav0: Path, imu: ImuSamples, calibration: Calibration
+    layout: _Layout, mav0: Path, imu: ImuSamples, calibration: AslCalibration
 ) -> tuple[ImageRecording, tuple[str, ...]]:
     """Return the pairs within the IMU's time with their cameras, and what had to be put right."""
     if calibration.cameras is None:

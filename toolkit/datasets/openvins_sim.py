@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations, stamps_ns
+from toolkit.datasets.io.fields import Fields, check_frame_count, rectified_observations, stamps_ns
 from toolkit.datasets.io.tables import find_table, first_line, read_columns
 from toolkit.datasets.trajectories import openvins
 from toolkit.datasets.trajectories.poses import checked_poses
@@ -161,8 +161,8 @@ def _frames(path: Path, imu_t_ns: IntArray) -> tuple[IntArray, Observations]:
     number, first_row = np.unique(table[inside, 1], return_index=True)
     kept = inside & stereo
     frame = np.searchsorted(number, table[kept, 1])
-    check_rows(path, table[kept, 3:7])
-    return row_t_ns[inside][first_row], observations(frame, table[kept, 2].astype(np.int64), table[kept, 3:7])
+    track_id = table[kept, 2].astype(np.int64)
+    return row_t_ns[inside][first_row], rectified_observations(path, frame, track_id, table[kept, 3:7])
 
 
 def _truth(folder: Path) -> Truth | None:

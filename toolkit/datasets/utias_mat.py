@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from toolkit.datasets.io.fields import Fields, check_frame_count, check_rows, observations, rigid, stamps_ns
+from toolkit.datasets.io.fields import Fields, check_frame_count, rectified_observations, rigid, stamps_ns
 from toolkit.errors import DataError
 from toolkit.files.reading import is_regular, open_input, read_input
 from toolkit.geometry import Array, IntArray, se3, so3_exp
@@ -111,8 +111,7 @@ def _sightings(fields: Fields, frame_count: int) -> Observations:
     frame, track_id = np.nonzero((features != _NOT_SEEN).any(axis=0))
     corners_px = features[:, frame, track_id].T
     corners_px = np.where(corners_px == _NOT_SEEN, np.nan, corners_px)
-    check_rows(fields.path, corners_px)
-    return observations(frame, track_id, corners_px)
+    return rectified_observations(fields.path, frame, track_id, corners_px)
 
 
 def _measured_noise(fields: Fields, t_ns: IntArray, v_mps: Array, w_radps: Array) -> TwistNoise:

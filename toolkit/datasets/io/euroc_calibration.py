@@ -71,7 +71,7 @@ _COEFFICIENTS = "distortion_coefficients|distortion_coeffs"
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class AslCalibration:
     """The rig of simulated tracks, the image size, the IMU's noise, and where all this is from.
 
     ``cameras`` are those of real images, None where they are not known; ``T_right_left`` (4, 4) takes coordinates of
@@ -88,11 +88,11 @@ class Calibration:
     cameras: tuple[Camera, Camera] | None = None
 
 
-def published() -> Calibration:
+def published() -> AslCalibration:
     """Return the calibration that came with every recording of the set."""
     T_left_right = np.eye(4)
     T_left_right[:3, 3] = _T_IMU_CAM0[:3, :3].T @ (_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])
-    return Calibration(
+    return AslCalibration(
         _simulated_rig(_PINHOLE_PX, float(np.linalg.norm(_CAM1_IN_IMU_M - _T_IMU_CAM0[:3, 3])), _T_IMU_CAM0),
         _SIZE_PX,
         _in_flight(_STATED_NOISE),
@@ -103,7 +103,7 @@ def published() -> Calibration:
     )
 
 
-def read_calibration(root: Path, mav0: Path) -> Calibration:
+def read_calibration(root: Path, mav0: Path) -> AslCalibration:
     """Read Kalibr's camchain where there is one, else the sensor.yaml of both cameras and the IMU.
 
     Extrinsics are made relative to the IMU. Raises DataError where a file is missing, damaged or incomplete, or the
@@ -113,7 +113,7 @@ def read_calibration(root: Path, mav0: Path) -> Calibration:
     return _of_sensor_files(mav0, is_simulated(root)) if chain is None else _of_kalibr(chain, root, mav0)
 
 
-def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
+def _of_sensor_files(mav0: Path, simulated: bool) -> AslCalibration:
     if (mav0 / "cam0").is_dir() and not (mav0 / "cam1").is_dir():
         raise DataError(f"{mav0 / 'cam1/sensor.yaml'}: cannot be read: there is cam0 and no cam1; stereo needs both")
     left, right, imu = (read_fields(mav0 / sensor / "sensor.yaml") for sensor in ("cam0", "cam1", "imu0"))
@@ -126,7 +126,7 @@ def _of_sensor_files(mav0: Path, simulated: bool) -> Calibration:
     return _calibration(sides, noise, "the folder's sensor.yaml files", noise_source)
 
 
-def _of_kalibr(chain: Path, root: Path, mav0: Path) -> Calibration:
+def _of_kalibr(chain: Path, root: Path, mav0: Path) -> AslCalibration:
     """Read cam0 and cam1 of a camchain; the noise is that of Kalibr's IMU file, as it stands, or of sensor.yaml."""
     fields = read_fields(chain)
     _check_camchain(fields)
@@ -209,7 +209,7 @@ def _is_right(T_left_right: Array) -> bool:
     return bool(x > max(abs(y), abs(z)))
 
 
-def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> Calibration:
+def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str) -> AslCalibration:
     left, right, T_left_right = sides.left, sides.right, sides.T_left_right
     _check_right(right.path, T_left_right, sides.T_left_right_inverted)
     fx_px, fy_px, cx_px, cy_px = _pinhole_of(left)
@@ -217,7 +217,7 @@ def _calibration(sides: _Sides, noise: ImuNoise, source: str, noise_source: str)
     rig = _simulated_rig((fx_px, fy_px, cx_px, cy_px), float(np.linalg.norm(T_left_right[:3, 3])), sides.T_imu_left)
     whole = all("distortion_model" in side and "intrinsics" in side for side in (left, right))
     cameras = (_camera_of(left), _camera_of(right)) if whole else None
-    return Calibration(
+    return AslCalibration(
         *(rig, (int(width_px), int(height_px)), noise, f"calibration from {source}", noise_source),
         T_imu_left=sides.T_imu_left,
         T_right_left=se3_inverse(T_left_right),

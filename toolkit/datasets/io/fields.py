@@ -242,3 +242,9 @@ def observations(frame: IntArray, track_id: IntArray, corners_px: Array) -> Obse
     v_px = np.where(no_u & no_v, v_left_px, np.where(no_u, np.nan, 0.5 * (v_left_px + v_right_px)))
     uv_px = np.stack([u_left_px, u_right_px, v_px], axis=1)
     return Observations.sorted(frame, track_id, uv_px)
+
+
+def rectified_observations(path: Path, frame: IntArray, track_id: IntArray, corners_px: Array) -> Observations:
+    """Build sightings as :func:`observations` does; raises DataError where the pair is not rectified."""
+    check_rows(path, corners_px)
+    return observations(frame, track_id, corners_px)

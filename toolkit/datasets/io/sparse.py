@@ -1,4 +1,4 @@
-"""Dense arrays that are mostly filler, streamed and kept sparse; the sightings of the course's features."""
+"""Dense arrays that are mostly filler, streamed and kept sparse, and the stereo corners in one of features."""
 
 import math
 from pathlib import Path
@@ -7,10 +7,9 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from toolkit.arrays import check_shape
-from toolkit.datasets.io.fields import check_numeric, check_rows, observations
+from toolkit.datasets.io.fields import check_numeric
 from toolkit.errors import DataError
 from toolkit.geometry import Array, IntArray
-from toolkit.sequence import Observations
 
 # Small enough for the processor's cache, large enough that the Python around it does not show.
 _CHUNK_BYTES = 1 << 18
@@ -88,9 +87,3 @@ def corners_of(features: SparseArray) -> tuple[IntArray, IntArray, Array]:
     corners_px: Array = np.full((cell.size, 4), np.nan)
     corners_px[row, coordinate] = features.value
     return cell // tracks, cell % tracks, corners_px
-
-
-def sightings(path: Path, frame: IntArray, track: IntArray, corners_px: Array) -> Observations:
-    """Return corners (N, 4) px as sightings; raises DataError where the pair is not rectified."""
-    check_rows(path, corners_px)
-    return observations(frame, track, corners_px)
