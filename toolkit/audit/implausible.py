@@ -89,7 +89,7 @@ def _leaps(sequence: Sequence) -> BoolArray:
 def _there_and_back(step: Array, least: Array) -> BoolArray:
     """Say of which samples but the ends (S - 2, d) both steps (S - 1, d) are beyond the least, and opposite."""
     far = np.abs(step) > least
-    return np.asarray(far[1:] & far[:-1] & (step[1:] * step[:-1] < 0.0))
+    return np.asarray(far[1:] & far[:-1] & (np.sign(step[1:]) * np.sign(step[:-1]) < 0.0))
 
 
 def _alone(step: Array, least: Array) -> BoolArray:
