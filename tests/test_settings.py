@@ -39,6 +39,7 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
         ({"window": {"lag_s": math.nan}}, "window.lag_s"),
         ({"window": 3}, "window: expected object, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
+        ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 1e-06"),
         ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or none, got string"),
     ],
 )

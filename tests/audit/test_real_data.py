@@ -40,7 +40,8 @@ def counts(outcome: Audit) -> dict[str, int]:
     [
         (
             "ucsd/03.npz",
-            {"stale-frames": 153, "mixed-axes": 1, "twist-lag": 1, "thin-vision": 2, "gyro-bias": 3, "conflict": 1},
+            {"stale-frames": 153, "mixed-axes": 1, "twist-lag": 1, "thin-vision": 2, "gyro-bias": 3, "conflict": 1}
+            | {"steady-difference": 1},  # a scale of 4.4 +- 0.8 %
         ),
         ("ucsd/0022.npz", {"stale-frames": 66, "extrinsic-translation": 1, "twist-lag": 1}),
         ("ucsd/0027.npz", {"stale-frames": 91, "extrinsic-translation": 1, "twist-lag": 1}),
@@ -56,8 +57,13 @@ def test_the_course_files_show_exactly_their_faults(name: str, expected: dict[st
 
 @pytest.mark.parametrize("name", KITTI_UTIAS)
 def test_the_utias_drives_have_sound_calibrations_and_fresh_frames(name: str) -> None:
-    # The odometry of one drive is off by an eighth of its speed for two seconds.
-    allowed = {"no-disparity", "twist-lag", "doubled-disparity"} | ({"conflict"} if "26_drive_0027" in name else set())
+    # The odometry of one drive is off by an eighth of its speed for two seconds; two go 0.009 rad off what they see.
+    slips = {"steady-difference"} if name in ("2011_09_26_drive_0009_sync_KLT.mat", KITTI_UTIAS[-1]) else set()
+    allowed = (
+        slips
+        | {"no-disparity", "twist-lag", "doubled-disparity"}
+        | ({"conflict"} if "26_drive_0027" in name else set())
+    )
     found = counts(audited(f"utias/{name}"))
     assert found.pop("correlated-tracks") == 1
     assert found.keys() <= allowed

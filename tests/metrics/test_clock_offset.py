@@ -66,3 +66,28 @@ def test_steady_motion_along_a_line_leaves_it_open() -> None:
 
 def test_few_pairs_leave_it_open() -> None:
     assert "needs 30 matched pairs" in scored(kept=slice(0, 20)).notes["clock_offset_ms"]
+
+
+@pytest.mark.parametrize("since_first", [0.0, 0.5])
+@pytest.mark.parametrize("rate", [0.93, 0.995, 1.005, 1.05])
+def test_a_clock_that_runs_fast_or_slow_is_told_with_its_rate(rate: float, since_first: float) -> None:
+    """Stamps that run fast are those of an earlier place: the estimate is where it was at the time by a right clock."""
+    t_s = PERIOD_S * np.arange(300)
+    origin_s = since_first * t_s[-1]
+    scores = compared(t_s, path(t_s), path(origin_s + (t_s - origin_s) / rate))
+    told = scores.notes["clock_offset_ms"]
+    assert told.startswith("time passes ")
+    assert float(told.split()[2]) == pytest.approx(rate, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_drift_and_noise_are_no_rate_of_a_clock(seed: int) -> None:
+    rng, t_s = np.random.default_rng(seed), PERIOD_S * np.arange(300)
+    drifting = path(t_s) + np.cumsum(rng.normal(0.0, 0.01, (300, 3)), axis=0) + rng.normal(0.0, 0.02, (300, 3))
+    assert "time passes" not in compared(t_s, path(t_s), drifting).notes.get("clock_offset_ms", "")
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.03, 3.28])
+def test_another_scale_is_no_rate_of_a_clock(scale: float) -> None:
+    t_s = PERIOD_S * np.arange(300)
+    assert "time passes" not in compared(t_s, path(t_s), scale * path(t_s)).notes.get("clock_offset_ms", "")

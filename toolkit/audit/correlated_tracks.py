@@ -57,6 +57,12 @@ def step_correlation(evidence: Evidence) -> tuple[float, float] | None:
     return _correlation(first, second), jackknife_error(_correlation, first, second)
 
 
+def err_by_themselves(evidence: Evidence) -> bool:
+    """Say whether the sightings of a track err each by itself, beyond doubt."""
+    found = step_correlation(evidence)
+    return found is not None and found[0] + SIGMAS * found[1] < MOST_CORRELATION
+
+
 def _neighbouring_residuals(evidence: Evidence) -> tuple[Array, Array]:
     """Return whitened residuals (T, 3), the usual ones, of the two steps between three sightings of a track."""
     steps = evidence.one_step

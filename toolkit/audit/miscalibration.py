@@ -16,7 +16,7 @@ from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, hidden, wrong
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.turn import turn_by_rotations, turn_by_velocities
+from toolkit.audit.parts.turn import angle_of, turn_by_rotations, turn_by_velocities
 from toolkit.audit.parts.units import force_ratio, rotation_ratio
 from toolkit.measured_motion import MotionKind
 from toolkit.sequence import StereoRig
@@ -92,9 +92,9 @@ def _by_turn(evidence: Evidence, intervals: Intervals) -> _Judged:
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
         return _Judged([], _undecided(float(least_rad.min()), kind == "twist"))
-    angle = float(np.linalg.norm(turn.rad))
+    angle, error = angle_of(turn)
     said = (
-        f"the camera moves as if it were turned by {angle:.3f} +- {np.linalg.norm(turn.error_rad):.3f} rad against "
+        f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
         f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
     )
     return _Judged([Wrong(said, "the extrinsic and the principal point")], None)

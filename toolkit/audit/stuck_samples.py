@@ -2,7 +2,8 @@
 
 Real samples carry noise, and three axes of it are never equal again and again, nor one axis for a second. Odometry may
 well repeat itself, for a wheel that stands still gives zeros and one that rolls straight ahead whole counts; it counts
-where it moves and turns, and where it says nothing of either all along while the camera does.
+where it moves and turns, and where it says nothing of either all along while the camera does. It comes rarely: how many
+equal samples in a row are no chance is told by how often two are equal in the rest of the recording.
 """
 
 import numpy as np
@@ -14,6 +15,8 @@ from toolkit.resampling import NS_PER_S
 
 # So many equal samples in a row, over so long, are no chance, nor a sensor that is read more often than it measures.
 LEAST_RUN, LEAST_S = 10, 0.1
+# Runs of odometry's samples that are chance less often than this, in the whole recording, count from four on.
+CHANCE, LEAST_RUN_OF_ODOMETRY = 1e-3, 4
 # Where this share of all samples repeats, bridges between the others are no recording of a motion any more.
 MOST_REPEATED = 0.2
 # One axis alone of a coarse sensor at rest may repeat itself for a while.
@@ -35,7 +38,7 @@ def check(evidence: Evidence) -> Symptom | None:
         return never
     if sequence.motion_kind == "twist":
         moves_and_turns = values[:, :3].any(axis=1) & values[:, 3:].any(axis=1)
-        repeated = {"odometry": _in_long_runs(values, least) & moves_and_turns}
+        repeated = {"odometry": _in_long_runs(values, _least_of_odometry(values, least, step_s)) & moves_and_turns}
     else:
         repeated = {name: _in_long_runs(values[:, columns], least) for name, columns in IMU_SENSORS.items()}
     stuck_axes = _stuck_axes(values, repeated, step_s) if sequence.motion_kind == "imu" else None
@@ -57,6 +60,18 @@ def check(evidence: Evidence) -> Symptom | None:
         remedy=None if too_many else keep_samples(sequence, ~stuck),
         spoils_vision=bool(too_many),
     )
+
+
+def _least_of_odometry(values: Array, least: int, step_s: float) -> int:
+    """Return from how many equal samples (S, 6) in a row on odometry hangs: for 0.1 s, and by no chance."""
+    same = (values[1:] == values[:-1]).all(axis=1)
+    lengths = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
+    longest = int(lengths.max(initial=1)) - 1
+    often = (same.sum() - longest + 1) / max(same.size - longest + 1, 2)  # in the rest of the recording, or once
+    if often >= 1.0:
+        return least
+    by_chance = 1 + int(np.ceil(np.log(CHANCE / len(values)) / np.log(often)))
+    return min(max(by_chance, LEAST_RUN_OF_ODOMETRY, 1 + round(LEAST_S / max(step_s, 1e-6))), least)
 
 
 def _stuck_axes(values: Array, whole: dict[str, BoolArray], step_s: float) -> Symptom | None:

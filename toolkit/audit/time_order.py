@@ -137,4 +137,9 @@ def _in_order(t_ns: IntArray) -> IntArray:
     return rows
 
 
-FAULT = Fault("time-order", "time stamps that repeat, run backwards, jump back or are no time at all", check)
+FAULT = Fault(
+    "time-order",
+    "time stamps that repeat, run backwards, jump back or are no time at all",
+    check,
+    after=("clock-jump",),
+)

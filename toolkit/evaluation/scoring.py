@@ -19,6 +19,7 @@ import numpy as np
 from toolkit.datasets.trajectories import read_poses
 from toolkit.datasets.trajectories.belonging import (
     Reference,
+    backwards,
     check_clock,
     check_length_unit,
     check_turns,
@@ -194,7 +195,7 @@ def _checked(file: PosesFile, estimate: Poses, truth: TruthFile) -> Array | None
     check_length_unit(what, reference, estimate.t_ns, estimate.poses[:, :3, 3])
     matched = matched_poses(estimate, truth.stamped)
     check_mirrored(what, matched.truth, matched.estimate)
-    readings = [inverted()]
+    readings = [inverted(), backwards()]
     if file.other_order is not None:
         readings.insert(0, in_other_order(file.other_order))
     some = slice(None, None, 1 + len(rotations) // _ENOUGH_TURNS)

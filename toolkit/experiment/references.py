@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 from toolkit.datasets.trajectories.belonging import (
     Reference,
+    backwards,
     check_clock,
     check_length_unit,
     check_turns,
@@ -54,7 +55,7 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
     reference = Reference.of_recording(recording)
     check_clock(what, reference, trajectory.t_ns)
     check_length_unit(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, 3])
-    readings = [inverted(), of_the_camera(recording)]
+    readings = [inverted(), backwards(), of_the_camera(recording)]
     if poses.other_order is not None:
         readings.insert(0, in_other_order(poses.other_order))
     confirmed = check_turns(what, reference, trajectory.t_ns, trajectory.T_world_imu[:, :3, :3], readings)

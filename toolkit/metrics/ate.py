@@ -65,6 +65,13 @@ _UNMEASURED = (
     "without a measured vertical the tilt of an estimator's world, its first frame, in the truth's depends on where it "
     "begins, and is most of this error; compare ate_se3_m"
 )
+# Another scale is worth a remark where it is off by so much, and the positions fit so many times as well with it.
+_LEAST_SCALE, _TIMES_BETTER = 0.02, 3.0
+_LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "miles": 1609.344, "kilometres": 1000.0}
+_SCALED = (
+    "its positions fit the truth's to {:.3g} m once they are multiplied by {:.4g}{}: another unit, a scale that "
+    "nothing measured, or a baseline, focal length or wheels that are off"
+)
 _ON_A_LINE = "the positions lie on a line or in a point, so the rotation about it is not determined"
 
 
@@ -81,6 +88,9 @@ def score(evaluation: AgainstTruth) -> Scores:
     )
     if scores.values["ate_se3_m"] is not None and not evaluation.se3_alignment.rotation_is_unique:
         return scores.remarked(["ate_se3_m", "ate_sim3_m"], _ON_A_LINE)
+    if (scale := _telling_scale(evaluation, scores)) is not None:
+        unit = "".join(f", as if in {name}" for name, metres in _LENGTHS.items() if abs(scale / metres - 1.0) < 0.02)
+        return scores.remarked(["ate_se3_m", "ate_yaw_m"], _SCALED.format(scores.values["ate_sim3_m"], scale, unit))
     tilt_deg = _telling_tilt_deg(evaluation, scores)
     if tilt_deg is None:
         return scores
@@ -96,6 +106,15 @@ def _telling_tilt_deg(evaluation: AgainstTruth, scores: Scores) -> float | None:
         return None
     tilt_deg = float(np.degrees(np.arccos(np.clip(evaluation.se3_alignment.rotation[2, 2], -1.0, 1.0))))
     return tilt_deg if tilt_deg >= _TILTED_DEG else None
+
+
+def _telling_scale(evaluation: AgainstTruth, scores: Scores) -> float | None:
+    """Return by what the estimate must be multiplied where that explains nearly all of ate_se3_m, else None."""
+    se3_m, sim3_m = scores.values["ate_se3_m"], scores.values["ate_sim3_m"]
+    if se3_m is None or sim3_m is None or _TIMES_BETTER * sim3_m > se3_m:
+        return None
+    scale = fit_sim3(*evaluation.compared.positions).scale
+    return scale if abs(scale - 1.0) > _LEAST_SCALE else None
 
 
 def _distances(matched: Matched, poses: Array) -> Array:

@@ -2,7 +2,8 @@
 
 A constant offset of two clocks displaces each position along its velocity. It is fitted together with the alignment
 that ATE fits, as in Furgale, Rehder and Siegwart, "Unified temporal and spatial calibration for multi-sensor systems"
-(IROS 2013), section III, with the truth's positions in the place of a spline of them.
+(IROS 2013), section III, with the truth's positions in the place of a spline of them. A clock that runs fast displaces
+them by more and more; its rate is fitted likewise, from the middle of the recording outwards.
 """
 
 from collections.abc import Callable
@@ -46,6 +47,13 @@ _FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
 _LEAST_LEFT = 0.02
 # An offset is told from so many standard errors and from a millisecond on: few stamps are better than that.
 _SIGMAS, _LEAST_S = 5.0, 1e-3
+# A rate is told from so much on, where it makes the positions fit so many times as well as any offset does. The fit
+# begins with this share of the pairs about the middle and takes in more and more of them.
+_LEAST_RATE, _MOST_RATE, _TIMES_BETTER, _SHARES = 1e-3, 0.5, 3.0, (0.15, 0.3, 0.6, 1.0)
+_RATE_REMARK = (
+    "time passes {:.4f} +- {:.4f} times as fast by its stamps as by the truth's: with that its positions fit to "
+    "{:.3g} m in place of {:.3g} m; stamp both by one clock"
+)
 _REMARK = (
     "with its stamps shifted by {:.1f} +- {:.1f} ms its positions fit the truth's to {:.3g} m in place of {:.3g} m: "
     "two clocks, a truth whose positions are stamped early or late, or a drift that goes with the velocity"
@@ -76,8 +84,12 @@ def score(evaluation: AgainstTruth) -> Scores:
     try:
         fit = _fit(evaluation)
     except Unavailable as reason:
-        return Scores({OFFSET: None, ERROR: None}, {OFFSET: str(reason), ERROR: str(reason)})
+        alone = _rate(evaluation, None)
+        why = str(reason) if alone is None else _RATE_REMARK.format(*alone)
+        return Scores({OFFSET: None, ERROR: None}, {OFFSET: why, ERROR: why})
     scores = Scores({OFFSET: 1e3 * fit.offset_s, ERROR: 1e3 * fit.error_s})
+    if (rate := _rate(evaluation, fit)) is not None:
+        return scores.remarked([OFFSET], _RATE_REMARK.format(*rate))
     if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s):
         return scores
     told = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
@@ -108,6 +120,72 @@ def _fit(evaluation: AgainstTruth) -> _Fit:
             before_m = rmse(lengths(_linearised(path, t_s[usable], estimated[usable]).error_m))
             return _Fit(offset_s, jackknife_error(_offset_s, *at), before_m, rmse(lengths(at.error_m)))
     raise Unavailable("no offset was found from which the fit does not step on")
+
+
+class _Rate(NamedTuple):
+    """How fast the estimate's clock runs, its standard error, and the RMS distances with that and without it (m)."""
+
+    value: float
+    error: float
+    after_m: float
+    before_m: float
+
+
+def _rate(evaluation: AgainstTruth, fit: _Fit | None) -> _Rate | None:
+    """Return the rate of the estimate's clock; None where it is not determined, or an offset fits nearly as well."""
+    pairs = evaluation.compared
+    t_s = (pairs.t_ns - pairs.t_ns[0]) / NS_PER_S
+    usable = _beside_no_gap(t_s)
+    if usable.sum() < _FEWEST_PAIRS:
+        return None
+    true, estimated = pairs.truth[:, :3, 3], pairs.estimate[:, :3, 3]
+    try:
+        slower, since_s, at = _from_the_middle(t_s, true, estimated, usable)
+    except Unavailable:
+        return None
+    error = jackknife_error(lambda *parts: float(_clock(*parts)[1]), at.error_m, at.jacobian, since_s)
+    before_m, after_m = (
+        rmse(lengths(evaluation.se3_alignment.apply(pairs.estimate)[:, :3, 3] - true)),
+        rmse(lengths(at.error_m)),
+    )
+    best_m = before_m if fit is None else min(before_m, fit.after_m)
+    if abs(slower) < max(_LEAST_RATE, _SIGMAS * error) or _TIMES_BETTER * after_m > best_m:
+        return None
+    return _Rate(1.0 / (1.0 + slower), error, after_m, before_m)
+
+
+def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArray) -> tuple[float, Array, _Linearised]:
+    """Return by how much slower the estimate's clock runs, and the time since the middle (m,) s and errors of pairs.
+
+    Gauss-Newton for offset and rate, over more and more of the pairs (n,); raises Unavailable where it does not settle.
+    """
+    from scipy.interpolate import CubicSpline  # as above
+
+    path, since_s = CubicSpline(t_s, true), t_s - 0.5 * t_s[-1]
+    clock = np.zeros(2)
+    for share in _SHARES:
+        for _ in range(_ITERATIONS):
+            at_s = t_s + clock[0] + clock[1] * since_s
+            rows = usable & (np.abs(since_s) <= 0.5 * share * t_s[-1]) & (at_s >= t_s[0]) & (at_s <= t_s[-1])
+            if rows.sum() < _FEWEST_PAIRS or abs(clock[1]) > _MOST_RATE:
+                break
+            at = _linearised(path, at_s[rows], estimated[rows])
+            step = _clock(at.error_m, at.jacobian, since_s[rows])
+            clock += step
+            if share == 1.0 and abs(step[0]) < _SETTLED_S:
+                return float(clock[1]), since_s[rows], at
+    raise Unavailable("no rate was found from which the fit does not step on")
+
+
+def _clock(error_m: Array, jacobian: Array, since_s: Array) -> Array:
+    """Return the steps (2,) of the offset (s) and of the rate that explain errors (n, 3) best, beside any alignment."""
+    velocity, aligning = jacobian[:, :, 0], jacobian[:, :, 1:].reshape(-1, 6)
+    moved = np.stack([velocity.ravel(), (since_s[:, None] * velocity).ravel()], axis=1)
+    left = moved - aligning @ np.linalg.lstsq(aligning, moved, rcond=None)[0]
+    squared = left.T @ left
+    if np.linalg.det(squared) <= _LEAST_LEFT**2 * np.prod(np.sum(moved**2, axis=0)):
+        raise Unavailable("the velocity hardly changes, so that a rate in time looks like a displacement")
+    return np.asarray(np.linalg.solve(squared, left.T @ error_m.ravel()))
 
 
 def _beside_no_gap(t_s: Array) -> BoolArray:

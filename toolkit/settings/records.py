@@ -138,18 +138,18 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[
             float,
             _setting(
-                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", gt=0.0, le=100.0
+                "standard deviation of uL and uR; v in proportion", "px", none="the recording's", ge=1e-6, le=100.0
             ),
         ]
         | None
     ) = None
     motion_scale: Annotated[
-        float, _setting("factor on the white-noise densities of the motion samples", gt=0.0, le=1e3)
+        float, _setting("factor on the white-noise densities of the motion samples", ge=1e-6, le=1e3)
     ] = 1.0
     tracks: Annotated[
         TrackModel, _setting("errors of a track's sightings: each by itself, a stated walk and offset, or fitted")
     ] = "white"
-    track_white_px: Annotated[float, _setting("correlated: white part, in column and row", "px", gt=0.0, le=100.0)] = (
+    track_white_px: Annotated[float, _setting("correlated: white part, in column and row", "px", ge=1e-6, le=100.0)] = (
         0.03
     )
     track_walk_px: Annotated[float, _setting("correlated: walk per root frame", "px", ge=0.0, le=100.0)] = 0.13
@@ -163,7 +163,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
                 "fitted: how much of the beginning, so that later causal answers rest on the past",
                 "s",
                 none="all of it",
-                gt=0.0,
+                ge=1e-6,
                 le=86400.0,
             ),
         ]
@@ -175,7 +175,7 @@ class Noise(Struct, frozen=True, forbid_unknown_fields=True):
             _setting(
                 "standard deviation of a scale on all disparities, a state of its own, as 0.01",
                 none="none: no such state",
-                gt=0.0,
+                ge=1e-6,
                 le=0.5,
             ),
         ]

@@ -154,12 +154,32 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     plus gravity, a constant but for the drift of the gyro. Of five velocities the median is taken, less the integrals
     of both: a median of what shakes or falls is no mean.
     """
+    frames_t_ns = sequence.frames_t_ns
+    middle_ns, fallen = fallen_mps(sequence, camera, bias_radps)
+    h_s = np.diff(middle_ns)[:, None] / NS_PER_S
+    fallen -= np.median(np.diff(fallen, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
+    smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
+    sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
+    rows = np.flatnonzero(sound[1:] & sound[:-1])
+    t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
+    value = (np.diff(smooth, axis=0) / h_s)[rows]
+    bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(fallen) - 2]]
+    sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
+    noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
+    return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
+
+
+def fallen_mps(sequence: Sequence, camera: CameraMotion, bias_radps: Array) -> tuple[IntArray, Array]:
+    """Return the middle (K - 1,) of each interval, and the camera's velocity (K - 1, 3) less what the IMU gained.
+
+    In the axes of the first frame, into which the gyro, less its bias (3,), turns everything: what is left falls with
+    gravity.
+    """
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
     middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
     w_radps = interval_means(motion.t_ns, motion.values, frames_t_ns)[:, 3:] - bias_radps
     v_mps = camera.v_mps @ R_imu_cam.T - np.cross(w_radps, p_imu_cam)
-    h_s = np.diff(middle_ns)[:, None] / NS_PER_S
     t_ns, middle_at = subdivided(middle_ns)
     step_s = np.diff(t_ns)[:, None] / NS_PER_S
     mean = interval_means(motion.t_ns, motion.values, t_ns)
@@ -167,17 +187,7 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     R_first_imu = chained(half @ half)
     v_first = (R_first_imu[middle_at] @ v_mps[:, :, None]).squeeze(-1)
     gained = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1) * step_s
-    fallen = v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at]
-    fallen -= np.median(np.diff(fallen, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
-    smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
-    sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
-    rows = np.flatnonzero(sound[1:] & sound[:-1])
-    t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
-    value = (np.diff(smooth, axis=0) / h_s)[rows]
-    bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(v_first) - 2]]
-    sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
-    noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
-    return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
+    return middle_ns, v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at]
 
 
 def _neighbours(values: Array, reach: int) -> Array:

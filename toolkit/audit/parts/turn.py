@@ -11,7 +11,7 @@ import numpy as np
 
 from toolkit.audit.parts.alignment import TURN, Regression, robust_with_formal_cov
 from toolkit.audit.parts.intervals import Intervals
-from toolkit.audit.parts.robust import INFLATION, chance_bound, in_motion
+from toolkit.audit.parts.robust import INFLATION, Scalar, chance_bound, in_motion
 from toolkit.geometry import Array, skew
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measured_motion import MotionKind
@@ -32,6 +32,12 @@ class Turn(NamedTuple):
     rad: Array
     error_rad: Array
     by_chance_rad: Array
+
+
+def angle_of(turn: Turn) -> Scalar:
+    """Return the angle of a turn about the axes that can be judged."""
+    angle = float(np.linalg.norm(turn.rad))
+    return Scalar(angle, float(np.linalg.norm(turn.rad * turn.error_rad)) / max(angle, 1e-12))
 
 
 def turn_by_velocities(whole: Regression) -> Turn:

@@ -96,6 +96,15 @@ def inverted() -> Reading:
     return Reading("inverted", remedy, lambda R_imu_world: np.swapaxes(R_imu_world, 1, 2))
 
 
+def backwards() -> Reading:
+    """Return the reading of poses in the reverse of their order, on stamps that go on."""
+    return Reading("read backwards", "its poses run backwards: write them in the order of their stamps", _reversed)
+
+
+def _reversed(R_world_imu: Array) -> Array:
+    return R_world_imu[::-1]
+
+
 def of_the_camera(sequence: Sequence) -> Reading:
     """Return the reading of poses of the left camera."""
     R_cam_imu = sequence.rig.T_imu_cam[:3, :3].T

@@ -1,0 +1,110 @@
+"""An accelerometer that reads another gravity from some time on: another range, a knock, a scale that was set anew.
+
+The camera's velocity less what the IMU gained falls with gravity. How fast it does within a few seconds, in whatever
+direction, is the gravity that the accelerometer reads there: a camera that sees well knows it to some thousandths, and
+a gyro's drift turns its direction alone.
+"""
+
+import numpy as np
+
+from toolkit.audit.correlated_tracks import err_by_themselves
+from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.deviations import fallen_mps
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar
+from toolkit.geometry import Array, BoolArray
+from toolkit.resampling import NS_PER_S
+
+# A change counts between the parts before and after one of these shares of the recording, by so many standard errors,
+# and beyond a share of gravity: parts of sound recordings at hand have 0.3 % at most beyond five standard errors, and
+# simulated flights whose tracks creep from image to image 0.8 %. Chosen with them in view.
+CUTS, SIGMAS, SYSTEMATIC, BY_CREEP = (1.0 / 3.0, 0.5, 2.0 / 3.0), 5.0, 0.005, 0.012
+# Gravity is read within windows of so long (s), shorter than the gyro's drift bends, each of so many intervals.
+WINDOW_S, LEAST_INTERVALS = 4.0, 12
+# Where a change must be larger than this share to show, it is said.
+LARGEST_HIDDEN = 0.05
+
+
+def check(evidence: Evidence) -> Symptom | Undecided | None:
+    """Compare the gravity that is read before and after."""
+    sequence, intervals = evidence.sequence, evidence.intervals
+    if sequence.motion_kind != "imu":
+        return None
+    if intervals is None:
+        return evidence.blind
+    w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
+    middle_ns, fallen = fallen_mps(sequence, evidence.camera_motion, w_bias)
+    t_s, known = (middle_ns - sequence.frames_t_ns[0]) / NS_PER_S, evidence.camera_motion.known
+    steps = {share: _step(t_s, fallen, known, share * sequence.duration_s) for share in CUTS}
+    found = {share: step for share, step in steps.items() if step is not None}
+    gravity = float(np.linalg.norm(sequence.gravity_world))
+    if not found:
+        return Undecided("too few intervals whose camera motion is known, to read gravity before and after")
+    share, step = max(found.items(), key=lambda one: abs(one[1].value) / one[1].error)
+    least = SYSTEMATIC * gravity + SIGMAS * step.error
+    if abs(step.value) > least and not err_by_themselves(evidence):
+        least = BY_CREEP * gravity + SIGMAS * step.error
+    if abs(step.value) < least:
+        hidden = least / gravity
+        return None if hidden < LARGEST_HIDDEN else Undecided(f"a change by less than {hidden:.0%} would not show")
+    return Symptom(
+        count=1,
+        detail=(
+            f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
+            f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before"
+        ),
+        treatment="its range or its scale have changed, or it was knocked: no one bias holds for the recording",
+        remedy=None,
+        harmful=False,
+        warns=True,
+    )
+
+
+def _step(t_s: Array, fallen: Array, known: BoolArray, at_s: float) -> Scalar | None:
+    """Return how much more gravity is read after a time than before it (m/s^2); None where one of them is not known."""
+    before, after = _gravity(t_s, fallen, known & (t_s < at_s)), _gravity(t_s, fallen, known & (t_s >= at_s))
+    if before is None or after is None:
+        return None
+    return Scalar(after.value - before.value, float(np.hypot(before.error, after.error)))
+
+
+def _gravity(t_s: Array, fallen: Array, rows: BoolArray) -> Scalar | None:
+    """Return the mean of the gravity (m/s^2) read in the windows of some rows (n,), by how well each is known."""
+    at = np.flatnonzero(rows)
+    if at.size < LEAST_INTERVALS:
+        return None
+    windows = max(round(float(np.ptp(t_s[at])) / WINDOW_S), 1)
+    parts = [part for part in np.array_split(at, windows) if part.size >= LEAST_INTERVALS]
+    if not parts:
+        return None
+    read = np.array([_read(t_s[part], fallen[part]) for part in parts])
+    weight = read[:, 1] ** -2.0
+    mean = float(weight @ read[:, 0] / weight.sum())
+    error = float(weight.sum() ** -0.5)
+    if len(parts) > 1:  # what their scatter shows beyond their own errors is that of bias and tilt
+        chi2 = float(weight @ (read[:, 0] - mean) ** 2) / (len(parts) - 1)
+        error *= max(np.sqrt(chi2), 1.0)
+    return Scalar(mean, error)
+
+
+def _read(t_s: Array, fallen: Array) -> tuple[float, float]:
+    """Return how fast velocities (n, 3) at times (n,) fall (m/s^2), and its standard error, with Cauchy weights."""
+    weight = np.ones(len(t_s))
+    for _ in range(ITERATIONS):
+        share = weight / weight.sum()
+        since_s, apart = t_s - share @ t_s, fallen - share @ fallen
+        moment = weight * since_s
+        slope = moment @ apart / float(moment @ since_s)
+        residual = apart - since_s[:, None] * slope
+        sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), 1e-9)
+        weight = 1.0 / (1.0 + np.sum((residual / sigma) ** 2, axis=1) / (3.0 * CAUCHY_SIGMAS**2))
+    size = float(np.linalg.norm(slope))
+    error = float(np.linalg.norm(sigma * slope / max(size, 1e-9)))
+    return size, error / float(np.sqrt(np.sum(since_s**2)))
+
+
+FAULT = Fault(
+    "accelerometer-change",
+    "an accelerometer that reads another gravity from some time on",
+    check,
+    after=("accelerometer-axes", "disagreement", "gyro-bias", "correlated-tracks"),
+)

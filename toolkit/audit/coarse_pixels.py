@@ -1,0 +1,60 @@
+"""Sightings that were rounded: to whole pixels or a simple part of one, or as half-precision numbers are.
+
+Rounding to steps of s adds errors of s / sqrt(12) to each coordinate (Bennett, "Spectra of quantized signals", 1948),
+and more to what is far: a disparity of a few pixels has few steps. A half-precision number above 512 px has steps of
+half a pixel, above 1024 px of a whole one.
+"""
+
+import numpy as np
+
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.geometry import Array
+
+# Steps (px) that are looked for; of what is finer nothing is said, for it adds less than 0.03 px.
+STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
+# With fewer sightings a few round ones may be chance. Of sound recordings an eighth are half-precision numbers at most.
+LEAST, NEARLY_ALL = 100, 0.999
+# Rounding counts as a warning from this share of the stated standard deviation on.
+MOST_SHARE = 0.5
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Tell the steps of the coordinates, and what they add to the stated noise."""
+    rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
+    seen_px = uv_px[np.isfinite(uv_px).all(axis=1)]
+    if len(seen_px) < LEAST:
+        return None
+    step_px, said = _step_px(seen_px)
+    if step_px is None:
+        return None
+    rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
+    return Symptom(
+        count=len(seen_px),
+        detail=f"{said}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px that are stated of uL",
+        treatment="write them with all the digits that the tracker has; far points suffer most",
+        remedy=None,
+        harmful=False,
+        warns=bool(rounding_px > MOST_SHARE * stated_px),
+    )
+
+
+def _step_px(uv_px: Array) -> tuple[float | None, str]:
+    """Return the step (px) of coordinates (N, 3), and in words whose it is; None where there is none that counts."""
+    for step_px in STEPS_PX:
+        steps = uv_px / step_px
+        if np.mean(np.abs(steps - np.round(steps)) < 1e-4) > NEARLY_ALL:
+            return step_px, f"uL, uR and v are multiples of {step_px:g} px"
+    with np.errstate(over="ignore"):
+        half = uv_px.astype(np.float16)
+    if np.mean(half == uv_px) <= NEARLY_ALL:
+        return None, ""
+    step_px = float(np.spacing(np.float16(np.median(np.abs(uv_px[:, 0])))))
+    return step_px, f"uL, uR and v are half-precision numbers, with steps of {step_px:g} px at the median uL"
+
+
+FAULT = Fault(
+    "coarse-pixels",
+    "sightings rounded to whole pixels or parts of one, or written as half-precision numbers",
+    check,
+    after=("not-finite", "implausible", "no-sightings"),
+)

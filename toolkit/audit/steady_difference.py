@@ -1,0 +1,78 @@
+"""Vision and odometry that part all along by more than chance, and by no more than slip makes of sound recordings.
+
+Odometry has a scale and a direction of its own, of tyres, slip and pitch. Where both differ from vision's by as much as
+those of sound drives do, nothing tells whether the calibration or the wheels are off by it; that they differ is certain
+all the same, and no estimator's covariance holds it.
+"""
+
+import numpy as np
+
+from toolkit.audit.correlated_tracks import err_by_themselves
+from toolkit.audit.fault import Evidence, Fault, Symptom
+from toolkit.audit.miscalibration import SYSTEMATIC_RAD
+from toolkit.audit.parts.turn import angle_of, turn_by_velocities
+from toolkit.audit.vision_scale import LARGEST_ERROR, SYSTEMATIC
+
+# Tracks that creep from image to image make so much more of both (a share, rad) in simulations, where nothing slips.
+SCALE_BY_CREEP, TURN_BY_CREEP_RAD = 0.005, 0.003
+
+
+def check(evidence: Evidence) -> Symptom | None:
+    """Tell the scale and the direction by which both differ, between chance and what counts as a fault."""
+    if evidence.intervals is None or evidence.sequence.motion_kind != "twist":
+        return None
+    said = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
+    if not said:
+        return None
+    return Symptom(
+        count=len(said),
+        detail=f"vision and odometry part all along: {'; '.join(said)}",
+        treatment=(
+            "a focal length, a baseline, a principal point or wheels that are off, or slip and pitch, which make as "
+            "much in sound recordings of cars; estimators count on none of it"
+        ),
+        remedy=None,
+        harmful=False,
+    )
+
+
+def _scale(evidence: Evidence) -> str | None:
+    found = evidence.alignment
+    if found is None or found.scale.error > LARGEST_ERROR or found.by_velocities is None:
+        return None
+    scale, error = found.scale
+    beyond = abs(scale) - found.scale_by_chance
+    if not 0.0 < beyond < SYSTEMATIC["twist"] or not _is_no_creep(evidence, beyond, SCALE_BY_CREEP):
+        return None
+    return (
+        f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
+        f"{'longer' if scale > 0.0 else 'shorter'} than the odometry's"
+    )
+
+
+def _direction(evidence: Evidence) -> str | None:
+    found = evidence.alignment
+    if found is None or found.by_velocities is None:
+        return None
+    turn = turn_by_velocities(found.by_velocities)
+    beyond_rad = float((np.abs(turn.rad) - turn.by_chance_rad).max())
+    if not 0.0 < beyond_rad < SYSTEMATIC_RAD["twist"] or not _is_no_creep(evidence, beyond_rad, TURN_BY_CREEP_RAD):
+        return None
+    angle, error = angle_of(turn)
+    return (
+        f"the camera goes {angle:.3f} +- {error:.3f} rad off the direction of the velocities, which is "
+        f"{angle * evidence.sequence.rig.fx_px:.0f} px of the principal point"
+    )
+
+
+def _is_no_creep(evidence: Evidence, beyond: float, by_creep: float) -> bool:
+    """Say whether what is beyond chance is more than tracks that creep make of it, or each sighting errs by itself."""
+    return beyond > by_creep or err_by_themselves(evidence)
+
+
+FAULT = Fault(
+    "steady-difference",
+    "vision and odometry that part all along, by no more than slip makes of sound recordings",
+    check,
+    after=("accelerometer-axes", "disagreement", "correlated-tracks"),
+)
