@@ -4,6 +4,7 @@ Source: Shao & Tu, "The Jackknife and Bootstrap" (1995), section 2.3: the delete
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,7 +21,9 @@ def jackknife_error(estimate: Callable[..., float], *rows: Array) -> float:
 
 def jackknife_cov(estimate: Callable[..., Array], *rows: Array, stretches: int = STRETCHES) -> Array:
     """Return the covariance (m, m) of an estimate (m,) from arrays (M, ...) in time, M no less than the stretches."""
-    stretch = np.arange(len(rows[0])) * stretches // len(rows[0])
-    without = np.array([estimate(*(one[stretch != k] for one in rows)) for k in range(stretches)])
+    ends = [-(-k * len(rows[0]) // stretches) for k in range(stretches + 1)]
+    without = np.array(
+        [estimate(*(np.concatenate([one[:begin], one[end:]]) for one in rows)) for begin, end in pairwise(ends)]
+    )
     off_mean = without - without.mean(axis=0)
     return np.asarray((stretches - 1) / stretches * off_mean.T @ off_mean)

@@ -35,6 +35,8 @@ def audited_once():
 
 audited_once()
 """
+# What a figure shows is tested elsewhere: here it is drawn, and encoded with few pixels.
+FEW_PIXELS = "%config InlineBackend.print_figure_kwargs = {'dpi': 20, 'bbox_inches': None}"
 
 each = pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.stem)
 
@@ -120,6 +122,7 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KernelManager]:
     with _one_processor():
         manager.start_kernel(cwd=str(NOTEBOOKS), env={**os.environ, **variables})
     run(AUDITED_ONCE, manager)
+    run(FEW_PIXELS, manager)
     yield manager
     manager.shutdown_kernel(now=True)
 

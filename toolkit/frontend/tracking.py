@@ -164,33 +164,31 @@ def _without_repeats(
 
 
 class _Matches(NamedTuple):
-    """Corners of a few pairs that were looked for, and found: in the partner, where left and right are exchanged, and
-    in the right images of the pairs before and after.
-    """
+    """Corners of a few pairs that were looked for in the partner, and found; the usable pairs by their places."""
 
+    places: tuple[int, ...]
     wanted: int
     matched: int
-    swapped: int
-    before: int
-    after: int
 
 
 def _looked_at(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend, bits: int) -> _Matches:
     """Match the corners of a few pairs, each by itself."""
-    places = np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int))
-    matched = swapped = wanted = before = after = 0
-    for place in places.tolist():
+    usable, wanted, matched = list[int](), 0, 0
+    for place in np.unique(np.linspace(0, len(pairs) - 1, _LOOKED_AT).astype(int)).tolist():
         images = read_pair(pairs[place], rig, bits)
-        exchanged = read_pair(pairs[place], rig, bits, (1, 0))
-        if isinstance(images, Unusable) or isinstance(exchanged, Unusable):
+        if isinstance(images, Unusable):
             continue
-        as_called = Tracker(rig, settings)
-        matched += _count(as_called, *images)
-        swapped += _count(Tracker(rig, settings), exchanged[1], exchanged[0])
-        wanted += as_called.tried
-        before += _matched_with(pairs, place, -1, rig, settings, bits)
-        after += _matched_with(pairs, place, 1, rig, settings, bits)
-    return _Matches(wanted, matched, swapped, before, after)
+        tracker = Tracker(rig, settings)
+        matched += _count(tracker, *images)
+        wanted += tracker.tried
+        usable.append(place)
+    return _Matches(tuple(usable), wanted, matched)
+
+
+def _exchanged(pair: StampedPair, rig: RectifiedPair, settings: Frontend, bits: int) -> int:
+    """Return how many corners of a pair are found in the partner where left and right are exchanged."""
+    images = read_pair(pair, rig, bits, (1, 0))
+    return 0 if isinstance(images, Unusable) else _count(Tracker(rig, settings), images[1], images[0])
 
 
 def _matched_with(
@@ -208,19 +206,23 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
     folders = f"{pairs[0].left.parent} and {pairs[0].right.parent}"
     if _all_alike(pairs, rig, bits):
         raise DataError(f"{folders}: left and right images are the same ones; one camera's were copied for both")
-    wanted, matched, swapped, before, after = _looked_at(pairs, rig, settings, bits)
+    places, wanted, matched = _looked_at(pairs, rig, settings, bits)
     least = max(_MOST_SWAPPED * matched, _LEAST_MATCHED * wanted)
-    if swapped > least:
+    # A pair begins so many tracks at most: where enough are found as called, no other way can find more by the factor.
+    most = settings.max_tracks * len(places)
+    if most > least and sum(_exchanged(pairs[place], rig, settings, bits) for place in places) > least:
         raise DataError(
             f"{folders}: left and right images are exchanged; exchange the two folders, or turn the images back if all "
             "are upside down or mirrored"
         )
-    if max(before, after) > least:
-        which = "before" if before > after else "after"
-        raise DataError(
-            f"{folders}: left images match the right images of the pair {which} theirs: one camera began earlier or "
-            "dropped an image; pair them by when they were taken"
-        )
+    if min(most, wanted) > least:
+        before, after = (sum(_matched_with(pairs, place, k, rig, settings, bits) for place in places) for k in (-1, 1))
+        if max(before, after) > least:
+            which = "before" if before > after else "after"
+            raise DataError(
+                f"{folders}: left images match the right images of the pair {which} theirs: one camera began earlier "
+                "or dropped an image; pair them by when they were taken"
+            )
     if matched < _LEAST_MATCHED * wanted:
         raise DataError(
             f"{folders}: only {matched} of {wanted} corners of left images are found in the same rows of the right "

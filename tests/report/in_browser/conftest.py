@@ -37,8 +37,8 @@ class Page:
         ]
         self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
         self.driver.get(path.as_uri())
-        self.run("localStorage.clear()")
-        self.driver.refresh()
+        if self.run("const kept = localStorage.length; localStorage.clear(); return kept"):
+            self.driver.refresh()
         self.settle()
 
     def settle(self) -> None:
