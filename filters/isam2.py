@@ -75,7 +75,7 @@ class Isam2:
         graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
-        values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
+        values, _, _, converged = solve(graph, start, stopping, self._progress, landmarks=beside)
         if beside is not None:
             graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
