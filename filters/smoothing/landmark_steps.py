@@ -135,6 +135,17 @@ class FirstImages:
         track_ids, begins = np.unique(np.concatenate([frame.track_ids for frame in frames]), return_index=True)
         return cls(track_ids, of_frame[begins], rig)
 
+    @classmethod
+    def in_graph(cls, graph: gtsam.NonlinearFactorGraph, rig: StereoRig) -> "FirstImages":
+        """Return the landmarks that factors of sightings in a graph see; what only linear factors hold is left out."""
+        first: dict[int, int] = {}
+        for factor in map(graph.at, range(graph.size())):
+            if isinstance(factor, gtsam.GenericStereoFactor3D | gtsam.GenericProjectionFactorCal3_S2):
+                frame, track_id = (gtsam.Symbol(key).index() for key in factor.keys())  # noqa: SIM118 - not a mapping
+                first[track_id] = min(frame, first.get(track_id, frame))
+        ids = sorted(first)
+        return cls(np.array(ids, dtype=np.int64), np.array([first[i] for i in ids], dtype=np.int64), rig)
+
     def taken(self, values: gtsam.Values, step: gtsam.VectorValues) -> gtsam.Values:
         """Return the values that a graph's own step leads to."""
         seen = LandmarksSeen.at(values, self.track_ids, self.first, self.rig)

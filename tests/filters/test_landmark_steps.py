@@ -206,3 +206,10 @@ def test_a_landmark_behind_its_camera_takes_its_metres():
     step.update(own)
     moved = images.taken(start, step).atPoint3(behind)
     np.testing.assert_allclose(moved, start.atPoint3(behind) + by_m, rtol=1e-12)
+
+
+def test_the_images_of_a_graph_are_those_of_its_frames():
+    graph, _, images = bent_drive(0)
+    found = FirstImages.in_graph(graph, DRIVE.rig)
+    np.testing.assert_array_equal(found.track_ids, images.track_ids)
+    np.testing.assert_array_equal(found.first, images.first)
