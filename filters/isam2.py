@@ -21,6 +21,7 @@ from filters.smoothing.chained_past import ChainedPast
 from filters.smoothing.graph_builder import LEARNT_AFTER_FRAMES, GraphBuilder, GraphExtension
 from filters.smoothing.indeterminate import Recovery, behind_camera, with_covariances
 from filters.smoothing.isam2_tree import FROZEN_AFTER_FRAMES, Isam2Tree
+from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Stopping, solve
 from filters.smoothing.linearisation_error import linearised_badly
 from filters.smoothing.robust_schedule import CHAIN_STOPPING
@@ -75,7 +76,8 @@ class Isam2:
         graph, motion = self._builder.brought_up_to_date(self._tree.graph()), self._builder.motion
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
-        values, _, _, converged = solve(graph, start, stopping, self._progress, beside=beside)
+        landmarks = FirstImages.in_graph(graph, self._rig) if beside is None else beside
+        values, _, _, converged = solve(graph, start, stopping, self._progress, landmarks=landmarks)
         if beside is not None:
             graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]
