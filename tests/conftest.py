@@ -148,6 +148,26 @@ def machine_paths() -> Callable[[str], list[str]]:
     return _OF_ONE_MACHINE.findall
 
 
+_count_memory_anew = runner._count_memory_anew
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _keeps_memory() -> Iterator[None]:
+    """Let runs begin with the memory that earlier ones have freed, but where their own is measured.
+
+    To give it back to the system and to have every page cleared again takes longer than many a run of these tests.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "_count_memory_anew", lambda: None)
+        yield
+
+
+@pytest.fixture
+def counts_memory_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have runs give memory back and begin to count its peak, as outside of tests."""
+    monkeypatch.setattr(runner, "_count_memory_anew", _count_memory_anew)
+
+
 @contextmanager
 def _without_pixels() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:

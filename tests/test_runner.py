@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -188,6 +189,15 @@ def test_a_pause_counts_in_the_time_and_not_in_the_processors(sequence):
     assert timings.finish_s >= 0.05
     assert timings.cpu_s < timings.total_s, "sleeping is no work"
     assert timings.peak_rss_mb > 10.0
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="this system cannot count a peak anew")
+def test_memory_that_earlier_work_took_is_not_counted(sequence, counts_memory_anew):
+    before_mb = run(Perfect, sequence).timings.peak_rss_mb
+    earlier = np.ones(25_000_000)
+    del earlier
+    # 200 MB, of which such a run takes none.
+    assert run(Perfect, sequence).timings.peak_rss_mb < before_mb + 100.0
 
 
 def test_a_failed_run_has_the_timings_of_what_it_did(sequence):

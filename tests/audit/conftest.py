@@ -1,13 +1,14 @@
 """Short clean recordings of every kind, and the faults that can be planted in them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pytest
 
-from toolkit.audit import Audit, audit
+from toolkit.audit import Audit, audit, fault
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
@@ -187,6 +188,37 @@ def plant(request: pytest.FixtureRequest) -> Plant:
     scenario, fault = request.param
     # A lag of the twists shows only where there are turns enough.
     return PLANTS[fault](clean(scenario, duration_s=30.0 if fault == "twist-lag" else None))
+
+
+def _once(
+    function: Callable[..., Any], of: Callable[..., tuple[object, ...]] = lambda *given: given
+) -> Callable[..., Any]:
+    """Return a function that remembers what came of the same objects; it keeps them, so that none takes their id."""
+    kept: dict[tuple[int, ...], tuple[object, Any]] = {}
+
+    def remembered(*given: Any) -> Any:
+        key = tuple(map(id, of(*given)))
+        if key not in kept:
+            kept[key] = given, function(*given)
+        return kept[key][1]
+
+    return remembered
+
+
+@pytest.fixture(scope="module")
+def derived_once() -> Iterator[None]:
+    """Derive what several faults look at once of a recording, though it is audited three times: whole, kept, repaired.
+
+    What follows from the same tracks, or from the same recording, is the same: an audit itself goes by that.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        tracks = _once(
+            fault.camera_motion, lambda sequence: (sequence.observations, sequence.frames_t_ns, sequence.rig)
+        )
+        patch.setattr(fault, "camera_motion", tracks)
+        for name in ("compare", "alignment", "self_calibration"):
+            patch.setattr(fault, name, _once(getattr(fault, name)))
+        yield
 
 
 @pytest.fixture
