@@ -21,7 +21,7 @@ MOST_SHARE = 0.5
 def check(evidence: Evidence) -> Symptom | None:
     """Tell the steps of the coordinates, and what they add to the stated noise."""
     rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
-    seen_px = uv_px[np.isfinite(uv_px).all(axis=1)]
+    seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
     if len(seen_px) < LEAST:
         return None
     step_px, said = _step_px(seen_px)
@@ -39,17 +39,17 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _step_px(uv_px: Array) -> tuple[float | None, str]:
-    """Return the step (px) of coordinates (N, 3), and in words whose it is; None where there is none that counts."""
+    """Return the step (px) of coordinates (N, 2), and in words whose it is; None where there is none that counts."""
     for step_px in STEPS_PX:
         steps = uv_px / step_px
         if np.mean(np.abs(steps - np.round(steps)) < 1e-4) > NEARLY_ALL:
-            return step_px, f"uL, uR and v are multiples of {step_px:g} px"
+            return step_px, f"uL and uR are multiples of {step_px:g} px"
     with np.errstate(over="ignore"):
         half = uv_px.astype(np.float16)
     if np.mean(half == uv_px) <= NEARLY_ALL:
         return None, ""
     step_px = float(np.spacing(np.float16(np.median(np.abs(uv_px[:, 0])))))
-    return step_px, f"uL, uR and v are half-precision numbers, with steps of {step_px:g} px at the median uL"
+    return step_px, f"uL and uR are half-precision numbers, with steps of {step_px:g} px at the median uL"
 
 
 FAULT = Fault(
