@@ -48,7 +48,8 @@ _LEAST_LEFT = 0.02
 # An offset is told from so many standard errors and from a millisecond on: few stamps are better than that.
 _SIGMAS, _LEAST_S = 5.0, 1e-3
 # A rate is told from so much on and up to as much, for beyond that other stretches of a path fit as well; it makes the
-# positions fit so many times as well as any offset does, and shifts no larger share of the time than that. The fit begins with this share of the pairs about the middle and takes in more and more of them.
+# positions fit so many times as well as any offset does, and shifts no larger share of the time than that. The fit
+# begins with this share of the pairs about the middle and takes in more and more of them.
 _LEAST_RATE, _MOST_RATE, _TIMES_BETTER, _SHARES = 1e-3, 0.1, 3.0, (0.15, 0.3, 0.6, 1.0)
 _RATE_REMARK = (
     "time passes {:.4f} +- {:.4f} times as fast by its stamps as by the truth's: with that its positions fit to "
