@@ -48,6 +48,15 @@ def test_a_sound_truth_and_a_sound_noise_are_not_accused(scenario: str, seed: in
     assert overstated_noise.check(evidence) is None
 
 
+@pytest.mark.parametrize(("metres", "unit"), [(0.3048, "feet"), (0.9144, "yards"), (0.0254, "inches")])
+def test_a_truth_in_another_unit_is_named_and_not_taken_for_another_motion(
+    drive: Sequence, metres: float, unit: str
+) -> None:
+    found = with_truth(drive, truth_of(faults.truth_unit(drive, 1.0 / metres)))
+    assert isinstance(found, Symptom)
+    assert f"times the truth's, as of one in {unit}" in found.detail
+
+
 @pytest.mark.parametrize("scale", [0.8, 1.25, 2.0])
 @pytest.mark.parametrize("recording", ["drive", "flight"])
 def test_a_wrong_baseline_is_told_with_its_size(recording: str, scale: float, request: pytest.FixtureRequest) -> None:

@@ -263,3 +263,20 @@ def test_feet_are_no_kilometres_an_hour() -> None:
     (unit,) = (f.detail for f in audit(faults.linear_unit(sound, 3.281)).findings if f.fault == "units")
     assert "it is in ft/s" in unit
     assert "units" not in found_in(faults.linear_unit(sound, 3.43))  # half-way between the two: nobody's
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("scenario", "duration_s", "dose"), [("flight", 6.0, 1.1), ("drive-imu", 12.0, 1.05), ("drive", 12.0, 1.1)]
+)
+def test_a_gyro_that_turns_too_fast_is_told_with_the_ratio(
+    scenario: str, duration_s: float, dose: float, seed: int
+) -> None:
+    sound = simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=seed % 2 == 1), 60 + seed)
+    assert "miscalibration" not in found_in(sound)
+    told = re.search(
+        r"turns ([\d.]+) \+- ([\d.]+) times as fast", found_in(faults.angular_unit(sound, dose))["miscalibration"]
+    )
+    assert told is not None
+    # The noise of the camera's rotation lowers the ratio by up to 1.5 %.
+    assert float(told[1]) == pytest.approx(dose, abs=0.015 + 3.0 * float(told[2]))

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -328,6 +329,23 @@ def test_time_coverage_of_keyframes_counts_gaps(scene, vislam) -> None:
     assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 34.0 / 59.95)
     assert vislam("evaluate", "truth.tum", "keyframes.tum", "--gap", "12", "--out", "out", "--quiet") == 0
     assert document()["runs"][0]["metrics"]["time_coverage_percent"] == pytest.approx(100.0 * 46.0 / 59.95)
+
+
+def test_an_estimate_that_stays_looks_one_way_or_leaps_is_remarked_and_a_sound_one_not(scene, vislam) -> None:
+    t_ns = scene.stamps(10.0)
+    sound = scene.estimated(t_ns, 0.05)
+    stays, one_way, leaps = sound.copy(), sound.copy(), sound.copy()
+    stays[:, :3, 3], one_way[:, :3, :3] = stays[0, :3, 3], np.eye(3)
+    leaps[200:300, :3, 3] += [30.0, 0.0, 0.0]
+    for name, poses in (("sound", sound), ("stays", stays), ("one_way", one_way), ("leaps", leaps)):
+        scene.write(f"{name}.tum", t_ns, poses)
+    assert vislam("evaluate", "truth.tum", "sound.tum", "stays.tum", "one_way.tum", "leaps.tum", "--out", "out") == 0
+    notes = {run["estimator"]: run["notes"] for run in document()["runs"]}
+    assert "ate_se3_m" not in notes["sound"]
+    assert "stands still" in notes["stays"]["ate_se3_m"]
+    assert "orientations are all one" in notes["one_way"]["ate_se3_deg"]
+    assert "leaps, 2 time(s), the farthest by 30" in notes["leaps"]["ate_se3_m"]
+    assert re.search(r" (19|29)\.9 s after its first pose", notes["leaps"]["ate_se3_m"])
 
 
 def test_a_truth_that_stands_still_is_remarked_beside_what_moves(scene, vislam, capsys) -> None:

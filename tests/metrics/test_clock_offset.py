@@ -91,3 +91,9 @@ def test_a_drift_and_noise_are_no_rate_of_a_clock(seed: int) -> None:
 def test_another_scale_is_no_rate_of_a_clock(scale: float) -> None:
     t_s = PERIOD_S * np.arange(300)
     assert "time passes" not in compared(t_s, path(t_s), scale * path(t_s)).notes.get("clock_offset_ms", "")
+
+
+def test_another_stretch_of_the_path_is_no_rate_of_a_clock() -> None:
+    t_s = PERIOD_S * np.arange(150)
+    for late_s in (4.0, 9.0, 15.0):
+        assert "time passes" not in compared(t_s, path(t_s), path(t_s - late_s)).notes.get("clock_offset_ms", "")

@@ -9,7 +9,6 @@ import numpy as np
 
 from toolkit.audit.correlated_tracks import err_by_themselves
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.deviations import fallen_mps
 from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
@@ -26,13 +25,12 @@ LARGEST_HIDDEN = 0.05
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Compare the gravity that is read before and after."""
-    sequence, intervals = evidence.sequence, evidence.intervals
+    sequence = evidence.sequence
     if sequence.motion_kind != "imu":
         return None
-    if intervals is None:
+    if evidence.intervals is None:
         return evidence.blind
-    w_bias = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
-    middle_ns, fallen = fallen_mps(sequence, evidence.camera_motion, w_bias)
+    middle_ns, fallen = evidence.fallen
     t_s, known = (middle_ns - sequence.frames_t_ns[0]) / NS_PER_S, evidence.camera_motion.known
     steps = {share: _step(t_s, fallen, known, share * sequence.duration_s) for share in CUTS}
     found = {share: step for share, step in steps.items() if step is not None}

@@ -13,7 +13,8 @@ from toolkit.geometry import Array
 # Steps (px) that are looked for; of what is finer nothing is said, for it adds less than 0.03 px.
 STEPS_PX = (1.0, 0.5, 0.25, 0.2, 0.125, 0.1)
 # With fewer sightings a few round ones may be chance. Of sound recordings an eighth are half-precision numbers at most.
-LEAST, NEARLY_ALL = 100, 0.999
+# Of so many first ones a smaller share will do, to look at the rest.
+LEAST, SOME, NEARLY_ALL = 100, 0.9, 0.999
 # Rounding counts as a warning from this share of the stated standard deviation on.
 MOST_SHARE = 0.5
 
@@ -21,7 +22,7 @@ MOST_SHARE = 0.5
 def check(evidence: Evidence) -> Symptom | None:
     """Tell the steps of the coordinates, and what they add to the stated noise."""
     rig, uv_px = evidence.sequence.rig, evidence.sequence.observations.uv_px
-    seen_px = uv_px[np.isfinite(uv_px).all(axis=1)]
+    seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
     if len(seen_px) < LEAST:
         return None
     step_px, said = _step_px(seen_px)
@@ -39,17 +40,27 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 def _step_px(uv_px: Array) -> tuple[float | None, str]:
-    """Return the step (px) of coordinates (N, 3), and in words whose it is; None where there is none that counts."""
+    """Return the step (px) of coordinates (N, 2), and in words whose it is; None where there is none that counts."""
+    some_px = uv_px[:LEAST]  # most recordings are refuted by them
     for step_px in STEPS_PX:
-        steps = uv_px / step_px
-        if np.mean(np.abs(steps - np.round(steps)) < 1e-4) > NEARLY_ALL:
-            return step_px, f"uL, uR and v are multiples of {step_px:g} px"
-    with np.errstate(over="ignore"):
-        half = uv_px.astype(np.float16)
-    if np.mean(half == uv_px) <= NEARLY_ALL:
+        if _share_round(some_px, step_px) > SOME and _share_round(uv_px, step_px) > NEARLY_ALL:
+            return step_px, f"uL and uR are multiples of {step_px:g} px"
+    if _share_half(some_px) <= SOME or _share_half(uv_px) <= NEARLY_ALL:
         return None, ""
     step_px = float(np.spacing(np.float16(np.median(np.abs(uv_px[:, 0])))))
-    return step_px, f"uL, uR and v are half-precision numbers, with steps of {step_px:g} px at the median uL"
+    return step_px, f"uL and uR are half-precision numbers, with steps of {step_px:g} px at the median uL"
+
+
+def _share_round(uv_px: Array, step_px: float) -> float:
+    """Return the share of coordinates that are multiples of a step."""
+    steps = uv_px / step_px
+    return float(np.mean(np.abs(steps - np.round(steps)) < 1e-4))
+
+
+def _share_half(uv_px: Array) -> float:
+    """Return the share of coordinates that are half-precision numbers."""
+    with np.errstate(over="ignore"):
+        return float(np.mean(uv_px.astype(np.float16) == uv_px))
 
 
 FAULT = Fault(

@@ -24,7 +24,8 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     sequence, found = evidence.sequence, list[tuple[Deviation, Span]]()
     speed_mps = float(np.median(np.linalg.norm(evidence.intervals.v_cam_mps, axis=1)))
-    for deviation in deviations(sequence, evidence.camera_motion, evidence.intervals):
+    fallen = evidence.fallen if sequence.motion_kind == "imu" else None
+    for deviation in deviations(sequence, evidence.camera_motion, evidence.intervals, fallen):
         least = LEAST[deviation.what] + LEAST_OF_SPEED * speed_mps * (deviation.what == "velocity")
         found += [(deviation, span) for span in sustained(deviation, SIGMAS, least)]
     if not found:

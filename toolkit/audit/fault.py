@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from toolkit.audit.parts.alignment import Alignment, alignment
+from toolkit.audit.parts.deviations import Fallen, fallen_mps
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import OneStep, one_step
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
@@ -124,6 +125,12 @@ class Evidence:
             return None
         return self_calibration(self.sequence, self.camera_motion, self.intervals)
 
+    @cached_property
+    def fallen(self) -> Fallen:
+        """The camera's velocity less what the IMU gained, of a recording that has ``intervals``."""
+        assert self.intervals is not None
+        return fallen_mps(self.sequence, self.camera_motion, self.intervals)
+
     def after(self, remedy: Sequence) -> "Evidence":
         """Return the evidence after a repair; what tracks alone show is kept where it left them as they were."""
         now, before = Evidence(remedy, self.spoilt_by), self.sequence
@@ -131,7 +138,7 @@ class Evidence:
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
             known = ["camera_motion", "one_step"]
             if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
-                known += ["intervals", "alignment", "self_calibration"]
+                known += ["intervals", "alignment", "self_calibration", "fallen"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

@@ -25,7 +25,10 @@ SIGMAS = 5.0
 # What sound recordings at hand have beyond their standard errors: turns (rad) by velocities, for cars slip and pitch,
 # and by rotations. Chosen with them in view.
 SYSTEMATIC_RAD = {"twist": 0.018, "imu": 0.01}
-SYSTEMATIC_RATIO = 0.05
+# The same of the force over gravity, and of the gyro's rates over the camera's, whose noise lowers that: beyond five
+# standard errors above one, of 699 parts of sound recordings two beside odometry have 0.011 at most and none beside an
+# IMU anything. Chosen with them in view.
+SYSTEMATIC_FORCE, SYSTEMATIC_RATE = 0.05, {"twist": 0.025, "imu": 0.01}
 # Where a turn must be larger than this to be seen, it is said.
 LARGEST_RAD = 0.05
 
@@ -37,11 +40,15 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return evidence.blind
     judged = _judged(evidence, intervals)
     wrongs, rotation = list(judged.wrongs), rotation_ratio(intervals)
-    if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation):
+    if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation, SYSTEMATIC_RATE[evidence.sequence.motion_kind]):
         said = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
         wrongs.append(Wrong(said, "the scale of the gyro and the focal length"))
     force = force_ratio(evidence.sequence)
-    if force is not None and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO and _is_off(force):
+    if (
+        force is not None
+        and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO
+        and _is_off(force, SYSTEMATIC_FORCE)
+    ):
         said = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
         wrongs.append(Wrong(said, "the scale and the bias of the accelerometer"))
     if not wrongs:
@@ -108,8 +115,8 @@ def _undecided(least_rad: float, by_velocity: bool) -> str | None:
     return f"where the camera looks: {hidden} would not show, for {cause}"
 
 
-def _is_off(ratio: Scalar) -> bool:
-    return abs(ratio.value - 1.0) > SIGMAS * ratio.error + SYSTEMATIC_RATIO
+def _is_off(ratio: Scalar, systematic: float) -> bool:
+    return abs(ratio.value - 1.0) > SIGMAS * ratio.error + systematic
 
 
 FAULT = Fault(

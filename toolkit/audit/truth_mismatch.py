@@ -48,6 +48,8 @@ DRIVES, MOST_STANDING = 5.0, 0.5
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
 # An offset of the truth's clock beyond so many standard errors and so much (s) counts.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
+# Lengths (m) that a truth is written in by mistake; millimetres and centimetres are converted (`units`).
+LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
 _OTHER = "check that the truth is this recording's, in order and in the axes it is read in; distrust what rests on it"
 
@@ -98,19 +100,20 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     off = {"moves": _off(both.displaced_m[:, moved])}
     if turned.sum() >= max(LEAST_WINDOWS, LEAST_TURNING * moved.sum()):
         off["turns"] = _off(both.turned_rad[:, turned])
-    elsewhere = [
-        f"it {how} otherwise, by {100.0 * share.value:.0f} +- {100.0 * share.error:.0f} % of the larger of both"
+    elsewhere = {
+        how: f"it {how} otherwise, by {100.0 * share.value:.0f} +- {100.0 * share.error:.0f} % of the larger of both"
         for how, share in off.items()
         if share.value - share.by_chance > MOST_OFF
-    ]
-    if elsewhere:
-        return _told(f"the truth's motion is not the camera's: {' and '.join(elsewhere)}", _OTHER)
+    }
     seen, true = both.displaced_m[:, moved]
     scale = _ratio(seen, true)
     only_longer = scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
+    if "turns" in elsewhere or (elsewhere and not only_longer):
+        return _told(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
         return None
-    return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's", _WHERE)
+    unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
+    return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
 
 
 def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:

@@ -219,5 +219,5 @@ FAULT = Fault(
     "units",
     "times, lengths, speeds, rates of rotation or accelerations in another unit than SI",
     check,
-    after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics"),
+    after=("stale-frames", "doubled-disparity", "no-disparity", "time-gap", "intrinsics", "exchanged-samples"),
 )

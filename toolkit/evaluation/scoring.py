@@ -82,6 +82,13 @@ _OF_POSITIONS = tuple(metric.key for metric in ate.METRICS)
 _STANDS = (
     "the truth stands still, all its positions are one: these are the estimate's own motion, unless it ought to stand"
 )
+# What an estimate that repeats one pose, or leaps, makes of errors. It leaps where it goes so much farther (m) than the
+# truth from one pose to the next, and so many times as far as it does as a rule.
+_STAYS = "the estimate stands still, all its positions are one: it has nothing but the truth's own motion for errors"
+_LOOKS_ONE_WAY = "the estimate's orientations are all one, as where none was written: these are the truth's own turns"
+_OF_ORIENTATIONS = ("ate_se3_deg", "rpe_1s_m", "rpe_1s_deg", "rpe_100m_percent", "kitti_t_percent", "kitti_r_deg_per_m")
+_LEAPS = "the estimate leaps, {} time(s), the farthest by {:.3g} m {:.1f} s after its first pose"
+_LEAST_LEAP_M, _TIMES_USUAL = 0.5, 20.0
 # Frames without stamps are taken to be so far apart where only their order matters.
 _FRAME_NS = NS_PER_S // 10
 _ALONG_AN_AXIS = 0.9
@@ -168,9 +175,31 @@ def score_file(path: Path, truth: TruthFile, terms: Terms) -> Scores:
         scores = scores.without(
             _OF_THE_BODY, f"its poses are of a body with other axes than the truth's: {_axes(turn)}"
         )
-    if np.ptp(matched.truth[:, :3, 3], axis=0).max() == 0.0 < np.ptp(matched.estimate[:, :3, 3], axis=0).max():
+    if _changes(matched.estimate[:, :3, 3]) and not _changes(matched.truth[:, :3, 3]):
         scores = scores.remarked(_OF_POSITIONS, _STANDS)
+    scores = _with_the_estimates_own(scores, matched)
     return scores.remarked([_PAIRS.key], _how_matched(estimate, truth, terms.max_dt_s))
+
+
+def _with_the_estimates_own(scores: Scores, matched: Matched) -> Scores:
+    """Remark on an estimate that never moves or turns beside a truth that does, and on one that leaps."""
+    truth, estimate = matched.truth, matched.estimate
+    if _changes(truth[:, :3, 3]) and not _changes(estimate[:, :3, 3]):
+        return scores.remarked(_OF_POSITIONS, _STAYS)
+    if _changes(truth[:, :3, :3]) and not _changes(estimate[:, :3, :3]):
+        scores = scores.remarked(_OF_ORIENTATIONS, _LOOKS_ONE_WAY)
+    true_m, step_m = (np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (truth, estimate))
+    leaps = (step_m > true_m + _LEAST_LEAP_M) & (step_m > _TIMES_USUAL * np.median(step_m))
+    if not leaps.any():
+        return scores
+    row = int(np.argmax(np.where(leaps, step_m, 0.0)))
+    at_s = float(matched.t_ns[row] - matched.t_ns[0]) / NS_PER_S
+    return scores.remarked(_OF_POSITIONS, _LEAPS.format(int(leaps.sum()), step_m[row], at_s))
+
+
+def _changes(values: Array) -> bool:
+    """Say whether any of values (n, ...) is not the same all along."""
+    return bool(np.ptp(values, axis=0).max() > 0.0)
 
 
 def _stamped(file: PosesFile, truth: TruthFile, offset_s: float) -> Poses:

@@ -47,9 +47,10 @@ _FEWEST_PAIRS, _WIDEST_STEPS = 3 * STRETCHES, 1.5
 _LEAST_LEFT = 0.02
 # An offset is told from so many standard errors and from a millisecond on: few stamps are better than that.
 _SIGMAS, _LEAST_S = 5.0, 1e-3
-# A rate is told from so much on, where it makes the positions fit so many times as well as any offset does. The fit
+# A rate is told from so much on and up to as much, for beyond that other stretches of a path fit as well; it makes the
+# positions fit so many times as well as any offset does, and shifts no larger share of the time than that. The fit
 # begins with this share of the pairs about the middle and takes in more and more of them.
-_LEAST_RATE, _MOST_RATE, _TIMES_BETTER, _SHARES = 1e-3, 0.5, 3.0, (0.15, 0.3, 0.6, 1.0)
+_LEAST_RATE, _MOST_RATE, _TIMES_BETTER, _SHARES = 1e-3, 0.1, 3.0, (0.15, 0.3, 0.6, 1.0)
 _RATE_REMARK = (
     "time passes {:.4f} +- {:.4f} times as fast by its stamps as by the truth's: with that its positions fit to "
     "{:.3g} m in place of {:.3g} m; stamp both by one clock"
@@ -172,7 +173,7 @@ def _from_the_middle(t_s: Array, true: Array, estimated: Array, usable: BoolArra
             at = _linearised(path, at_s[rows], estimated[rows])
             step = _clock(at.error_m, at.jacobian, since_s[rows])
             clock += step
-            if share == 1.0 and abs(step[0]) < _SETTLED_S:
+            if share == 1.0 and abs(step[0]) < _SETTLED_S and abs(clock[0]) < _MOST_RATE * t_s[-1]:
                 return float(clock[1]), since_s[rows], at
     raise Unavailable("no rate was found from which the fit does not step on")
 

@@ -31,7 +31,7 @@ def _setting(description: str, unit: str = "", *, none: str = "", **within: floa
 
 
 PolicyName = Literal["robust", "gate", "none", "classic"]
-HuberThreshold = Annotated[float, Meta(gt=0.0, extra={"unit": "sigma"})] | None
+HuberThreshold = Annotated[float, Meta(ge=1e-3, le=1e6, extra={"unit": "sigma"})] | None
 
 
 class Outliers(Struct, frozen=True, forbid_unknown_fields=True):

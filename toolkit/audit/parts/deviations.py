@@ -55,10 +55,12 @@ class Span(NamedTuple):
     size: float
 
 
-def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> tuple[Deviation, ...]:
+def deviations(
+    sequence: Sequence, camera: CameraMotion, intervals: Intervals, fallen: "Fallen | None" = None
+) -> tuple[Deviation, ...]:
     """Return what can be compared: rotation, and the velocity of twists or the specific force of an IMU.
 
-    The gyro's constant bias is taken off first.
+    The gyro's constant bias is taken off first. ``fallen`` is that of `fallen_mps`, where it is known.
     """
     T_imu_cam = sequence.rig.T_imu_cam
     frame_s = (sequence.frames_t_ns - sequence.frames_t_ns[0]) / NS_PER_S
@@ -67,7 +69,7 @@ def deviations(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -
     bias_radps = np.median(w_radps, axis=0)
     rotation = _of_medians("rate of rotation", "rad/s", t_s, w_radps - bias_radps)
     if intervals.v_mps is None:
-        return rotation, _specific_force(sequence, camera, bias_radps)
+        return rotation, _specific_force(sequence, camera, fallen or fallen_mps(sequence, camera, intervals))
     lever_mps = np.cross(intervals.w_radps - bias_radps, T_imu_cam[:3, 3])
     v_mps = intervals.v_mps + lever_mps - intervals.v_cam_mps @ T_imu_cam[:3, :3].T
     return rotation, _of_medians("velocity", "m/s", t_s, v_mps)
@@ -147,7 +149,7 @@ def _scatter(value: Array) -> Array:
     return np.asarray(MAD_TO_SIGMA * np.median(change, axis=0) / np.sqrt(2.0))
 
 
-def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array) -> Deviation:
+def _specific_force(sequence: Sequence, camera: CameraMotion, found: "Fallen") -> Deviation:
     """Return what the change of the camera's velocity leaves of the specific force, less gravity as it is around then.
 
     In the axes of the first frame, into which the gyro turns everything, the velocity changes by the specific force
@@ -155,9 +157,12 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     of both: a median of what shakes or falls is no mean.
     """
     frames_t_ns = sequence.frames_t_ns
-    middle_ns, fallen = fallen_mps(sequence, camera, bias_radps)
+    middle_ns = found.middle_ns
     h_s = np.diff(middle_ns)[:, None] / NS_PER_S
-    fallen -= np.median(np.diff(fallen, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
+    fallen = (
+        found.velocity_mps
+        - np.median(np.diff(found.velocity_mps, axis=0) / h_s, axis=0) * (middle_ns - middle_ns[0])[:, None] / NS_PER_S
+    )
     smooth = np.asarray(np.median(_neighbours(fallen, _MEDIAN_OF // 2), axis=-1))
     sound = _neighbours(camera.known.astype(float), _MEDIAN_OF // 2).min(axis=-1) > 0.0
     rows = np.flatnonzero(sound[1:] & sound[:-1])
@@ -169,12 +174,20 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, bias_radps: Array)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
 
 
-def fallen_mps(sequence: Sequence, camera: CameraMotion, bias_radps: Array) -> tuple[IntArray, Array]:
-    """Return the middle (K - 1,) of each interval, and the camera's velocity (K - 1, 3) less what the IMU gained.
+class Fallen(NamedTuple):
+    """The middle (K - 1,) of each interval, and the camera's velocity (K - 1, 3) less what the IMU gained until then.
 
-    In the axes of the first frame, into which the gyro, less its bias (3,), turns everything: what is left falls with
+    In the axes of the first frame, into which the gyro, less its bias, turns everything: what is left falls with
     gravity.
     """
+
+    middle_ns: IntArray
+    velocity_mps: Array
+
+
+def fallen_mps(sequence: Sequence, camera: CameraMotion, intervals: Intervals) -> Fallen:
+    """Take what the IMU gained from the camera's velocity."""
+    bias_radps = np.median(intervals.w_radps - intervals.w_cam_radps @ sequence.rig.T_imu_cam[:3, :3].T, axis=0)
     R_imu_cam, p_imu_cam = sequence.rig.T_imu_cam[:3, :3], sequence.rig.T_imu_cam[:3, 3]
     frames_t_ns, motion = sequence.frames_t_ns, sequence.motion
     middle_ns = frames_t_ns[:-1] + np.diff(frames_t_ns) // 2
@@ -187,7 +200,7 @@ def fallen_mps(sequence: Sequence, camera: CameraMotion, bias_radps: Array) -> t
     R_first_imu = chained(half @ half)
     v_first = (R_first_imu[middle_at] @ v_mps[:, :, None]).squeeze(-1)
     gained = (R_first_imu[:-1] @ half @ mean[:, :3, None]).squeeze(-1) * step_s
-    return middle_ns, v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at]
+    return Fallen(middle_ns, v_first - np.concatenate([np.zeros((1, 3)), np.cumsum(gained, axis=0)])[middle_at])
 
 
 def _neighbours(values: Array, reach: int) -> Array:

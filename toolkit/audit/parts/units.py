@@ -7,7 +7,7 @@ import numpy as np
 
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar, median_error
-from toolkit.geometry import Array
+from toolkit.geometry import Array, IntArray
 from toolkit.measured_motion import ImuSamples, TwistNoise, TwistSamples
 from toolkit.models.noise import white_sigma
 from toolkit.resampling import NS_PER_S
@@ -78,14 +78,19 @@ def linear_scaled(sequence: Sequence, linear: float, angular: float = 1.0) -> Se
     scaled = motion.of(motion.t_ns, motion.values * np.repeat([linear, angular], 3))
     if not (isinstance(motion, TwistSamples) and isinstance(noise, TwistNoise)):
         return replace(sequence, motion=scaled)
-    root_dt = np.sqrt(np.median(np.diff(motion.t_ns)) / NS_PER_S)
     velocity, gyro_noise = noise.velocity_noise_density, noise.gyro_noise_density
-    if linear != 1.0 and (velocity > FROM_SCATTER * white_sigma(motion.v_mps) * root_dt).all():
+    if linear != 1.0 and is_from_scatter(velocity, motion.v_mps, motion.t_ns):
         velocity = linear * velocity
-    if angular != 1.0 and (gyro_noise > FROM_SCATTER * white_sigma(motion.w_radps) * root_dt).all():
+    if angular != 1.0 and is_from_scatter(gyro_noise, motion.w_radps, motion.t_ns):
         gyro_noise = angular * gyro_noise
     return replace(
         sequence,
         motion=scaled,
         noise=replace(noise, velocity_noise_density=velocity, gyro_noise_density=gyro_noise),
     )
+
+
+def is_from_scatter(density: Array, values: Array, t_ns: IntArray) -> bool:
+    """Say whether a density (3,) of white noise is what a loader makes of the scatter of the samples (S, 3)."""
+    root_dt = np.sqrt(np.median(np.diff(t_ns)) / NS_PER_S)
+    return bool((density > FROM_SCATTER * white_sigma(values) * root_dt).all())

@@ -37,7 +37,10 @@ def parse(rows: Rows) -> PosesFile:
     t_ns = rows.stamps(1)
     unit = probable_unit_of_ns(table[:, 0])
     if unit is not None:
-        raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}")
+        hint = (
+            "; a TUM file has blanks between its columns" if unit.startswith("seconds") and rows.width == _WIDTH else ""
+        )
+        raise DataError(f"{rows.path}: time must be in nanoseconds, but the stamps look like {unit}{hint}")
     T_world_imu = checked_poses(rows.path, rows.line_numbers, t_ns, table[:, 1:_WIDTH][:, _TO_XYZW])
     return PosesFile(rows.path, "EuRoC", t_ns, T_world_imu, W_LAST)
 
