@@ -80,7 +80,7 @@ class Batch:
         trajectory, log = self._with_covariances(smoothed)
         values = smoothed.solution.values
         landmarks = Landmarks.of({i: values.atPoint3(L(i)) for i in seen_ids(smoothed.frames)})
-        return Finished(trajectory, landmarks, smoothed.solution.converged, log + self._tracks.told)
+        return Finished(trajectory, landmarks, smoothed.solution.converged, log + self._tracks.messages)
 
     def _with_covariances(self, smoothed: Smoothed) -> tuple[Trajectory, tuple[str, ...]]:
         values = smoothed.solution.values

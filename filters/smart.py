@@ -83,7 +83,7 @@ class Smart:
         return Finished(
             Trajectory.of(self._states),
             Landmarks.of(self._points),
-            log=(*self._noise.told, *self._tracks.told, *self._log),
+            log=(*self._noise.messages, *self._tracks.messages, *self._log),
         )
 
     def _extended(self, packet: Packet) -> TrackedWindow:

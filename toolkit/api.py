@@ -27,7 +27,7 @@ from toolkit.experiment import run as run_plan
 from toolkit.experiment.configuration import Configuration, Request
 from toolkit.experiment.recording import Part
 from toolkit.progress import silent
-from toolkit.report.comparison_table import columns_asked, comparison_table
+from toolkit.report.comparison_table import comparison_table, requested_columns
 from toolkit.report.table import Table, as_markdown, as_text
 from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Settings, SettingsError, as_values, settings_of
@@ -165,7 +165,7 @@ class Result:
 
     def table(self, *columns: str) -> "ShownTable":
         """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
-        return ShownTable(comparison_table(self.comparison, columns_asked(columns)))
+        return ShownTable(comparison_table(self.comparison, requested_columns(columns)))
 
     @cached_property
     def figures(self) -> Mapping[str, "Figure"]:
@@ -199,8 +199,8 @@ class Result:
         from toolkit.report.run_directory import MadeBy, write_run
 
         target = Path(directory)
-        asked = Configuration(Request(), self.comparison.settings)
-        write_run(self.comparison, target, MadeBy("toolkit.compare", asked, figure_format, figures))
+        requested = Configuration(Request(), self.comparison.settings)
+        write_run(self.comparison, target, MadeBy("toolkit.compare", requested, figure_format, figures))
         return target
 
     def __repr__(self) -> str:

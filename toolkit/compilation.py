@@ -18,14 +18,14 @@ from typing import BinaryIO, Literal
 
 from toolkit.errors import EstimatorError
 
-Asked = Literal["auto", "compiled", "numpy"]
+Requested = Literal["auto", "compiled", "numpy"]
 Ran = Literal["compiled", "numpy"]
 _NEEDS = "needs numba, which is not installed: pip install 'vislam-toolkit[fast]', or --no-fast"
 
 
-def check_possible(asked: Asked) -> None:
+def check_possible(requested: Requested) -> None:
     """Raise EstimatorError where compiled code is asked for and cannot be had here."""
-    if asked == "compiled" and find_spec("numba") is None:
+    if requested == "compiled" and find_spec("numba") is None:
         raise EstimatorError(f"arithmetic = compiled {_NEEDS}")
 
 
@@ -36,8 +36,8 @@ class Compilation:
     ``wall_s`` and ``cpu_s`` what importing and compiling took, which is once a process and no cost of the run.
     """
 
-    def __init__(self, asked: Asked = "numpy") -> None:
-        self._asked = asked
+    def __init__(self, requested: Requested = "numpy") -> None:
+        self._requested = requested
         self.ran: Ran | None = None
         self.log: tuple[str, ...] = ()
         self.wall_s = self.cpu_s = 0.0
@@ -61,9 +61,9 @@ class Compilation:
                     self._imported(name, nullcontext())
 
     def _can_run(self) -> bool:
-        check_possible(self._asked)
+        check_possible(self._requested)
         self.ran = "numpy"
-        return self._asked != "numpy" and find_spec("numba") is not None
+        return self._requested != "numpy" and find_spec("numba") is not None
 
     def _imported(self, name: str, turn: AbstractContextManager[object]) -> ModuleType | None:
         """Import a module when it is this process's turn, and take down what that took."""
@@ -75,7 +75,7 @@ class Compilation:
         except Exception as error:
             # A numba that does not fit this Python or NumPy says so in errors of many kinds.
             why = " ".join(str(error).split())[:200]
-            if self._asked == "compiled":
+            if self._requested == "compiled":
                 raise EstimatorError(f"arithmetic = compiled: numba cannot be used here ({why})") from error
             self.log = tuple(dict.fromkeys([*self.log, f"numba cannot be used here, NumPy ran: {why}"]))
             return None

@@ -38,7 +38,7 @@ _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
 
 # Covariances are linearised anew at every frame: what a correction takes away shows in their difference down to such a
 # share of a standard deviation. Of a position that is uncertain by 20 m that is 0.2 m: a turn of the whole way behind.
-_TOLD_APART = 0.01
+_RESOLUTION = 0.01
 
 
 def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
@@ -65,11 +65,14 @@ def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = No
     if not info.keys() >= {"gate_tested", "gate_accepted"}:
         return None
     tested, accepted = np.nan_to_num(info["gate_tested"]), np.nan_to_num(info["gate_accepted"])
-    for part, words in ((slice(None), "its measurements"), (slice(3 * tested.size // 4, None), "its last quarter's")):
+    for part, part_name in (
+        (slice(None), "its measurements"),
+        (slice(3 * tested.size // 4, None), "its last quarter's"),
+    ):
         passed, count = accepted[part].sum(), tested[part].sum()
         if count >= _FEWEST_TESTED and passed < LEAST_ACCEPTED * count:
             return (
-                f"{100.0 * passed / count:.0f} % of {words} passed its own gate: its covariance does not cover its "
+                f"{100.0 * passed / count:.0f} % of {part_name} passed its own gate: its covariance does not cover its "
                 f"error{doubt} (at least {100.0 * LEAST_ACCEPTED:.0f} % pass in a run that works)"
             )
     return None
@@ -96,7 +99,7 @@ def _step_distances(trajectory: Trajectory, sequence: Sequence) -> Array:
     cov = _LUMP_FRAMES * noise
     if trajectory.cov is not None:
         cov = cov + _taken_away(trajectory.cov[start], trajectory.cov[end], transition, noise)
-        cov = cov + _TOLD_APART**2 * _finite(trajectory.cov[end][:, POSE, POSE])
+        cov = cov + _RESOLUTION**2 * _finite(trajectory.cov[end][:, POSE, POSE])
     return mahalanobis_squared(deviation, cov)
 
 

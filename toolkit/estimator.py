@@ -111,13 +111,15 @@ class EstimatorEntry:
 
     def _rules(self) -> Mapping[str, bool | str]:
         rules = self.found.constants().get("RULES", {})
-        said = rules if isinstance(rules, dict) else {"": False}
-        if not all(rule in RULES and (what is True or (what and isinstance(what, str))) for rule, what in said.items()):
+        declared = rules if isinstance(rules, dict) else {"": False}
+        if not all(
+            rule in RULES and (what is True or (what and isinstance(what, str))) for rule, what in declared.items()
+        ):
             raise EstimatorError(
                 f"estimator {self.name}: RULES in {self.found.path.name} maps some of {', '.join(RULES)} to True, "
                 "or to the reason why the estimator does not obey it"
             )
-        return said
+        return declared
 
     def check_usable(self, settings: Settings) -> None:
         """Raise EstimatorError unless the estimator can be imported and reads every option set for it.

@@ -98,7 +98,7 @@ class _Log:
     def __init__(self, label: str, stream: TextIO) -> None:
         self._label, self._stream = label, stream
         self._done, self._total, self._began_s = 0, 0, time.monotonic()
-        self._first_s = self._told_s = self._began_s
+        self._first_s = self._shown_s = self._began_s
 
     def advance(self, done: int, total: int, stage: str = "") -> None:
         """Write a line where the last one is long past."""
@@ -107,7 +107,7 @@ class _Log:
             self._began_s = now_s
         self._done, self._total = done, total
         times_longer = min(max((now_s - self._first_s) / _SELDOM_AFTER_S, 1.0), _MOST_SELDOM)
-        if now_s - self._told_s < LOG_EVERY_S * times_longer:
+        if now_s - self._shown_s < LOG_EVERY_S * times_longer:
             return
         from tqdm import tqdm
 
@@ -116,7 +116,7 @@ class _Log:
         meter = tqdm.format_meter(done, total, now_s - self._began_s, prefix=label, bar_format=line)
         self._stream.write(f"{meter}\n")
         self._stream.flush()
-        self._told_s = now_s
+        self._shown_s = now_s
 
 
 def of_this_process() -> ProgressFor:

@@ -100,8 +100,8 @@ def updated_by_pose_sightings(belief: Belief, residual_px: Array, H_pose: Array,
     rows = weighted.reshape(-1, 6)
     matrix, vector = rows.T @ H_pose.reshape(-1, 6), rows.T @ residual_px.reshape(-1)
     cov_pose = belief.cov[:, POSE]
-    told = np.column_stack([matrix @ cov_pose.T, vector])
-    taken = cov_pose @ np.linalg.solve(np.eye(6) + matrix @ cov_pose[POSE], told)
+    information = np.column_stack([matrix @ cov_pose.T, vector])
+    taken = cov_pose @ np.linalg.solve(np.eye(6) + matrix @ cov_pose[POSE], information)
     return belief.moved(taken[:, -1], belief.cov - taken[:, :-1])
 
 

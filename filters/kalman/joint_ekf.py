@@ -85,7 +85,7 @@ class JointEkf:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the run."""
-        return self._noise.told + self._correlation.told
+        return self._noise.messages + self._correlation.messages
 
     def _start_new(self, frame: StereoFrame) -> None:
         """Start the tracks the state does not have from this one view of them."""

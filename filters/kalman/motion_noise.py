@@ -30,7 +30,7 @@ BY_CHANCE = 1e-6
 # Of the variance: an IMU that errs a hundred times as much as it states has another fault, of which the status tells.
 _MOST = 1e4
 # Less rounds to 1.0 times the stated noise and is not logged.
-_LEAST_TOLD = 1.05
+_LEAST_REPORTED = 1.05
 
 
 # Tests what measurements made of a belief.
@@ -62,10 +62,10 @@ class MatchedNoise:
         return {"motion_noise_scale": self._applied}
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """Return a line for the log where the stated noise did not hold, else nothing."""
         most, usual = np.sqrt([max(self._scales), np.median(self._scales)])
-        if most < _LEAST_TOLD:
+        if most < _LEAST_REPORTED:
             return ()
         return (
             f"the tracks contradict the IMU: its noise was taken for up to {most:.1f} times what is stated "

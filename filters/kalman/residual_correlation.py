@@ -47,7 +47,7 @@ _MOST_CORRELATED = 0.98
 # the noise of the course's (0.17).
 _LEAST_WHITE_NOISE = 0.05
 # What rounds to the full information is none to speak of.
-_MOST_TOLD = 0.95
+_MOST_REPORTED = 0.95
 # Gates, robust weights and linearisation leave residuals of white landmarks correlated, however many there are: by up
 # to 0.07 where there are thousands, on drive, flight and exports of OpenVINS. Tracks that walk are beyond 0.5.
 _LEAST_OF_LANDMARKS = 0.15
@@ -94,9 +94,9 @@ class ResidualCorrelation:
         return (1.0 + rho) / (1.0 - rho) * self._squares / self._pairs if rho > 0.0 else 0.0
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """Return what a user should know, a line, where tracks do not count in full."""
-        if self.share > _MOST_TOLD:
+        if self.share > _MOST_REPORTED:
             return ()
         together = self._neighbours.erring_as_one(self.correlation)
         neighbours = f" {together:.1f} neighbours as one," if together > 1.0 else ""

@@ -110,7 +110,7 @@ class SlidingWindowFilter:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the run."""
-        return self._noise.told + self._correlation.told + self._landmark_correlation.told
+        return self._noise.messages + self._correlation.messages + self._landmark_correlation.messages
 
     def _correct_by_landmarks(self, frame: StereoFrame, gate: FrameGate) -> None:
         gate.share = self._landmark_correlation.share

@@ -67,10 +67,10 @@ def triangulate(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) ->
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if not unsettled.any():
             break
-    told, blind = wide, lacking(uvs_px, seen, wide)
+    determined, blind = wide, lacking(uvs_px, seen, wide)
     if blind.any():
-        told = wide | (blind & is_determined(fit.hessian, fit.depth_m))
-    return fit.points, told & (fit.depth_m > LEAST_DEPTH_M)
+        determined = wide | (blind & is_determined(fit.hessian, fit.depth_m))
+    return fit.points, determined & (fit.depth_m > LEAST_DEPTH_M)
 
 
 def nearest_view(uvs_px: Array, seen: BoolArray, poses: Array, rig: StereoRig) -> tuple[Array, BoolArray]:

@@ -93,8 +93,8 @@ class _Linearised:
         """Say where (N,) old linearisations are off by now, weigh something else, or have Jacobians of elsewhere."""
         now, then = self.about, old.about
         steps = _step(then.own, now.own), _step(then.before, now.before), now.points - then.points
-        said = sum((by @ step[..., None])[..., 0] for by, step in zip(old.linear[1:], steps, strict=True))
-        off = np.linalg.norm(old.linear.innovation - said - self.linear.innovation, axis=1)
+        predicted = sum((by @ step[..., None])[..., 0] for by, step in zip(old.linear[1:], steps, strict=True))
+        off = np.linalg.norm(old.linear.innovation - predicted - self.linear.innovation, axis=1)
         off_or_heavier = (off > RENEW_BEYOND) | (np.abs(self.weight / old.weight - 1.0) > RENEW_BEYOND)
         return np.asarray(off_or_heavier | self.jacobians_at.differ_from(old.jacobians_at))
 

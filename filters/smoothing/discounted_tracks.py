@@ -97,9 +97,9 @@ class DiscountedTracks:
         return discounted(self._rig, self._huber, self.share)
 
     @property
-    def told(self) -> tuple[str, ...]:
+    def messages(self) -> tuple[str, ...]:
         """Return what a user should know, a line, where tracks do not count in full."""
-        return self._correlation.told
+        return self._correlation.messages
 
     def learn(self, frames: list[StereoFrame], T_world_imu: Array, points: Mapping[int, Array]) -> None:
         """Take in what the first of two frames saw of points (3,) m, beside the second one, from poses (2, 4, 4)."""

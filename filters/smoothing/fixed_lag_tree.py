@@ -309,11 +309,11 @@ class FixedLagTree:
         latest leads: then no other has states that it has not, and they are eliminated as one clique, not each as one
         of nearly all that is left.
         """
-        told = [key for key in landmarks if self._first_seen_ns[key] < self._oldest_ns]
-        told.sort(key=self._landmark_stamps_ns.__getitem__)
-        turns = [told[i : i + _MOST_AT_ONCE] for i in range(0, len(told), _MOST_AT_ONCE)]
-        untold = [key for key in landmarks if self._first_seen_ns[key] >= self._oldest_ns]
-        return [untold, *(part for turn in turns for part in (turn[-1:], turn[:-1]))]
+        connected = [key for key in landmarks if self._first_seen_ns[key] < self._oldest_ns]
+        connected.sort(key=self._landmark_stamps_ns.__getitem__)
+        turns = [connected[i : i + _MOST_AT_ONCE] for i in range(0, len(connected), _MOST_AT_ONCE)]
+        unconnected = [key for key in landmarks if self._first_seen_ns[key] >= self._oldest_ns]
+        return [unconnected, *(part for turn in turns for part in (turn[-1:], turn[:-1]))]
 
 
 def _goes_with(landmark: int, factor: gtsam.NonlinearFactor) -> bool:

@@ -135,7 +135,7 @@ class GraphBuilder:
 
     def log(self) -> tuple[str, ...]:
         """Return what a user should know of the motion and the tracks that were taken in."""
-        return self._noise.told + self._tracks.told
+        return self._noise.messages + self._tracks.messages
 
     def contradicted(self) -> set[int]:
         """Return the landmarks to be dropped after a packet, for what their tracks show is elsewhere."""

@@ -47,11 +47,11 @@ class ScaleState:
             covs, of_scale = covs_beside(linear, motion, trajectory.T_world_imu, (SCALE,))
         except RuntimeError as refusal:
             return trajectory, (f"disparities are {100.0 * scale:+.2f} % longer", no_covariances(refusal))
-        return replace(trajectory, cov=covs), (self.in_words(scale, float(np.sqrt(of_scale[0, 0]))),)
+        return replace(trajectory, cov=covs), (self.message_of(scale, float(np.sqrt(of_scale[0, 0]))),)
 
-    def in_words(self, scale: float, sigma: float) -> str:
+    def message_of(self, scale: float, sigma: float) -> str:
         """Say what came of the scale."""
-        told = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
+        message = f"disparities are {100.0 * scale:+.2f} +- {100.0 * sigma:.2f} % longer than the rig says"
         if sigma > _UNTOLD * self.prior_sigma:
-            return f"{told}: the measurements do not tell, and that is the prior"
-        return f"{told} (prior 0 +- {100.0 * self.prior_sigma:g} %)"
+            return f"{message}: the measurements do not tell, and that is the prior"
+        return f"{message} (prior 0 +- {100.0 * self.prior_sigma:g} %)"

@@ -82,7 +82,7 @@ def test_what_odometry_cannot_tell_is_not_judged(unknown: int) -> None:
 def test_the_error_that_is_told_has_what_sound_recordings_err_by_in_it() -> None:
     rig = recorded(DRIVE, 0).rig
     (told,) = wrong(SelfCalibration(0.2 * np.eye(COMMON)[0], 1e-12 * np.eye(COMMON), 1), rig, "twist")
-    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in told.said
+    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in told.summary
 
 
 def test_of_a_long_drive_the_windows_that_turn_are_taken() -> None:
@@ -95,8 +95,8 @@ def test_a_sound_drive_is_not_accused_and_one_with_a_wrong_focal_length_is(seed:
     sound = recorded(DRIVE, seed)
     assert audit(sound).findings == ()
     for dose in (0.9, 1.1):
-        said = {finding.fault: finding.detail for finding in audit(faults.wrong_focal_length(sound, dose)).findings}
-        assert f"tracks and odometry fit fx_px = {sound.rig.fx_px / 100.0:.0f}" in said["miscalibration"]
+        summary = {finding.fault: finding.detail for finding in audit(faults.wrong_focal_length(sound, dose)).findings}
+        assert f"tracks and odometry fit fx_px = {sound.rig.fx_px / 100.0:.0f}" in summary["miscalibration"]
 
 
 def test_a_drive_that_hardly_turns_says_what_would_not_show() -> None:

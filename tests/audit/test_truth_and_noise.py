@@ -145,7 +145,7 @@ def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
 @pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y turned (positions alone)"])
 def test_a_truth_in_exchanged_axes_is_told_with_those(flight: Sequence, words: str) -> None:
     truth = truth_of(flight)
-    (exchange,) = (one for one in exchanges() if one.in_words == words)
+    (exchange,) = (one for one in exchanges() if one.description == words)
     found = with_truth(flight, replace(truth, T_world_imu=exchange.reread(truth.T_world_imu)))
     assert isinstance(found, Symptom)
     assert f"but for one with {words}" in found.detail

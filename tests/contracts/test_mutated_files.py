@@ -270,10 +270,10 @@ def run_on(files: Files, capfd: pytest.CaptureFixture[str]) -> None:
         words = ("compare", str(path), "--estimators", "dead-reckoning", "--max-frames", "4", "--workers", "1")
         words += ("--figures", "none")
         status = main([*words, "--out", str(out)])
-        told = capfd.readouterr()
-        assert status in (0, 1, 3), told.err
-        assert told.err.count("\n") == (status == 3)
-        assert told.out.replace("\n", " ").isprintable()
+        messages = capfd.readouterr()
+        assert status in (0, 1, 3), messages.err
+        assert messages.err.count("\n") == (status == 3)
+        assert messages.out.replace("\n", " ").isprintable()
         entries = {entry.name for entry in Path(folder).iterdir()}
         assert entries == ({"given"} if status == 3 else {"given", "run"})
         assert (out / "manifest.json").is_file() == (status != 3)

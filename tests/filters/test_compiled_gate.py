@@ -219,15 +219,15 @@ def test_what_was_kept_is_compiled_anew_when_any_source_of_its_folder_changes(ke
     other = tmp_path / "other.py"
     other.write_text("ONE = 1\n")
 
-    def told() -> str:
+    def messages() -> str:
         sys.modules.pop("kept_one", None)
         return what_was_compiled(kept((types.float64,), tmp_path)(importlib.import_module("kept_one").add), "add was")
 
-    assert told() == "add was compiled, once for this version"
-    assert told() == ""
+    assert messages() == "add was compiled, once for this version"
+    assert messages() == ""
     other.write_text("ONE = 1.0\n")
-    assert told() != ""
-    assert told() == ""
+    assert messages() != ""
+    assert messages() == ""
 
 
 @pytest.mark.parametrize("kind", [".nbi", ".nbc"])
@@ -240,14 +240,14 @@ def test_what_was_kept_and_is_damaged_is_thrown_away_and_compiled_anew(kernels, 
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "kept_two.py").write_text("def add(x):\n    return x + 1.0\n")
 
-    def told() -> str:
+    def messages() -> str:
         sys.modules.pop("kept_two", None)
         kernel = kept((types.float64,), tmp_path)(importlib.import_module("kept_two").add)
         assert kernel(1.0) == 2.0
         return what_was_compiled(kernel, "add was")
 
-    assert told() != ""
+    assert messages() != ""
     (file,) = tmp_path.rglob(f"*{kind}")
     file.write_bytes(damaged(file.read_bytes()))
-    assert told() == "add was compiled, once for this version"
-    assert told() == ""
+    assert messages() == "add was compiled, once for this version"
+    assert messages() == ""

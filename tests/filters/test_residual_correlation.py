@@ -84,8 +84,8 @@ def learnt_of_pairs(rig, correlation, counts_neighbours):
 
 def test_landmarks_count_for_less_by_the_neighbours_that_err_as_one(drive):
     alone, beside = (learnt_of_pairs(drive.rig, 0.8, counts) for counts in (False, True))
-    assert "neighbours" not in alone.told[0]
-    assert "neighbours as one" in beside.told[0]
+    assert "neighbours" not in alone.messages[0]
+    assert "neighbours as one" in beside.messages[0]
     assert beside.share < 0.6 * alone.share
 
 
@@ -97,7 +97,7 @@ def test_landmarks_whose_tracks_are_white_count_in_full_whatever_errs_as_one(dri
 def test_white_errors_count_in_full(drive, seed):
     found = learnt(drive.rig, 0.0, seed)
     assert found.share == 1.0
-    assert found.told == ()
+    assert found.messages == ()
 
 
 def test_correlated_errors_count_for_as_much_as_their_mean_is_worth(drive):
@@ -108,7 +108,7 @@ def test_correlated_errors_count_for_as_much_as_their_mean_is_worth(drive):
     found = learnt(drive.rig, correlation)
     assert worth == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.01)
     assert worth < found.share < 1.6 * worth
-    assert f"{found.correlation:.2f} from frame to frame" in found.told[0]
+    assert f"{found.correlation:.2f} from frame to frame" in found.messages[0]
 
 
 def test_noise_stated_large_enough_for_correlated_errors_counts_in_full(drive):
@@ -167,7 +167,7 @@ def test_landmarks_of_the_state_count_for_as_much_as_the_mean_of_their_errors_is
     correlation = 0.6
     found = learnt_by_frame(drive.rig, correlation)
     assert found.share == pytest.approx((1.0 - correlation) / (1.0 + correlation), rel=0.15)
-    assert "tracks of landmarks in the state came to count for" in found.told[0]
+    assert "tracks of landmarks in the state came to count for" in found.messages[0]
 
 
 def test_landmarks_whose_residuals_are_hardly_correlated_count_in_full(drive):

@@ -26,16 +26,16 @@ SETTINGS = Settings(noise=Noise(match_tracks=False), outliers=POLICIES["none"])
     ids=["msckf_fej", "msckf_slam", "fixed_lag"],
 )
 def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(estimator, rate_hz, oracle):
-    told, white = [], []
+    messages, white = [], []
     scenario = replace(SCENARIO, camera=replace(SCENARIO.camera, rate_hz=rate_hz))
     for seed in range(3):
         sequence = oracle.with_track_errors(scenario, NOISE, seed)
         untold = replace(sequence, rig=replace(sequence.rig, track_noise=None))
-        for which, found in ((sequence, told), (untold, white)):
+        for which, found in ((sequence, messages), (untold, white)):
             result = run("one", estimator.build, which, which.prior, settings=SETTINGS)
             scores = score_run(result, "causal", which, only=["nees_pose_mean"])
             found.append(scores.values["nees_pose_mean"])
     # Errors of successive poses are nearly the same one: of three runs the mean is known to a third at best.
-    assert 0.5 < np.mean(told) < 1.6
+    assert 0.5 < np.mean(messages) < 1.6
     # Above what is let pass for honest, by more than the mean of the runs of an honest filter varies.
     assert np.mean(white) > 1.8

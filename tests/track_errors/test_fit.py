@@ -12,7 +12,7 @@ from toolkit.geometry import se3_exp, se3_inverse, se3_log
 from toolkit.sequence import Sequence
 from toolkit.settings import settings_of
 from toolkit.simulation.faults import few_tracks, identity_intrinsics
-from toolkit.track_errors import Fit, fit_track_noise, in_words
+from toolkit.track_errors import Fit, fit_track_noise, summary_of
 from toolkit.track_errors.adjustment import adjusted, started
 from toolkit.track_errors.likelihood import Residuals, Tailed, likelihood, linearised
 from toolkit.track_errors.tracklets import MOST_SIGHTINGS, middle_of_pair, tracklets
@@ -30,7 +30,7 @@ def test_a_planted_walk_and_offset_are_found(walking_fit: Fit) -> None:
     np.testing.assert_allclose(noise.offset_px, [0.0, OFFSET_PX, 0.0], rtol=0.12)
     assert noise.white_px.max() < 0.06
     assert walking_fit.gain > 5.0 * walking_fit.gain_error
-    assert "an offset of 0." in in_words(walking_fit, np.eye(3))
+    assert "an offset of 0." in summary_of(walking_fit, np.eye(3))
 
 
 def test_white_noise_comes_out_white(white_fit: Fit) -> None:
@@ -38,9 +38,9 @@ def test_white_noise_comes_out_white(white_fit: Fit) -> None:
     # c is the mean of two columns of 1 px, d their difference, v the mean of two rows; 600 tracks are good for 3 %.
     np.testing.assert_allclose(white_fit.noise.white_px, [np.sqrt(0.5), np.sqrt(2.0), np.sqrt(0.5)], rtol=0.1)
     stated_px2 = 2.0**2 * np.diag([1.0, 1.0, 0.5])
-    assert "each sighting by itself" in in_words(white_fit, stated_px2)
+    assert "each sighting by itself" in summary_of(white_fit, stated_px2)
     times = re.search(
-        r"recording's own 1.41/2.83/1.41 px in c/d/v, ([\d.]+) times that", in_words(white_fit, stated_px2)
+        r"recording's own 1.41/2.83/1.41 px in c/d/v, ([\d.]+) times that", summary_of(white_fit, stated_px2)
     )
     assert times is not None
     assert float(times[1]) == pytest.approx(2.0, rel=0.05)

@@ -20,7 +20,7 @@ from toolkit.sequence import Sequence
 # Share of the sightings that a repair may drop; frames cut off with theirs do not count, for what stays is whole.
 MOST_LOST = 0.2
 
-__all__ = ["Audit", "Finding", "audit", "faults", "judged_again"]
+__all__ = ["Audit", "Finding", "audit", "checked_again", "faults"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     return Audit(evidence.sequence, tuple(findings), undecided)
 
 
-def judged_again(found: Audit, name: str, sequence: Sequence) -> Audit:
+def checked_again(found: Audit, name: str, sequence: Sequence) -> Audit:
     """Return an audit with one fault, of those that nothing repairs, checked anew in what became of the recording."""
     fault = next(fault for fault in _ordered() if fault.name == name)
     findings = tuple(finding for finding in found.findings if finding.fault != name)

@@ -62,10 +62,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     jumps = [step for step in steps if step.is_jump]
     if not jumps:
         open_s = [f"{step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s" for step in steps if step.gone is None]
-        said = f"the stamps of frames and samples leap together by {', '.join(open_s)}"
-        return Undecided(f"{said}: the tracks do not tell whether time passed") if open_s else None
+        summary = f"the stamps of frames and samples leap together by {', '.join(open_s)}"
+        return Undecided(f"{summary}: the tracks do not tell whether time passed") if open_s else None
     usual_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
-    told = [
+    jumps_text = [
         f"by {step.by_s:+.3g} s at {_at_s(sequence, step):.1f} s (by the tracks "
         f"{usual_s * step.gone.value:.3f} +- {usual_s * step.gone.error:.3f} s passed)"
         for step in jumps
@@ -74,7 +74,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     remedy = _longest_stretch(sequence, jumps)
     return Symptom(
         count=len(jumps),
-        detail=f"the clock of frames and samples is set {', '.join(told)}",
+        detail=f"the clock of frames and samples is set {', '.join(jumps_text)}",
         treatment=f"the longest stretch without a jump is kept: {remedy.frame_count} of {sequence.frame_count} frames",
         remedy=remedy,
     )

@@ -33,7 +33,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     samples = "the IMU" if sequence.motion_kind == "imu" else "odometry"
     return Symptom(
         count=len(found),
-        detail=f"vision and {samples} disagree at {', '.join(_in_words(*one) for one in sorted(found, key=_begin))}",
+        detail=f"vision and {samples} disagree at {', '.join(_detail(*one) for one in sorted(found, key=_begin))}",
         treatment="moving objects or wrong samples: distrust every estimate from there on",
         remedy=None,
         harmful=False,
@@ -50,7 +50,7 @@ def _in_ns(span: Span, first_ns: int) -> tuple[int, int]:
     return first_ns + round(span.begin_s * NS_PER_S), first_ns + round(span.end_s * NS_PER_S)
 
 
-def _in_words(deviation: Deviation, span: Span) -> str:
+def _detail(deviation: Deviation, span: Span) -> str:
     return f"{span.begin_s:.0f}-{span.end_s:.0f} s (by {span.size:.2g} {deviation.unit} of {deviation.what})"
 
 

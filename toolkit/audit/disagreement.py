@@ -31,18 +31,18 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     found = agreement(evidence.sequence, evidence.camera_motion)
-    said = _ratios(evidence)
-    if found.residual_px > found.limit_px or found.own_px > found.limit_px or said:
-        said.append(
+    findings = _ratios(evidence)
+    if found.residual_px > found.limit_px or found.own_px > found.limit_px or findings:
+        findings.append(
             f"the tracks miss the measured motion by {found.residual_px:.2f} px from frame to frame (median; noise "
             f"explains {found.limit_px:.2f} px at most) and the camera's own best motion by {found.own_px:.2f} px"
         )
-    if not said:
+    if not findings:
         return None
     treatment = "T_imu_cam, the intrinsics, the baseline or the samples are wrong: check them"
     if found.own_px > found.limit_px:
         treatment = "the intrinsics or the tracks themselves are wrong: check K and the pixels"
-    return Symptom(count=1, detail="; ".join(said), treatment=treatment, remedy=None)
+    return Symptom(count=1, detail="; ".join(findings), treatment=treatment, remedy=None)
 
 
 def _ratios(evidence: Evidence) -> list[str]:
@@ -50,20 +50,22 @@ def _ratios(evidence: Evidence) -> list[str]:
     assert evidence.intervals is not None
     speed, force = speed_ratio(evidence.intervals), force_ratio(evidence.sequence)
     rotation = rotation_ratio(evidence.intervals)
-    said = []
+    findings = []
     angle_deg = _median_angle_deg(evidence)
     if angle_deg is not None and angle_deg > MOST_ANGLE_DEG:
-        said.append(f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)")
+        findings.append(f"the samples' velocity points {angle_deg:.0f} degrees away from the camera's (median)")
     if speed is not None and _is_off(speed, 1.0 / MOST_RATIO, MOST_RATIO):
         meant = _units_meant(speed.value, SPEEDS | OTHER_SPEEDS)
-        said.append(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}")
+        findings.append(f"the samples' speed is {speed.value:.3g} +- {speed.error:.1g} times the camera's{meant}")
     if _is_off(rotation, 0.0, MOST_RATIO):
         meant = _units_meant(rotation.value, RATES | OTHER_RATES)
-        said.append(f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}")
+        findings.append(
+            f"the gyro turns {rotation.value:.3g} +- {rotation.error:.1g} times as fast as the camera{meant}"
+        )
     if force is not None and _is_off(force, 1.0 / MOST_FORCE_RATIO, MOST_FORCE_RATIO):
         meant = _units_meant(force.value, FORCES | OTHER_FORCES)
-        said.append(f"the accelerometer reads {force.value:.3g} times gravity (median){meant}")
-    return said
+        findings.append(f"the accelerometer reads {force.value:.3g} times gravity (median){meant}")
+    return findings
 
 
 def _units_meant(ratio: float, factors: Mapping[str, float]) -> str:

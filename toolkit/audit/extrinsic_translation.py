@@ -33,8 +33,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     where = f"in turns the tracks put it {share.value:.2f} +- {share.error:.2f} of the way (of {apart_m:.2f} m) to"
     if not is_there(share):
-        said = f"the camera is at {metres(given)}, or at {metres(candidate)} if that is the translation of the inverse"
-        return Undecided(f"{said}: {where} there, and turns so few or wide tell no better")
+        summary = (
+            f"the camera is at {metres(given)}, or at {metres(candidate)} if that is the translation of the inverse"
+        )
+        return Undecided(f"{summary}: {where} there, and turns so few or wide tell no better")
     return Symptom(
         count=1,
         detail=(

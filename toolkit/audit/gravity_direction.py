@@ -41,12 +41,12 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     largest = int(np.argmax(np.abs(measured)))
     axis[largest] = np.sign(measured[largest])
     measured_text, given_text = _rounded(measured), _rounded(given)
-    told = f"the samples fall along {measured_text} m/s^2 of the truth's world, and gravity_world is {given_text}"
+    summary = f"the samples fall along {measured_text} m/s^2 of the truth's world, and gravity_world is {given_text}"
     certain = _angle_deg(axis, measured) < NEAR_AXIS_DEG
     gravity_world = (size_mps2 if size_mps2 > 0.0 else STANDARD_MPS2) * axis
     return Symptom(
         count=1,
-        detail=told,
+        detail=summary,
         treatment=f"it is set to {_rounded(gravity_world)}"
         if certain
         else "no axis of the world is near: set it right",

@@ -41,12 +41,12 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if not jumps.size:
         return None
     stay = [k for k in jumps.tolist() if _stays(intervals, sequence.rig.T_imu_cam, k, turn_rad[k])]
-    told = [f"{frame_s[intervals.interval[k]]:.1f} s (by {angle_rad[k]:.3f} rad)" for k in stay or jumps.tolist()]
+    places = [f"{frame_s[intervals.interval[k]]:.1f} s (by {angle_rad[k]:.3f} rad)" for k in stay or jumps.tolist()]
     if not stay:
-        return Undecided(f"the camera jumps at {', '.join(told)}, and its velocity does not show that it stays so")
+        return Undecided(f"the camera jumps at {', '.join(places)}, and its velocity does not show that it stays so")
     return Symptom(
         count=len(stay),
-        detail=f"the image jumps, and not the vehicle, at {', '.join(told)}",
+        detail=f"the image jumps, and not the vehicle, at {', '.join(places)}",
         treatment="the camera was knocked or the image was cropped anew: cut the recording there",
         remedy=None,
         harmful=False,

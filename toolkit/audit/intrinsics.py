@@ -55,7 +55,7 @@ def check(evidence: Evidence) -> Symptom | None:
     return Symptom(
         count=len(faults),
         detail=(
-            f"{'; '.join(words for _, words in faults)}: the tracks miss the camera's own best motion by "
+            f"{'; '.join(summary for _, summary in faults)}: the tracks miss the camera's own best motion by "
             f"{given_px:.2f} px, and by {other_px:.2f} px with ordinary values"
         ),
         treatment="the true ones are not in the data: mend K, or the pixels",
@@ -91,11 +91,11 @@ def _suspects(rig: StereoRig, low: Array, high: Array) -> list[tuple[dict[str, A
     if not NARROWEST * rig.fx_px < width_px < WIDEST * rig.fx_px:
         angle_deg = np.degrees(2.0 * np.arctan2(0.5 * width_px, rig.fx_px))
         usual_px = width_px / USUAL
-        words = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
-        found.append(({"fx_px": usual_px, "fy_px": usual_px}, words))
+        summary = f"fx_px = {rig.fx_px:g} makes the sightings, {width_px:.0f} px across, a view of {angle_deg:.1f} deg"
+        found.append(({"fx_px": usual_px, "fy_px": usual_px}, summary))
     elif not 1.0 / MOST_STRETCHED < rig.fy_px / rig.fx_px < MOST_STRETCHED:
-        words = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are not square by far"
-        found.append(({"fy_px": rig.fx_px}, words))
+        summary = f"fy_px = {rig.fy_px:g} beside fx_px = {rig.fx_px:g}: pixels are not square by far"
+        found.append(({"fy_px": rig.fx_px}, summary))
     return found
 
 
@@ -106,12 +106,12 @@ def _resized(rig: StereoRig, middle: Array) -> tuple[dict[str, Any], str] | None
     if ratio.max() > ALIKE * ratio.min() or 1.0 / USUAL < factor < USUAL:
         return None
     names = ("fx_px", "fy_px", "cx_px", "cy_px")
-    words = (
+    summary = (
         f"K with (cx_px, cy_px) = ({rig.cx_px:.0f}, {rig.cy_px:.0f}) looks like that of images of {1.0 / factor:.2g}"
     )
     return {
         name: factor * getattr(rig, name) for name in names
-    }, f"{words} times the size of those the sightings are in"
+    }, f"{summary} times the size of those the sightings are in"
 
 
 def _own_px(sequence: Sequence, camera: CameraMotion) -> float:

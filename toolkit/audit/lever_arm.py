@@ -48,20 +48,20 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     found, kind = _place(evidence), evidence.sequence.motion_kind
-    if found is None or not (judged := found.error_m < LARGEST_ERROR_M).any():
+    if found is None or not (decidable := found.error_m < LARGEST_ERROR_M).any():
         errors = "" if found is None else f" to {', '.join(f'{error:.1f}' for error in found.error_m)} m"
         return Undecided(f"too little rotation: where the camera is along x, y and z is not known{errors}")
-    off = judged & (np.abs(found.lacking_m) > found.least_m)
+    off = decidable & (np.abs(found.lacking_m) > found.least_m)
     if not off.any() and not found.slip:
-        return _hidden(found, judged, HIDDEN_M[kind])
-    axes = np.flatnonzero(off if off.any() else judged).tolist()
-    told = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
+        return _hidden(found, decidable, HIDDEN_M[kind])
+    axes = np.flatnonzero(off if off.any() else decidable).tolist()
+    axes_m = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
     given = metres(evidence.sequence.rig.T_imu_cam[:3, 3])
     return Symptom(
         count=len(axes),
         detail=(
-            f"residuals turn with the vehicle: the camera is off by {', '.join(told)} from {given}, where T_imu_cam "
+            f"residuals turn with the vehicle: the camera is off by {', '.join(axes_m)} from {given}, where T_imu_cam "
             f"has it{found.slip}"
         ),
         treatment=f"check the translation of T_imu_cam{other_point}",
@@ -71,9 +71,9 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
-def _hidden(found: _Place, judged: BoolArray, most_m: float) -> Undecided | None:
+def _hidden(found: _Place, decidable: BoolArray, most_m: float) -> Undecided | None:
     """Say how far off the camera could be along the axes that are judged, where that is much."""
-    far = np.flatnonzero(judged & (found.least_m > most_m)).tolist()
+    far = np.flatnonzero(decidable & (found.least_m > most_m)).tolist()
     if not far:
         return None
     parts = ", ".join(f"{found.least_m[k]:.1f} m along {'xyz'[k]}" for k in far)

@@ -38,24 +38,24 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     intervals = evidence.intervals
     if intervals is None:
         return evidence.blind
-    judged = _judged(evidence, intervals)
-    wrongs, rotation = list(judged.wrongs), rotation_ratio(intervals)
+    calibration = _calibration(evidence, intervals)
+    wrongs, rotation = list(calibration.wrongs), rotation_ratio(intervals)
     if 1.0 < rotation.value < MOST_RATIO and _is_off(rotation, SYSTEMATIC_RATE[evidence.sequence.motion_kind]):
-        said = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
-        wrongs.append(Wrong(said, "the scale of the gyro and the focal length"))
+        summary = f"the gyro turns {rotation.value:.3f} +- {rotation.error:.3f} times as fast as the camera"
+        wrongs.append(Wrong(summary, "the scale of the gyro and the focal length"))
     force = force_ratio(evidence.sequence)
     if (
         force is not None
         and 1.0 / MOST_FORCE_RATIO < force.value < MOST_FORCE_RATIO
         and _is_off(force, SYSTEMATIC_FORCE)
     ):
-        said = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
-        wrongs.append(Wrong(said, "the scale and the bias of the accelerometer"))
+        summary = f"the accelerometer reads {force.value:.3f} +- {force.error:.3f} times gravity (median)"
+        wrongs.append(Wrong(summary, "the scale and the bias of the accelerometer"))
     if not wrongs:
-        return None if judged.hidden is None else Undecided(judged.hidden)
+        return None if calibration.hidden is None else Undecided(calibration.hidden)
     return Symptom(
         count=len(wrongs),
-        detail="; ".join(one.said for one in wrongs),
+        detail="; ".join(one.summary for one in wrongs),
         treatment=f"check {', '.join(dict.fromkeys(one.check for one in wrongs))}",
         remedy=None,
         harmful=False,
@@ -63,14 +63,14 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
-class _Judged(NamedTuple):
+class _Calibration(NamedTuple):
     """What is wrong, and in words what would not show."""
 
     wrongs: list[Wrong]
     hidden: str | None
 
 
-def _judged(evidence: Evidence, intervals: Intervals) -> _Judged:
+def _calibration(evidence: Evidence, intervals: Intervals) -> _Calibration:
     """Judge by the self-calibration; beside odometry, and where there is none, also from frame to frame."""
     sequence = evidence.sequence
     kind, found = sequence.motion_kind, evidence.self_calibration
@@ -81,30 +81,30 @@ def _judged(evidence: Evidence, intervals: Intervals) -> _Judged:
         return fitted
     looks = _by_turn(evidence, intervals)
     unseen = [one for one in (looks.hidden, fitted.hidden) if one is not None]
-    return _Judged(fitted.wrongs or looks.wrongs, "; ".join(unseen) or None)
+    return _Calibration(fitted.wrongs or looks.wrongs, "; ".join(unseen) or None)
 
 
-def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> _Judged:
+def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> _Calibration:
     if found is not None:
-        return _Judged(wrong(found, rig, kind), hidden(found, kind))
+        return _Calibration(wrong(found, rig, kind), hidden(found, kind))
     unseen = f"no tracks are seen for long enough beside the {BESIDE[kind]}"
-    return _Judged([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
+    return _Calibration([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
 
 
-def _by_turn(evidence: Evidence, intervals: Intervals) -> _Judged:
+def _by_turn(evidence: Evidence, intervals: Intervals) -> _Calibration:
     """Judge where the camera looks from frame to frame, which leaves the intrinsics open."""
     rig, kind = evidence.sequence.rig, evidence.sequence.motion_kind
     whole = None if evidence.alignment is None else evidence.alignment.by_velocities
     turn = turn_by_rotations(intervals, rig.T_imu_cam) if whole is None else turn_by_velocities(whole)
     least_rad = SYSTEMATIC_RAD[kind] + turn.by_chance_rad
     if not (np.abs(turn.rad) > least_rad).any():
-        return _Judged([], _undecided(float(least_rad.min()), kind == "twist"))
+        return _Calibration([], _undecided(float(least_rad.min()), kind == "twist"))
     angle, error = angle_of(turn)
-    said = (
+    summary = (
         f"the camera moves as if it were turned by {angle:.3f} +- {error:.3f} rad against "
         f"T_imu_cam, or its principal point were {angle * rig.fx_px:.0f} px off"
     )
-    return _Judged([Wrong(said, "the extrinsic and the principal point")], None)
+    return _Calibration([Wrong(summary, "the extrinsic and the principal point")], None)
 
 
 def _undecided(least_rad: float, by_velocity: bool) -> str | None:

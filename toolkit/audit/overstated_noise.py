@@ -35,12 +35,12 @@ def check(evidence: Evidence) -> Symptom | None:
     t_ns, values = motion.t_ns[finite], motion.values[finite]
     if t_ns.size < LEAST_SAMPLES or (np.diff(t_ns) <= 0).any():
         return None
-    said = list(_refuted(t_ns / NS_PER_S - t_ns[0] / NS_PER_S, values, noise))
-    if not said:
+    findings = list(_refuted(t_ns / NS_PER_S - t_ns[0] / NS_PER_S, values, noise))
+    if not findings:
         return None
     return Symptom(
-        count=len(said),
-        detail="; ".join(said),
+        count=len(findings),
+        detail="; ".join(findings),
         treatment=(
             "estimators told so hardly use the IMU: check its noise (imu0/sensor.yaml, imu.yaml), which is a density "
             "for one sample a second"

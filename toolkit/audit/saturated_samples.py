@@ -21,18 +21,18 @@ def check(evidence: Evidence) -> Symptom | None:
     if evidence.sequence.motion_kind != "imu":
         return None
     values = evidence.sequence.motion.values
-    told, rows = list[str](), np.zeros(len(values), dtype=bool)
+    findings, rows = list[str](), np.zeros(len(values), dtype=bool)
     for name, unit, column in zip(AXES, UNITS, values.T, strict=True):
         for sign in (1.0, -1.0):
             at_end = _at_range_end(sign * column)
             if at_end.any():
                 rows |= at_end
-                told.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
-    if not told:
+                findings.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
+    if not findings:
         return None
     return Symptom(
         count=int(rows.sum()),
-        detail=f"samples pile up at the end of a range: {', '.join(told)}",
+        detail=f"samples pile up at the end of a range: {', '.join(findings)}",
         treatment="what was beyond is lost: use a sensor of a larger range",
         remedy=None,
         harmful=False,

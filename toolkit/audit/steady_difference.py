@@ -21,12 +21,12 @@ def check(evidence: Evidence) -> Symptom | None:
     """Tell the scale and the direction by which both differ, between chance and what counts as a fault."""
     if evidence.intervals is None or evidence.sequence.motion_kind != "twist":
         return None
-    said = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
-    if not said:
+    differences = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
+    if not differences:
         return None
     return Symptom(
-        count=len(said),
-        detail=f"vision and odometry part all along: {'; '.join(said)}",
+        count=len(differences),
+        detail=f"vision and odometry part all along: {'; '.join(differences)}",
         treatment=(
             "a focal length, a baseline, a principal point or wheels that are off, or slip and pitch, which make as "
             "much in sound recordings of cars; estimators count on none of it"

@@ -108,16 +108,18 @@ def _never_moves(evidence: Evidence) -> Symptom | None:
         return None
     speed_mps = float(np.median(np.linalg.norm(camera.v_mps[camera.known], axis=1)))
     rate_radps = float(np.median(np.linalg.norm(camera.w_radps[camera.known], axis=1)))
-    said = []
+    findings = []
     if not values[:, :3].any() and speed_mps > STANDING_MPS:
-        said.append(f"all {len(values)} velocities are zero while the camera moves at {speed_mps:.2g} m/s (median)")
+        findings.append(f"all {len(values)} velocities are zero while the camera moves at {speed_mps:.2g} m/s (median)")
     if not values[:, 3:].any() and rate_radps > STRAIGHT_RADPS:
-        said.append(f"all {len(values)} rates of rotation are zero while the camera turns at {rate_radps:.2g} rad/s")
-    if not said:
+        findings.append(
+            f"all {len(values)} rates of rotation are zero while the camera turns at {rate_radps:.2g} rad/s"
+        )
+    if not findings:
         return None
     return Symptom(
         count=len(values),
-        detail=", and ".join(said),
+        detail=", and ".join(findings),
         treatment="they were not recorded: look at the driver and the cables",
         remedy=None,
         spoils_vision=True,

@@ -55,9 +55,9 @@ def check(evidence: Evidence) -> Symptom | None:
         why = "no order of the coordinates makes the tracks follow the measured motion: mend the file"
         detail += ": left and right, or u and v, are exchanged"
         return Symptom(count, detail, why, remedy=None, spoils_vision=True)
-    words, remedy = explained[0]
+    order_name, remedy = explained[0]
     treatment = "exchanged again, and the tracks follow the measured motion"
-    return Symptom(count, f"{detail}: {words}", treatment, remedy, spoils_vision=True)
+    return Symptom(count, f"{detail}: {order_name}", treatment, remedy, spoils_vision=True)
 
 
 def _rows_in_some_tracks(evidence: Evidence) -> Symptom | None:
@@ -128,7 +128,7 @@ def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
     # What lacks the right image has nothing to be exchanged with.
     sequence = replace(sequence, observations=sequence.observations.select(~is_left_only(uv_px)))
     uv_px = sequence.observations.uv_px
-    whole = [(_words(order), uv_px[:, list(order)]) for order in orders]
+    whole = [(_order_name(order), uv_px[:, list(order)]) for order in orders]
     observations = sequence.observations
     parts = {"whole tracks": _behind(uv_px, observations.track_id), "whole frames": _behind(uv_px, observations.frame)}
     # The exchange is of the kind that leaves the fewest points behind the camera.
@@ -137,7 +137,7 @@ def _reordered(sequence: Sequence) -> list[tuple[str, Sequence]]:
     if behind.mean() < 1.0 - SUSPECT_SHARE:
         turned = np.where(behind[:, None], uv_px[:, [1, 0, 2]], uv_px)
         whole.append((f"left and right are exchanged in {behind.mean():.0%} of them, {kind}", turned))
-    return [(words, _with_pixels(sequence, pixels)) for words, pixels in whole]
+    return [(order_name, _with_pixels(sequence, pixels)) for order_name, pixels in whole]
 
 
 def _behind(uv_px: Array, group: IntArray) -> BoolArray:
@@ -157,7 +157,7 @@ def _is_sound(sequence: Sequence) -> bool:
     return found.residual_px <= found.limit_px
 
 
-def _words(order: tuple[int, ...]) -> str:
+def _order_name(order: tuple[int, ...]) -> str:
     if order == (1, 0, 2):
         return "left and right are exchanged"
     return f"they stand in the order {', '.join(NAMES[order.index(column)] for column in range(3))}"

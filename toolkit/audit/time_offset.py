@@ -148,12 +148,12 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     near = [shift for shift in (-late_s, step_s - late_s) if abs(offset.value - shift) <= NEAR_SIGMAS * offset.error]
     if not near:
         return None
-    told = " or ".join(f"{1e3 * shift:+.0f}" for shift in near)
+    shifts = " or ".join(f"{1e3 * shift:+.0f}" for shift in near)
     return Symptom(
         count=1,
         detail=(
             f"twists come as often as frames, and each frame {1e3 * late_s:.0f} ms after one: a camera's clock that is "
-            f"to be shifted by {told} ms looks so; by the tracks it is {1e3 * offset.value:+.0f} +- "
+            f"to be shifted by {shifts} ms looks so; by the tracks it is {1e3 * offset.value:+.0f} +- "
             f"{1e3 * offset.error:.0f} ms, which does not tell that from none"
         ),
         treatment="if frames and twists were taken together, give them the same stamps",

@@ -60,7 +60,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     cause = "mismatches, points that move, or noise stated too small"
     if SAME_RATIO[0] < _nearer_scatter(chi2) / scatter < SAME_RATIO[1]:
         cause = f"near and far ones alike, so that the noise is stated {scatter:.3g} times too small"
-    return _told(
+    return _symptom(
         f"{_scatters(evidence, scatter, error)}; {np.mean(chi2 > FAR_CHI2):.0%} are beyond chance",
         f"{cause}: estimators trust such tracks too much",
     )
@@ -87,12 +87,14 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
     cause = f"the noise is stated {times} times too large, or the errors last along whole tracks"
     if not each_by_itself:
         cause = f"the noise is stated too large, by less than {times} times as the errors go together between frames"
-    said = _told(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
+    symptom = _symptom(_scatters(evidence, scatter, error), f"{cause}: estimators trust such tracks too little")
     if np.sqrt(evidence.sequence.rig.cov_uv_px2[0, 0]) != TRACKED_PIXEL_SIGMA_PX:
-        return said
+        return symptom
     # Nobody stated this noise: it is what is assumed of a tracker whose recording says nothing.
-    assumed = f"{said.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px states it"
-    return replace(said, treatment=assumed, warns=False)
+    assumed = (
+        f"{symptom.treatment}; half a pixel is assumed where nothing is stated, and noise.pixel_sigma_px states it"
+    )
+    return replace(symptom, treatment=assumed, warns=False)
 
 
 def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
@@ -104,7 +106,7 @@ def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
     )
 
 
-def _told(detail: str, treatment: str) -> Symptom:
+def _symptom(detail: str, treatment: str) -> Symptom:
     return Symptom(count=1, detail=detail, treatment=treatment, remedy=None, harmful=False, warns=True)
 
 
@@ -121,7 +123,7 @@ def _tail(chi2: Array) -> Symptom | None:
 
 
 def _mismatched(share: str, than: str) -> Symptom:
-    return _told(
+    return _symptom(
         f"from frame to frame {share} of the sightings miss by more than {than}",
         "mismatches, exchanged ids, or points that move: estimators must refuse as many",
     )

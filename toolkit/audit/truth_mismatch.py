@@ -70,7 +70,9 @@ def _broken(truth: Truth) -> Symptom | None:
     """Tell of poses that are not finite, or between which nothing can have moved: a reset, a flipped bit."""
     finite = np.isfinite(truth.T_world_imu).all(axis=(1, 2))
     if not finite.all():
-        return _told(f"{int((~finite).sum())} of {finite.size} true poses are not finite", "leave them out of the file")
+        return _symptom(
+            f"{int((~finite).sum())} of {finite.size} true poses are not finite", "leave them out of the file"
+        )
     step_s = np.maximum(np.diff(truth.t_ns), 1) / NS_PER_S
     step_m = np.linalg.norm(np.diff(truth.T_world_imu[:, :3, 3], axis=0), axis=1)
     usual_mps = float(np.quantile(step_m / step_s, 0.9))
@@ -79,7 +81,7 @@ def _broken(truth: Truth) -> Symptom | None:
         return None
     row = int(np.argmax(np.where(leaps, step_m, 0.0)))
     at_s = (truth.t_ns[row] - truth.t_ns[0]) / NS_PER_S
-    return _told(
+    return _symptom(
         f"the truth leaps {int(leaps.sum())} time(s), the farthest by {step_m[row]:.3g} m at {at_s:.1f} s of it",
         "cut it there, or leave the pose out: every position error holds the leap",
     )
@@ -109,11 +111,11 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
     scale = _ratio(seen, true)
     only_longer = scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
     if "turns" in elsewhere or (elsewhere and not only_longer):
-        return _told(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
+        return _symptom(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
         return None
     unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
-    return _told(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
+    return _symptom(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
 
 
 def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:
@@ -125,7 +127,7 @@ def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:
     if not in_most and (apart & frozen).sum() < LEAST_WINDOWS:
         return None
     speed_mps = float(np.median(drives_m[apart])) / WINDOW_S
-    return _told(
+    return _symptom(
         f"the truth stands still in {apart.sum()} of {moved.size} windows of {WINDOW_S:g} s in which the camera moves "
         f"at {speed_mps:.2g} m/s",
         "it is no truth of this motion, or was frozen: leave it out, for errors and consistency against it say nothing",
@@ -137,11 +139,13 @@ def _read_otherwise(evidence: Evidence, truth: Truth, both: "_Windows") -> Sympt
     given = _apart(both)
     if not given > LEAST_APART:
         return None
-    for words, remedy, T_world_imu in _readings(truth.T_world_imu):
+    for reading, remedy, T_world_imu in _readings(truth.T_world_imu):
         apart = _apart(_windows(evidence, replace(truth, T_world_imu=T_world_imu)))
         if apart < given / TIMES_NEARER:
-            said = f"the truth's motion is not the camera's, but for one {words}, by which they differ by {apart:.1%}"
-            return _told(f"{said} and not by {given:.0%}", remedy)
+            summary = (
+                f"the truth's motion is not the camera's, but for one {reading}, by which they differ by {apart:.1%}"
+            )
+            return _symptom(f"{summary} and not by {given:.0%}", remedy)
     return None
 
 
@@ -149,7 +153,7 @@ def _readings(T_world_imu: Array) -> Iterator[tuple[str, str, Array]]:
     """Yield what a truth may be in the place of what it is: in words, what to do about it, and the poses."""
     yield "whose poses run backwards", "write them in the order of their stamps", T_world_imu[::-1]
     for exchange in exchanges():
-        yield f"with {exchange.in_words}", _AXES, exchange.reread(T_world_imu)
+        yield f"with {exchange.description}", _AXES, exchange.reread(T_world_imu)
 
 
 def _apart(both: "_Windows") -> float:
@@ -178,14 +182,14 @@ def _by_another_clock(evidence: Evidence, truth: Truth) -> Symptom | None:
     found = camera_offset(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
     if found is None or abs(found.value) < max(LEAST_OFFSET_S, OFFSET_SIGMAS * found.error):
         return None
-    return _told(
+    return _symptom(
         f"the camera turns as the truth does when the truth's stamps are shifted by {-1e3 * found.value:.0f} +- "
         f"{1e3 * found.error:.0f} ms",
         "stamp both by one clock: every position error holds the way that is gone in that time",
     )
 
 
-def _told(detail: str, treatment: str) -> Symptom:
+def _symptom(detail: str, treatment: str) -> Symptom:
     return Symptom(count=1, detail=detail, treatment=treatment, remedy=None, harmful=False, warns=True)
 
 

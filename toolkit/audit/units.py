@@ -49,7 +49,7 @@ LEAST_BASELINE_M, MOST_BASELINE_M, MOST_LEVER_M = 0.005, 5.0, 10.0
 class _Wrong(NamedTuple):
     """A unit that is wrong: what was measured, and the sequence in SI, or None where two units are as likely."""
 
-    words: str
+    summary: str
     remedy: Sequence | None
 
 
@@ -70,7 +70,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     certain = all(wrong.remedy is not None for wrong in found)
     return Symptom(
         count=len(found),
-        detail="; ".join(wrong.words for wrong in found),
+        detail="; ".join(wrong.summary for wrong in found),
         treatment="converted to SI" if certain else "no one unit fits it all: mend the recording",
         remedy=now.sequence if certain else None,
         spoils_vision=True,
@@ -113,17 +113,17 @@ def _baseline(evidence: Evidence) -> _Wrong | None:
         return None
     fitting = [u for u, factor in LENGTHS.items() if LEAST_BASELINE_M <= rig.baseline_m / factor <= MOST_BASELINE_M]
     ratio = speed_ratio(evidence.intervals)
-    words = f"baseline_m is {rig.baseline_m:g}, which no rig has"
+    summary = f"baseline_m is {rig.baseline_m:g}, which no rig has"
     if ratio is not None:
         measured = {unit: 1.0 / LENGTHS[unit] for unit in fitting}
         unit = in_other_unit(ratio, measured, WITHIN_FACTOR, SIGMAS)
         fitting = [unit] if unit is not None else []
-        words += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
+        summary += f" and the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's"
     if len(fitting) != 1:
-        return _Wrong(f"{words}: it is not in metres", None)
+        return _Wrong(f"{summary}: it is not in metres", None)
     baseline_m = rig.baseline_m / LENGTHS[fitting[0]]
     remedy = replace(evidence.sequence, rig=replace(rig, baseline_m=baseline_m))
-    return _Wrong(f"{words}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
+    return _Wrong(f"{summary}: it is in {fitting[0]}, {baseline_m:g} m", remedy)
 
 
 def _lever_arm(evidence: Evidence) -> _Wrong | None:
@@ -133,17 +133,17 @@ def _lever_arm(evidence: Evidence) -> _Wrong | None:
     distance_m = float(np.linalg.norm(position))
     if not distance_m > MOST_LEVER_M:
         return None
-    words = f"T_imu_cam puts the camera {distance_m:.3g} m from the IMU"
+    summary = f"T_imu_cam puts the camera {distance_m:.3g} m from the IMU"
     unit = "millimetres"
     if distance_m / LENGTHS[unit] > MOST_LEVER_M:
-        return _Wrong(f"{words}: it is not in metres", None)
+        return _Wrong(f"{summary}: it is not in metres", None)
     T_imu_cam = se3(rig.T_imu_cam[:3, :3], position / LENGTHS[unit])
     if evidence.intervals is not None:
         camera = evidence.camera_motion
         given_px, now_px = (median_one_step_px(evidence.sequence, camera, T) for T in (rig.T_imu_cam, T_imu_cam))
-        words += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
+        summary += f" (median one-step reprojection {given_px:.2f} px as given, {now_px:.2f} px in {unit})"
     remedy = replace(evidence.sequence, rig=replace(rig, T_imu_cam=T_imu_cam))
-    return _Wrong(f"{words}: its translation is in {unit}", remedy)
+    return _Wrong(f"{summary}: its translation is in {unit}", remedy)
 
 
 def _speed(evidence: Evidence) -> _Wrong | None:
@@ -151,10 +151,10 @@ def _speed(evidence: Evidence) -> _Wrong | None:
     unit = None if ratio is None else in_other_unit(ratio, SPEEDS, WITHIN_FACTOR_OF_SPEED, SIGMAS)
     if ratio is None or unit is None:
         return None
-    words = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
+    summary = f"the samples' speed is {ratio.value:.3g} +- {ratio.error:.1g} times the camera's: it is in {unit}"
     if not _all_along(evidence, speed_ratio, SPEEDS[unit]):
-        return _Wrong(f"{words}{IN_A_PART}", None)
-    return _Wrong(words, linear_scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
+        return _Wrong(f"{summary}{IN_A_PART}", None)
+    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0 / SPEEDS[unit]))
 
 
 def _rotation(evidence: Evidence) -> _Wrong | None:
@@ -165,10 +165,10 @@ def _rotation(evidence: Evidence) -> _Wrong | None:
     unit = in_other_unit(ratio, RATES, WITHIN_FACTOR, SIGMAS)
     if unit is None:
         return None
-    words = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
+    summary = f"the gyro turns {ratio.value:.3g} +- {ratio.error:.1g} times as fast as the camera: it is in {unit}"
     if not _all_along(evidence, rotation_ratio, RATES[unit]):
-        return _Wrong(f"{words}{IN_A_PART}", None)
-    return _Wrong(words, linear_scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
+        return _Wrong(f"{summary}{IN_A_PART}", None)
+    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0, 1.0 / RATES[unit]))
 
 
 def _all_along(evidence: Evidence, ratio_of: Callable[[Intervals], Scalar | None], factor: float) -> bool:
@@ -186,8 +186,8 @@ def _force(evidence: Evidence) -> _Wrong | None:
     unit = None if ratio is None else in_other_unit(ratio, FORCES, WITHIN_FACTOR, SIGMAS)
     if ratio is None or unit is None:
         return None
-    words = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
-    return _Wrong(words, linear_scaled(evidence.sequence, 1.0 / FORCES[unit]))
+    summary = f"the accelerometer reads {ratio.value:.3g} times gravity (median): it is in {unit}"
+    return _Wrong(summary, linear_scaled(evidence.sequence, 1.0 / FORCES[unit]))
 
 
 def _truth(evidence: Evidence) -> _Wrong | None:
@@ -211,8 +211,8 @@ def _truth(evidence: Evidence) -> _Wrong | None:
     T_world_imu = se3(truth.T_world_imu[:, :3, :3], scale * truth.T_world_imu[:, :3, 3])
     v_world = None if truth.v_world is None else scale * truth.v_world
     remedy = replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
-    words = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
-    return _Wrong(words, remedy)
+    summary = f"the truth moves {ratio.value:.4g} +- {ratio.error:.1g} times as fast as measured: it is in {unit}"
+    return _Wrong(summary, remedy)
 
 
 FAULT = Fault(

@@ -66,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; any trouble is one line on stderr."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_streams()
-    with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as asked_to_end:
-        return _guarded(given, asked_to_end)
+    with _ended_once(signal.SIG_DFL if arguments is not None else signal.SIG_IGN) as end_requests:
+        return _guarded(given, end_requests)
 
 
-def _guarded(given: list[str], asked_to_end: Collection[float]) -> int:
+def _guarded(given: list[str], end_requests: Collection[float]) -> int:
     try:
         return _run(given)
     except VislamError as error:
@@ -82,7 +82,7 @@ def _guarded(given: list[str], asked_to_end: Collection[float]) -> int:
         _give_up_output()
         return _READER_GONE
     except Exception as error:  # the last resort: whatever it is, it is told in one line
-        if asked_to_end:  # compiled code may make any error of an interrupt
+        if end_requests:  # compiled code may make any error of an interrupt
             return _interrupted()
         return _unexpected(error)
 

@@ -268,21 +268,21 @@ def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def assignments_asked(options: argparse.Namespace) -> list[str]:
+def requested_assignments(options: argparse.Namespace) -> list[str]:
     """Return what --outliers, --window, --no-fast and --set say, in that order, as assignments."""
     arithmetic = "numpy" if options.no_fast else None
     named = {"outliers.policy": options.outliers, "window.lag_s": options.window, "arithmetic": arithmetic}
     return [*(f"{key}={value}" for key, value in named.items() if value is not None), *options.set]
 
 
-def settings_asked(options: argparse.Namespace) -> "Settings":
+def requested_settings(options: argparse.Namespace) -> "Settings":
     """Return the settings of --config and --set; raises SettingsError for one that does not exist."""
     from toolkit.experiment.configuration import read_configuration
     from toolkit.settings import settings_of, with_assignments
 
     values = {} if options.config is None else read_configuration(options.config)[1]
     place = "the command line" if options.config is None else str(options.config)
-    return settings_of(with_assignments(values, assignments_asked(options)), place)
+    return settings_of(with_assignments(values, requested_assignments(options)), place)
 
 
 def add_output_arguments(parser: argparse.ArgumentParser, as_json: str, quiet: str = "the exit status tells") -> None:
@@ -357,7 +357,7 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "--seed", 0, "of a simulated sequence", metavar="N", type=at_least(0))
 
 
-def recording_asked(options: argparse.Namespace) -> "Recording":
+def requested_recording(options: argparse.Namespace) -> "Recording":
     """Return the recording that SEQUENCE and --seed name, with what --no-repair, --keep, --tracks and --topics say."""
     from toolkit.audit import faults
     from toolkit.experiment.recording import Recording

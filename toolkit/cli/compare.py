@@ -21,12 +21,12 @@ from toolkit.cli.arguments import (
     add_settings_arguments,
     add_tracks_argument,
     add_workers_argument,
-    assignments_asked,
     at_least,
     command,
     kept_faults,
     named_file,
     names,
+    requested_assignments,
     with_tracks,
 )
 from toolkit.errors import VislamError, printable
@@ -146,9 +146,9 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.report.scores_json import scores_document
 
     columns = _columns(options.columns)
-    asked = _configuration(options)
-    plan, progress_for = _placed(_plan(asked), options), of_this_process()
-    made_by, all_ok = _made_by(options, asked), True
+    requested = _configuration(options)
+    plan, progress_for = _placed(_plan(requested), options), of_this_process()
+    made_by, all_ok = _made_by(options, requested), True
     with workers_of(plan) as workers, ExitStack() as open_files:
         cases = prepared_cases(plan, workers, progress_for)
         directories = directories_for(cases, options.out if options.out is not None else _new_run())
@@ -171,10 +171,10 @@ def compare(options: argparse.Namespace) -> int:
     return 0 if all_ok else 1
 
 
-def _made_by(options: argparse.Namespace, asked: Configuration) -> MadeBy:
+def _made_by(options: argparse.Namespace, requested: Configuration) -> MadeBy:
     from toolkit.report.run_directory import MadeBy
 
-    return MadeBy(shlex.join(options.command_line), asked, options.figure_format, options.figures)
+    return MadeBy(shlex.join(options.command_line), requested, options.figure_format, options.figures)
 
 
 @contextmanager
@@ -209,10 +209,10 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
 
 def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.report.comparison_table import columns_asked
+    from toolkit.report.comparison_table import requested_columns
 
     try:
-        return columns_asked(names)
+        return requested_columns(names)
     except VislamError as error:
         raise UsageError(str(error)) from error
 
@@ -224,7 +224,7 @@ def _configuration(options: argparse.Namespace) -> Configuration:
     from toolkit.settings import with_assignments
 
     request, settings = ({}, {}) if options.config is None else read_configuration(options.config)
-    assignments = assignments_asked(options)
+    assignments = requested_assignments(options)
     places = ([] if options.config is None else [str(options.config)]) + (["the command line"] if assignments else [])
     place = " or ".join(places) or "the command line"
     given = {
@@ -264,13 +264,13 @@ def _placed(plan: Plan, options: argparse.Namespace) -> Plan:
     return replace(plan, workers=options.workers, scheduler=options.scheduler)
 
 
-def _plan(asked: Configuration) -> Plan:
+def _plan(requested: Configuration) -> Plan:
     """Return the plan of a configuration; what does not go together is a UsageError."""
     from toolkit.estimator import defaults
     from toolkit.experiment import Plan
     from toolkit.experiment.recording import Part
 
-    request, settings = asked.request, asked.settings
+    request, settings = requested.request, requested.settings
     sequences = request.sequences or SEQUENCES
     estimators = request.estimators or defaults()
     single = {"--truth": request.truth is not None, "--trajectory": bool(request.trajectories)}

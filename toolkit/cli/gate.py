@@ -17,7 +17,7 @@ from toolkit.cli.arguments import (
     at_least,
     command,
     positive_seconds,
-    settings_asked,
+    requested_settings,
 )
 from toolkit.errors import printable
 
@@ -112,7 +112,7 @@ def baseline(options: argparse.Namespace) -> int:
     check_writable(out)
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))
-    made = new_baseline(cases, workers, made_by, of_this_process(), settings_asked(options))
+    made = new_baseline(cases, workers, made_by, of_this_process(), requested_settings(options))
     write_text(out, to_text(made))
     ends = list(_bad_ends(made))
     print("\n".join(map(printable, [*ends, f"baseline: {out}"])))

@@ -17,8 +17,8 @@ from toolkit.cli.arguments import (
     at_least,
     command,
     positive_seconds,
-    recording_asked,
-    settings_asked,
+    requested_recording,
+    requested_settings,
 )
 from toolkit.errors import printable
 
@@ -51,7 +51,7 @@ def check_data(options: argparse.Namespace) -> int:
     from toolkit.report.comparison_text import audit_text
     from toolkit.report.prose import width_of_output
 
-    recording = replace(recording_asked(options), truth=options.truth)
+    recording = replace(requested_recording(options), truth=options.truth)
     with of_this_process()(options.sequence) as progress:
         audited = audited_recording(recording, progress)
     print(audit_text(audited, width_of_output()))
@@ -83,7 +83,7 @@ def card(options: argparse.Namespace) -> int:
 
     if options.json is not None:
         check_writable(options.json)
-    recording = replace(recording_asked(options), max_frames=options.max_frames)
+    recording = replace(requested_recording(options), max_frames=options.max_frames)
     with of_this_process()(options.sequence) as progress:
         sequence, card = recording_card(recording, progress)
     if options.json is not None:  # before a reader of the output can have gone away
@@ -120,7 +120,7 @@ def tracks(options: argparse.Namespace) -> int:
     from toolkit.frontend.stills import write_stills, write_video
     from toolkit.progress import of_this_process
 
-    frontend = settings_asked(options).frontend
+    frontend = requested_settings(options).frontend
     if options.topics is not None:
         frontend = msgspec.structs.replace(frontend, topics=options.topics)
     check_parent(options.out.parent)
@@ -195,11 +195,11 @@ def simulate(options: argparse.Namespace) -> int:
     scenario = KNOWN[options.scenario]
     if options.duration is not None:
         scenario = replace(scenario, duration_s=options.duration)
-    asked = [name for name in _ONLY_WITH_IMAGES if getattr(options, name) is not None]
+    requested = [name for name in _ONLY_WITH_IMAGES if getattr(options, name) is not None]
     if options.images:
         return _film(scenario, options)
-    if asked:
-        raise UsageError(f"--{asked[0]} is of images; add --images")
+    if requested:
+        raise UsageError(f"--{requested[0]} is of images; add --images")
     vislam_recording.check_folder(options.out)
     sequence = simulate(scenario, options.seed)
     vislam_recording.save(sequence, options.out)

@@ -189,12 +189,12 @@ def _run_again(there: Path, out: Path, options: argparse.Namespace) -> None:
     sequence = [] if options.data is None else [options.data]
     workers = [] if options.workers is None else ["--workers", str(options.workers)]
     words = ["compare", *sequence, "--config", str(there / MANIFEST), "--out", str(out), *workers]
-    asked = parser().parse_args(words)
-    asked.command_line = ["vislam", *words]
+    requested = parser().parse_args(words)
+    requested.command_line = ["vislam", *words]
     with ExitStack() as stack:
         nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123
         stack.enter_context(redirect_stdout(nowhere))
-        asked.command(asked)
+        requested.command(requested)
 
 
 def _print(found: Differences, record: BundleRecord, options: argparse.Namespace) -> None:

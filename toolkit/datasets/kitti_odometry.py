@@ -172,9 +172,9 @@ def _projections(layout: _Layout) -> tuple[Array, Array]:
     rows: dict[str, Array] = {}
     for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
         name, colon, rest = line.partition(":")
-        words = (rest if colon else line).split()
+        columns = (rest if colon else line).split()
         try:
-            values = np.array([float(word) for word in words])
+            values = np.array([float(word) for word in columns])
         except ValueError as error:
             raise DataError(f"{file}: line {number}: {error}; expected a name and twelve numbers") from error
         if values.size == 12:

@@ -321,11 +321,11 @@ def _read_stamps(file: Path) -> dict[int, int]:
     return stamps
 
 
-def _stamp_ns(words: str) -> int:
+def _stamp_ns(stamp_text: str) -> int:
     """Return the nanoseconds since 1970 of a date and time; raises ValueError where it is none."""
-    if not _STAMP.fullmatch(words):
-        raise ValueError(words)
-    return int(np.datetime64(words.replace(" ", "T"), "ns").astype(np.int64))
+    if not _STAMP.fullmatch(stamp_text):
+        raise ValueError(stamp_text)
+    return int(np.datetime64(stamp_text.replace(" ", "T"), "ns").astype(np.int64))
 
 
 def _packet(file: Path) -> Array:
@@ -342,8 +342,10 @@ def _positions(places: Array) -> Array:
     """Return (S, 3) m east, north and up of the first of some places (S, 3) deg, deg, m."""
     latitude, longitude = np.deg2rad(places[:, :2]).T
     scale = np.cos(latitude[0]) * _EARTH_RADIUS_M
-    mapped = np.stack([scale * longitude, scale * np.log(np.tan(np.pi / 4.0 + latitude / 2.0)), places[:, 2]], axis=1)
-    return np.asarray(mapped - mapped[0])
+    projected = np.stack(
+        [scale * longitude, scale * np.log(np.tan(np.pi / 4.0 + latitude / 2.0)), places[:, 2]], axis=1
+    )
+    return np.asarray(projected - projected[0])
 
 
 def _attitudes(angles: Array) -> Array:

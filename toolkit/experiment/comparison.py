@@ -95,18 +95,18 @@ def _contradicted(scored: Sequence[Scored]) -> Consistency | None:
 def _by_errors(scored: Sequence[Scored]) -> Consistency | None:
     nees = [value for one in scored if (value := one.scores.values.get(NEES)) is not None]
     if nees:
-        return _judged(NEES, nees, float(POSE_DOF * len(nees)))
+        return _consistency(NEES, nees, float(POSE_DOF * len(nees)))
     nis = [(value, one.nis_dof) for one in scored if (value := one.scores.values.get(NIS)) is not None and one.nis_dof]
     if not nis:
         return None
     # A mean of n chi-square variables over their degrees of freedom d_i has the variance 2 sum(1 / d_i) / n^2.
     accepted = [value for one in scored if (value := one.scores.values.get(ACCEPTED)) is not None]
     refused_much = bool(accepted) and refuses_much(sum(accepted) / len(accepted))
-    judged = _judged(NIS, [value for value, _ in nis], len(nis) ** 2 / sum(1.0 / dof for _, dof in nis))
-    return replace(judged, refused_much=refused_much)
+    found = _consistency(NIS, [value for value, _ in nis], len(nis) ** 2 / sum(1.0 / dof for _, dof in nis))
+    return replace(found, refused_much=refused_much)
 
 
-def _judged(metric: str, values: list[float], dof: float) -> Consistency:
+def _consistency(metric: str, values: list[float], dof: float) -> Consistency:
     return Consistency(metric, sum(values) / len(values), *nees_band(dof))
 
 

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from toolkit.errors import DataError, did_you_mean
-from toolkit.files.documents import in_words
+from toolkit.files.documents import readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings import Settings, SettingsError, read_toml, settings_of
 
@@ -58,10 +58,10 @@ def configuration(request: Mapping[str, Any], settings: Mapping[str, Any], place
         if key not in known:
             raise SettingsError(f"{place}: there is no {COMPARE}.{key}{did_you_mean(key, known)}")
     try:
-        asked = msgspec.convert(dict(request), Request)
+        requested = msgspec.convert(dict(request), Request)
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{place}: {COMPARE}.{in_words(error, dict(request), Request)}") from error
-    return Configuration(asked, settings_of(settings, place))
+        raise SettingsError(f"{place}: {COMPARE}.{readable(error, dict(request), Request)}") from error
+    return Configuration(requested, settings_of(settings, place))
 
 
 def _manifest(path: Path) -> dict[str, Any]:

@@ -59,12 +59,12 @@ class Dispute:
     def of(cls, rows: Iterable[Row]) -> Self:
         """Hold the rows of a comparison against each other; over seeds, where no runs are kept, nobody parts."""
         rows = [row for row in rows if row.answered]
-        resting = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
-        others = [row for row in rows if row.estimator not in (one.estimator for one in resting)]
-        motion = _trajectory(resting[0]) if resting else None
+        uncorrected = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
+        others = [row for row in rows if row.estimator not in (one.estimator for one in uncorrected)]
+        motion = _trajectory(uncorrected[0]) if uncorrected else None
         apart = [] if motion is None else [farthest(row, motion) for row in others]
         return cls(
-            _names(resting),
+            _names(uncorrected),
             _names(row for row in others if row.value(TREND) is not None),
             tuple(one for one in apart if one is not None and one.squared > FARTHEST),
             _names(row for row in others if row.mark == "contradicted"),

@@ -282,13 +282,13 @@ class OutcomeStore:
         """Return the outcome of a unit with all that is asked of it, or None."""
         if unit.build is not None:  # a function, which nobody can tell from another of its name
             return None
-        asked = unit.settings.metrics.requested()
+        metric_keys = unit.settings.metrics.requested()
         for record in self._records.get(self._conditions.key(unit).text(), []):
-            if set(asked) <= set(record.requested):
+            if set(metric_keys) <= set(record.requested):
                 files = self._unchanged(record.files)
                 if not unit.keep_trajectories or files.keys() == _names(unit, record.final_is_causal, record.outputs):
                     self.found += 1
-                    return replace(outcome_of_record(record, asked), files=files)
+                    return replace(outcome_of_record(record, metric_keys), files=files)
         return None
 
     def keep(self, unit: Unit, outcome: Outcome) -> Outcome:
@@ -302,12 +302,12 @@ class OutcomeStore:
             self._lines.append(msgspec.json.encode(FilesRecord(files=tuple(texts))))
             self._write(texts)
         digests = {name: hashlib.sha256(text).hexdigest() for name, text in texts.items()}
-        asked = unit.settings.metrics.requested()
-        line = line_of(record_of(outcome, self._conditions.key(unit), asked, digests))
+        metric_keys = unit.settings.metrics.requested()
+        line = line_of(record_of(outcome, self._conditions.key(unit), metric_keys, digests))
         self._lines.append(line)
         kept = _DECODER.decode(line)
         assert isinstance(kept, OutcomeRecord)
-        return outcome_of_record(kept, asked)
+        return outcome_of_record(kept, metric_keys)
 
     def close(self) -> None:
         """Let other processes add to the file."""

@@ -282,7 +282,7 @@ def _comparison(
         seeds=plan.seeds,
         outcomes=(*ordered, *others),
         changes={name: entry.change() for name, entry in entries.items()} if on_ladder else {},
-        white={} if sequence.rig.track_noise is None else _told_white(entries),
+        white={} if sequence.rig.track_noise is None else _taken_for_white(entries),
         lacking=lacking(entries, plan.settings.noise, decisive_parts(case.prepared)),
         settings=plan.settings,
         workers=workers,
@@ -291,7 +291,7 @@ def _comparison(
     )
 
 
-def _told_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
+def _taken_for_white(entries: Mapping[str, EstimatorEntry]) -> dict[str, str]:
     """Return which estimators take the noise of tracks for white whatever the rig states, and why."""
     return {name: entry.ignores()["tracks"] for name, entry in entries.items() if "tracks" in entry.ignores()}
 
@@ -300,13 +300,13 @@ def lacking(
     entries: Mapping[str, EstimatorEntry], noise: Noise, decisive: frozenset[str]
 ) -> dict[str, tuple[str, ...]]:
     """Return, for each optional part of the noise model that is asked for and decisive, the estimators without it."""
-    asked = {
+    requested = {
         "disparity_scale": noise.disparity_scale is not None,
         "bridge_gaps": noise.bridge_gaps,
         "match_tracks": noise.match_tracks,
     }
-    parts = {part: tuple(name for name, entry in entries.items() if not entry.obeys(part)) for part in asked}
-    return {part: names for part, names in parts.items() if asked[part] and part in decisive and names}
+    parts = {part: tuple(name for name, entry in entries.items() if not entry.obeys(part)) for part in requested}
+    return {part: names for part, names in parts.items() if requested[part] and part in decisive and names}
 
 
 def decisive_parts(prepared: Prepared) -> frozenset[str]:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from toolkit.audit import Audit, Finding, audit, judged_again
+from toolkit.audit import Audit, Finding, audit, checked_again
 from toolkit.audit.parts.subsets import keep_frames
 from toolkit.datasets import check_built_in, load_sequence
 from toolkit.datasets.io.truth import load_truth, with_truth
@@ -22,7 +22,7 @@ from toolkit.sequence import Prior, Sequence, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Noise, SettingsError, TrackUse, Varied
 from toolkit.simulation import SCENARIOS, simulate
 from toolkit.threads import on_one_thread
-from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, in_words
+from toolkit.track_errors import Card, card_of, contradicted, fit_track_noise, summary_of
 from toolkit.track_noise import TrackNoise
 
 Start = Literal["measurements", "truth"]
@@ -109,7 +109,7 @@ def prepare(recording: Recording, progress: Progress = SILENT) -> Prepared:
         audited = audited_recording(recording, progress)
         whole = _with_noise(audited.sequence, recording.noise)
         if recording.noise.pixel_sigma_px is not None and recording.noise.tracks == "white":
-            audited = _judged_with_its_noise(audited, _cut(whole, recording))
+            audited = _audited_with_its_noise(audited, _cut(whole, recording))
         card = None
         if recording.noise.tracks == "fitted":
             whole, card = _with_fitted_tracks(whole, _cut(whole, recording), recording.noise.track_fit_s)
@@ -224,8 +224,8 @@ def _part(sequence: Sequence, part: Part) -> Sequence:
             f"in {sequence.duration_s:g} s"
         )
     provenance = sequence.provenance
-    told = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
-    taken = replace(keep_frames(sequence, kept), provenance=told)
+    extended = replace(provenance, facts=(*provenance.facts, f"a part of the recording: {part}"))
+    taken = replace(keep_frames(sequence, kept), provenance=extended)
     return taken if part.every == 1 else _with_truth_at_frames(taken)
 
 
@@ -243,14 +243,14 @@ def _with_truth_at_frames(sequence: Sequence) -> Sequence:
     return replace(sequence, truth=thinned)
 
 
-def _with_noise(sequence: Sequence, asked: Noise) -> Sequence:
+def _with_noise(sequence: Sequence, requested: Noise) -> Sequence:
     """Return the sequence with the noise that the settings ask for."""
     rig = sequence.rig
-    if asked.pixel_sigma_px is not None:
-        rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (asked.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
-    if asked.tracks == "correlated":
-        rig = replace(rig, track_noise=_stated_track_noise(asked))
-    noise = sequence.noise if asked.motion_scale == 1.0 else sequence.noise.scaled(asked.motion_scale)
+    if requested.pixel_sigma_px is not None:
+        rig = replace(rig, cov_uv_px2=rig.cov_uv_px2 * (requested.pixel_sigma_px**2 / rig.cov_uv_px2[0, 0]))
+    if requested.tracks == "correlated":
+        rig = replace(rig, track_noise=_stated_track_noise(requested))
+    noise = sequence.noise if requested.motion_scale == 1.0 else sequence.noise.scaled(requested.motion_scale)
     return sequence if rig is sequence.rig and noise is sequence.noise else replace(sequence, rig=rig, noise=noise)
 
 
@@ -279,15 +279,15 @@ def _without_moving_tracks(sequence: Sequence, prior: Prior) -> tuple[Sequence, 
     return replace(at_rest, provenance=provenance), share
 
 
-def _judged_with_its_noise(audited: Audit, used: Sequence) -> Audit:
+def _audited_with_its_noise(audited: Audit, used: Sequence) -> Audit:
     """Return what was found, with the tracks held against the noise that the settings state in the place of another."""
     with np.errstate(all="ignore"):
-        return judged_again(audited, "track-scatter", used)
+        return checked_again(audited, "track-scatter", used)
 
 
-def _stated_track_noise(asked: Noise) -> TrackNoise:
+def _stated_track_noise(requested: Noise) -> TrackNoise:
     """Return the noise of tracks that the settings state; a disparity is the difference of two columns."""
-    white, walk, offset = asked.track_white_px, asked.track_walk_px, asked.track_offset_px
+    white, walk, offset = requested.track_white_px, requested.track_walk_px, requested.track_offset_px
     return TrackNoise(np.array([white, 2.0 * white, white]), np.full(3, walk), np.array([0.0, offset, 0.0]))
 
 
@@ -310,7 +310,7 @@ def _with_fitted_tracks(whole: Sequence, used: Sequence, fit_s: float | None) ->
     basis = "all that is used of the recording, so that causal answers know it too early"
     if fit_s is not None:
         basis = f"the first {fit_s:g} s, which causal answers of that time know too early"
-    fact = f"noise of tracks, fitted to {basis}: {in_words(fitted, whole.rig.cov_uv_px2)}"
+    fact = f"noise of tracks, fitted to {basis}: {summary_of(fitted, whole.rig.cov_uv_px2)}"
     provenance = replace(whole.provenance, facts=(*whole.provenance.facts, fact))
     rig = replace(whole.rig, track_noise=fitted.noise) if fitted.correlated else whole.rig
     return replace(whole, rig=rig, provenance=provenance), card_of(used, fitted)

@@ -60,7 +60,7 @@ class WorkerProcess:
 
         Raises SystemLimitError where the system lets no process be started.
         """
-        with _interrupts_held_back(), _refusals_told():
+        with _interrupts_held_back(), _refusals_shown():
             # Started with the first process, Python's own tracker would let interrupts through to it again.
             resource_tracker.ensure_running()
             if self._executor is None:
@@ -122,7 +122,7 @@ def _interrupts_held_back() -> Iterator[None]:
 
 
 @contextmanager
-def _refusals_told() -> Iterator[None]:
+def _refusals_shown() -> Iterator[None]:
     """Raise SystemLimitError for what the system refuses to a new process: it needs files, and room in /dev/shm."""
     try:
         yield
@@ -240,7 +240,7 @@ class _Share:
         if stage and stage not in self._stages:
             self._stages.append(stage)
         steps = int(_share_done(len(self._stages), done, total))
-        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count, _in_words(stage, done))
+        self._whole.advance(_STEPS * self._place + steps, _STEPS * self._count, _step_label(stage, done))
 
 
 def _share_done(stages: Any, done: Any, total: Any) -> Any:
@@ -249,7 +249,7 @@ def _share_done(stages: Any, done: Any, total: Any) -> Any:
     return half * done // np.maximum(total, 1) + half * (np.asarray(stages) > 0)
 
 
-def _in_words(stage: str, done: int) -> str:
+def _step_label(stage: str, done: int) -> str:
     """Return what a smoother does in the end, nothing where it has not come to that."""
     return f"{stage}, iteration {done + 1}" if stage else ""
 
@@ -361,7 +361,7 @@ class _Board:
         entries = np.array(self._entries[: self._under_way.size])[self._under_way]
         shares = _share_done(entries["stages"], entries["done"], entries["total"])
         ending = entries[entries["stage"] != b""][:1]
-        stage = "".join(_in_words(one["stage"].decode(), int(one["done"])) for one in ending)
+        stage = "".join(_step_label(one["stage"].decode(), int(one["done"])) for one in ending)
         return self.total - _STEPS * entries.size + int(shares.sum()), self.total, stage
 
 

@@ -119,7 +119,7 @@ def parse(content: bytes | str, record: type[Record], older: Older | None = None
     try:
         return msgspec.convert(document, record)
     except msgspec.ValidationError as why:
-        raise DataError(f"breaks the contract {wanted}: {in_words(why, document, record)}") from why
+        raise DataError(f"breaks the contract {wanted}: {readable(why, document, record)}") from why
 
 
 def schema_name(record: type[msgspec.Struct]) -> str:
@@ -157,7 +157,7 @@ def _schema_of(document: object) -> object:
     return document.get("schema") if isinstance(document, dict) else None
 
 
-def in_words(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:
+def readable(why: msgspec.ValidationError, document: object, record: type[msgspec.Struct]) -> str:
     """Say what is wrong and where, with the keys that msgspec leaves out of its paths."""
     what, path = _parts(why)
     steps = _place(path, document, record)

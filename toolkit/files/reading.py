@@ -60,7 +60,7 @@ def read_text_input(path: Path, kind: str) -> str:
 def check_regular(path: Path) -> None:
     """Raise DataError for a directory, a pipe, a socket or a device; OSError where the path cannot be looked at."""
     mode = path.stat().st_mode
-    what = next((words for is_of_kind, words in _KINDS if is_of_kind(mode)), None)
+    what = next((kind_text for is_of_kind, kind_text in _KINDS if is_of_kind(mode)), None)
     if what is not None:
         raise DataError(f"{path}: cannot be read: {what}")
 

@@ -99,11 +99,11 @@ def _parents_of(target: Path) -> Iterator[_Parents]:
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Hold back what asks the program to end until the block is left; a part of a rename is neither old nor new."""
-    asked: list[int] = []
+    requested: list[int] = []
     try:
         before = {number: signal.getsignal(number) for number in _ENDING}
         for number in before:
-            signal.signal(number, lambda got, _frame: asked.append(got))
+            signal.signal(number, lambda got, _frame: requested.append(got))
     except ValueError:  # signals are the main thread's
         yield
         return
@@ -112,8 +112,8 @@ def uninterrupted() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-        if asked:
-            signal.raise_signal(asked[0])
+        if requested:
+            signal.raise_signal(requested[0])
 
 
 @contextmanager

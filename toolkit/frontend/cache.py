@@ -42,10 +42,10 @@ def key_of(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Frontend)
     paths = [path for pair in pairs for path in (pair.left, pair.right)]
     with ThreadPoolExecutor(_HASHERS) as hashers:
         images = list(hashers.map(_digest, paths))
-    asked = {name: getattr(settings, name) for name in settings.__struct_fields__ if name not in _OF_THE_SOURCE}
+    requested = {name: getattr(settings, name) for name in settings.__struct_fields__ if name not in _OF_THE_SOURCE}
     stamps = np.array([pair.t_ns for pair in pairs], dtype=np.int64)
     made_by = f"{_FRONT_END} {version('opencv-python-headless')} {version('numpy')}"
-    return content_digest((made_by, repr(asked), rig, stamps, *images))
+    return content_digest((made_by, repr(requested), rig, stamps, *images))
 
 
 def load(key: str) -> dict[str, Any] | None:

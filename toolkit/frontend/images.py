@@ -22,7 +22,7 @@ from toolkit.frontend.cameras import Image
 _PNG = b"\x89PNG\r\n\x1a\n"
 _LFS_POINTER = b"version https://git-lfs"
 _AHEAD = 3
-_Asked = TypeVar("_Asked")
+_Requested = TypeVar("_Requested")
 _Given = TypeVar("_Given")
 
 
@@ -137,12 +137,12 @@ def _is_whole_png(content: bytes) -> bool:
     return False
 
 
-def read_ahead(asked: Iterable[_Asked], read: Callable[[_Asked], _Given]) -> Iterator[_Given]:
+def read_ahead(requested: Iterable[_Requested], read: Callable[[_Requested], _Given]) -> Iterator[_Given]:
     """Yield what is read for each thing asked, in order; another thread is a few of them ahead, and no more."""
     with ThreadPoolExecutor(1, thread_name_prefix="images") as reader:
         coming: deque[Future[_Given]] = deque()
         try:
-            for one in asked:
+            for one in requested:
                 coming.append(reader.submit(read, one))
                 if len(coming) > _AHEAD:
                     yield coming.popleft().result()

@@ -77,8 +77,8 @@ def _drawn(
     recording: ImageRecording, tracks: ImageTracks, frames: IntArray, progress: Progress
 ) -> Iterator[tuple[int, Image]]:
     pair_at = {pair.t_ns: pair for pair in recording.pairs}
-    asked = [pair_at[t_ns] for t_ns in tracks.t_ns[frames].tolist()]
-    for done, (k, images) in enumerate(zip(frames.tolist(), read_pairs(recording, asked), strict=True), start=1):
+    requested = [pair_at[t_ns] for t_ns in tracks.t_ns[frames].tolist()]
+    for done, (k, images) in enumerate(zip(frames.tolist(), read_pairs(recording, requested), strict=True), start=1):
         if isinstance(images, Unusable):
             raise DataError(f"{images}: it was there when the tracks were made; copy it again")
         yield k, _still(images, tracks, k)

@@ -23,7 +23,7 @@ _CANDIDATES = 3
 # A corner that found no partner is not tried again for so many frames, within so many pixels.
 _COOL_DOWN_FRAMES, _COOL_DOWN_PX = 5, 4
 # Fewer than this share of the tracks found in the right image, and of no fewer tracks: it belongs to another instant.
-_LEAST_PAIRED, _FEWEST_TO_JUDGE = 0.25, 20
+_LEAST_PAIRED, _FEWEST_TO_TEST = 0.25, 20
 _LEVELS_RIGHT = 1
 _LEAST_DISPARITY_PX = 0.5
 
@@ -90,13 +90,13 @@ class Tracker:
     tried: int = field(default=0, init=False)  # corners that were looked for in a right image
 
     def __post_init__(self) -> None:
-        asked = self.settings
-        self._flow = Flow(asked.window_px, asked.levels, asked.forward_backward_px)
-        self._across = Flow(asked.window_px, _LEVELS_RIGHT, 2.0 * asked.forward_backward_px)
-        self._motion = StereoMotion(self.rig, asked.ransac_px)
-        self._rigidity = Rigidity.of(self.rig, asked.ransac_px)
+        requested = self.settings
+        self._flow = Flow(requested.window_px, requested.levels, requested.forward_backward_px)
+        self._across = Flow(requested.window_px, _LEVELS_RIGHT, 2.0 * requested.forward_backward_px)
+        self._motion = StereoMotion(self.rig, requested.ransac_px)
+        self._rigidity = Rigidity.of(self.rig, requested.ransac_px)
         self._seen = self.rig.seen(0), self.rig.seen(1)
-        self._grid = grid_of(self.rig.size_px, asked.max_tracks)
+        self._grid = grid_of(self.rig.size_px, requested.max_tracks)
 
     def step(self, left: Image, right: Image) -> TrackedCorners | None:
         """Follow the tracks into the next pair and begin new ones.
@@ -107,7 +107,7 @@ class Tracker:
         found, motion = self._followed(left, floats)
         paired = self._fitted_right(right_floats, self._paired(left, right, found))
         agrees = motion.agrees(paired.left_px, paired.right_px, paired.ids)
-        if len(found.ids) >= _FEWEST_TO_JUDGE and agrees.sum() < _LEAST_PAIRED * len(found.ids):
+        if len(found.ids) >= _FEWEST_TO_TEST and agrees.sum() < _LEAST_PAIRED * len(found.ids):
             return None
         self._motion = motion
         tracks = paired.select(agrees)

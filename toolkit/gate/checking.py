@@ -64,35 +64,35 @@ def check(baseline: Baseline, name: str, how: How, progress_for: ProgressFor) ->
     Raises BaselineError where another version of the code is asked for and cannot be found or timed.
     """
     began, how = time.monotonic(), replace(how, settings=baseline.settings)
-    judged = CaseVerdicts()
+    collected = CaseVerdicts()
     if how.speed_against is not None:
         speeds = compare_speed(baseline, how.speed_against, baseline.false_alarm_rate, progress_for)
-        judged.verdicts += speeds.verdicts
-        judged.notes += speeds.notes
+        collected.verdicts += speeds.verdicts
+        collected.notes += speeds.notes
     for case, before in baseline.cases:
         now = _measured(case, metrics_of(case, baseline.bounds), how, progress_for)
         one = judge_case(case, before, now, baseline.bounds, how.terms)
-        judged.verdicts += one.verdicts
-        judged.tests += one.tests
-        judged.notes += one.notes
-    return judge_all(judged, baseline, name, time.monotonic() - began, how.terms)
+        collected.verdicts += one.verdicts
+        collected.tests += one.tests
+        collected.notes += one.notes
+    return judge_all(collected, baseline, name, time.monotonic() - began, how.terms)
 
 
 def judge_all(
-    judged: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
+    collected: CaseVerdicts, baseline: Baseline, name: str, seconds: float, terms: CheckTerms = USUAL_TERMS
 ) -> Check:
     """Test what awaits its test, all at once, and put the verdicts together."""
-    tested = judge_pairs(judged.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
+    tested = judge_pairs(collected.tests, baseline.false_alarm_rate, accept_better=terms.accept_better)
     places = {
         (case.source, name): (i, k)
         for i, (case, before) in enumerate(baseline.cases)
         for k, name in enumerate(("", *before.runs))
     }
-    verdicts = sorted([*judged.verdicts, *tested], key=lambda v: (places[v.sequence, v.estimator], v.output))
+    verdicts = sorted([*collected.verdicts, *tested], key=lambda v: (places[v.sequence, v.estimator], v.output))
     return Check(
         name,
         tuple(verdicts),
-        tuple(judged.notes),
+        tuple(collected.notes),
         baseline.false_alarm_rate,
         len(tested),
         installed_releases(),

@@ -111,10 +111,10 @@ def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iter
     for timed, p, p_faster in zip(found, slower, faster, strict=True):
         finding: Finding = "regressed" if p <= rate else "better" if p_faster <= rate else "same"
         ratio, (was, is_) = float(np.exp(np.median(timed.differences))), np.median(timed.cpu_s, axis=0).tolist()
-        words = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
+        message = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
         seen = 100.0 * float(np.expm1(_seen(timed.differences, rate / len(found))))
         yield Verdict(
-            timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else words, was, is_,
+            timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else message, was, is_,
             100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
         )  # fmt: skip
 
@@ -152,12 +152,12 @@ class Process:
     def __init__(self, process: "subprocess.Popen[str]", what: str) -> None:
         self._process, self._what = process, what
 
-    def ask(self, do: str, **asked: object) -> dict[str, Any]:
+    def request(self, do: str, **requested: object) -> dict[str, Any]:
         """Return the answer; raises BaselineError where there is none."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
-            self._process.stdin.write(json.dumps({"do": do, **asked}) + "\n")
+            self._process.stdin.write(json.dumps({"do": do, **requested}) + "\n")
             self._process.stdin.flush()
             line = self._process.stdout.readline()
         except BrokenPipeError:
@@ -200,7 +200,7 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 def _lacking(version: str, sides: Sequence[Process], names: Sequence[str]) -> list[str]:
     """Return the estimators that only one side has; raises BaselineError where both sides are the same code."""
-    found = [side.ask("where", estimators=names) for side in sides]
+    found = [side.request("where", estimators=names) for side in sides]
     if found[0] == found[1]:
         raise BaselineError(f"{version} brings no code of what runs here ({found[0]['toolkit']}); name another")
     return [name for name in names if any(side["files"][name] is None for side in found)]
@@ -209,7 +209,7 @@ def _lacking(version: str, sides: Sequence[Process], names: Sequence[str]) -> li
 def _prepare(sides: Sequence[Process], case: Case, baseline: Baseline) -> None:
     recording = recordings_of(case, baseline.settings)[0]
     for side in sides:
-        side.ask(
+        side.request(
             "prepare",
             source=recording.source,
             seed=recording.seed,
@@ -230,7 +230,7 @@ def _timed(
 
 def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs | str:
     """Time both sides in turn; return why that is not possible where a run does not end well."""
-    first = [side.ask("run", estimator=estimator) for side in sides]  # warms up, and is not counted
+    first = [side.request("run", estimator=estimator) for side in sides]  # warms up, and is not counted
     if any(one["status"] != "ok" for one in first):
         return f"{source}: {estimator} ends {first[0]['status']} there and {first[1]['status']} here, and is not timed"
     pairs = np.array([_pair(sides, estimator, k) for k in range(FEWEST_PAIRS)])
@@ -242,7 +242,7 @@ def _time(sides: Sequence[Process], source: str, estimator: str) -> TimedPairs |
 def _pair(sides: Sequence[Process], estimator: str, k: int) -> tuple[float, float]:
     """Return the seconds of the old and the new code; every second time the new code goes first."""
     order: Mapping[int, Process] = dict(enumerate(sides))
-    times = {side: float(order[side].ask("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
+    times = {side: float(order[side].request("run", estimator=estimator)["cpu_s"]) for side in ((0, 1), (1, 0))[k % 2]}
     return times[0], times[1]
 
 
@@ -278,12 +278,12 @@ def _unpack_revision(revision: str, folder: Path) -> None:
         packed.extractall(folder, filter="data")
 
 
-def _git(*words: str, remedy: str, folder: str = ".") -> bytes:
+def _git(*arguments: str, remedy: str, folder: str = ".") -> bytes:
     try:
-        done = subprocess.run(["git", "-C", folder, *words], capture_output=True, check=False)
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, check=False)
     except OSError as error:
         raise BaselineError(f"git cannot be run ({error}); name a wheel") from error
     if done.returncode:
-        said = printable(done.stderr.decode(errors="replace").strip()) or "it is not known here"
-        raise BaselineError(f"git {words[0]} {words[-1]}: {said}; {remedy}")
+        error_text = printable(done.stderr.decode(errors="replace").strip()) or "it is not known here"
+        raise BaselineError(f"git {message[0]} {message[-1]}: {error_text}; {remedy}")
     return done.stdout

@@ -62,28 +62,28 @@ def judge_case(
     case: Case, before: Measured, now: Measured, bounds: Bounds, terms: CheckTerms = USUAL_TERMS
 ) -> CaseVerdicts:
     """Judge one case on the terms given."""
-    judged = CaseVerdicts()
+    collected = CaseVerdicts()
     if now.unreadable:
-        judged.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
-        return judged
+        collected.verdicts.append(_missing(case, *_NOTHING, "sequence", now.unreadable))
+        return collected
     other = _other_measurements(case, before, now)
     if other:
-        judged.verdicts.append(_missing(case, *_NOTHING, "sequence", other))
-        return judged
+        collected.verdicts.append(_missing(case, *_NOTHING, "sequence", other))
+        return collected
     if before.hashes != now.hashes:
-        judged.notes.append(
+        collected.notes.append(
             f"{case.source}: the same measurements but for their last bits, which this processor rounds differently"
         )
     for estimator, was in before.runs.items():
         if estimator in now.absent or estimator not in now.runs:
             why = now.absent.get(estimator, "it was not run")
-            judged.verdicts.append(_missing(case, estimator, "", "estimator", why))
+            collected.verdicts.append(_missing(case, estimator, "", "estimator", why))
         else:
-            _judge_series(case, estimator, was, now.runs[estimator], judged, bounds, terms)
+            _judge_series(case, estimator, was, now.runs[estimator], collected, bounds, terms)
             if terms.speed:
-                judged.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
-                judged.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
-    return judged
+                collected.notes += _other_arithmetic(case, estimator, was, now.runs[estimator])
+                collected.verdicts += judge_speed(case, estimator, was, now.runs[estimator], bounds)
+    return collected
 
 
 def _other_measurements(case: Case, before: Measured, now: Measured) -> str:
@@ -112,40 +112,42 @@ def _other_arithmetic(case: Case, estimator: str, before: Series, now: Series) -
 
 
 def _judge_series(
-    case: Case, estimator: str, before: Series, now: Series, judged: CaseVerdicts, bounds: Bounds, terms: CheckTerms
+    case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, bounds: Bounds, terms: CheckTerms
 ) -> None:
     """Judge one estimator: how its runs ended first, then every metric where both sides ended well."""
-    judged.verdicts += _ends(case, estimator, before, now, judged, terms)
+    collected.verdicts += _ends(case, estimator, before, now, collected, terms)
     usable = [i for i, (was, is_) in enumerate(zip(before.status, now.status, strict=True)) if was == is_ == "ok"]
     if not usable:
-        judged.notes.append(f"{case.source}: {estimator} has no run that ended well on both sides, nothing is compared")
+        collected.notes.append(
+            f"{case.source}: {estimator} has no run that ended well on both sides, nothing is compared"
+        )
         return
     criteria = bounds.simulated if case.simulated else bounds.recorded
     for output, metrics in before.outputs.items():
         given = now.outputs.get(output, {})
         lost = {key: why for key, values in metrics.items() if (why := _lost(values, given.get(key), usable))}
-        judged.verdicts += [_missing(case, estimator, output, key, why) for key, why in lost.items()]
+        collected.verdicts += [_missing(case, estimator, output, key, why) for key, why in lost.items()]
         shared = {key: _shared(values, given[key], usable) for key, values in metrics.items() if key not in lost}
         changed = changed_metrics(shared)
         for key in criteria:
             where = Where(case.source, estimator, output, key)
             if key in changed:
-                judged.verdicts.append(_changed(where, shared[key], changed[key]))
+                collected.verdicts.append(_changed(where, shared[key], changed[key]))
             elif key in shared and shared[key][0].size:
-                _judge_metric(case, Pairs(where, criteria[key], *shared[key]), judged, terms)
-    judged.verdicts += judge_coverage(case, estimator, before, now, bounds)
+                _judge_metric(case, Pairs(where, criteria[key], *shared[key]), collected, terms)
+    collected.verdicts += judge_coverage(case, estimator, before, now, bounds)
 
 
-def _judge_metric(case: Case, pairs: Pairs, judged: CaseVerdicts, terms: CheckTerms) -> None:
+def _judge_metric(case: Case, pairs: Pairs, collected: CaseVerdicts, terms: CheckTerms) -> None:
     """Put a metric among the tests, or hold it to its bound."""
     if case.simulated:
-        judged.tests.append(pairs)
+        collected.tests.append(pairs)
         return
     where, now = pairs.where, pairs.after
     if np.ptp(now) > SHOWN * np.abs(now).max():
-        judged.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
+        collected.notes.append(f"{case.source}: {where.estimator}'s {where.metric} is another one in every run")
     was, is_ = float(np.median(pairs.before)), float(np.median(now))
-    judged.verdicts.append(judge_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
+    collected.verdicts.append(judge_recorded(where, pairs.criterion, was, is_, accept_better=terms.accept_better))
 
 
 def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdict:
@@ -159,22 +161,22 @@ def _changed(where: Where, values: tuple[Array, Array], unchanged: str) -> Verdi
 
 
 def _ends(
-    case: Case, estimator: str, before: Series, now: Series, judged: CaseVerdicts, terms: CheckTerms
+    case: Case, estimator: str, before: Series, now: Series, collected: CaseVerdicts, terms: CheckTerms
 ) -> Iterator[Verdict]:
     """Fail where runs end otherwise than they did; where that is accepted, note those that end well now."""
     pairs = list(zip(case.seeds, before.status, now.status, strict=True))
     worse = [(seed, is_) for seed, was, is_ in pairs if _SEVERITY[is_] > _SEVERITY[was]]
     if worse:
         runs = f"under seed {', '.join(str(seed) for seed, _ in worse)}" if case.simulated else ""
-        words = f"{worse[0][1]} {runs}".strip() + (f": {now.why}" if now.why else "")
-        yield Verdict(case.source, estimator, "", "status", "regressed", words)
+        message = f"{worse[0][1]} {runs}".strip() + (f": {now.why}" if now.why else "")
+        yield Verdict(case.source, estimator, "", "status", "regressed", message)
     better = [seed for seed, was, is_ in pairs if _SEVERITY[is_] < _SEVERITY[was]]
     if better:
-        words = f"ends better in {len(better)} runs than before"
+        message = f"ends better in {len(better)} runs than before"
         if worse or terms.accept_better:
-            judged.notes.append(f"{case.source}: {estimator} {words}")
+            collected.notes.append(f"{case.source}: {estimator} {message}")
         else:
-            yield Verdict(case.source, estimator, "", "status", "moved", words)
+            yield Verdict(case.source, estimator, "", "status", "moved", message)
 
 
 def _lost(before: Values, now: Values | None, usable: list[int]) -> str:
@@ -208,12 +210,12 @@ def judge_recorded(
             finding = "regressed"
         elif _distance(before, after) > bound and not accept_better:
             finding = "moved"
-    words = "" if finding == "same" else f"{before:.7g} became {after:.7g}"
+    message = "" if finding == "same" else f"{before:.7g} became {after:.7g}"
     if finding in FAILURES:
         by = f"{100.0 * worse:.3g} % worse" if finding == "regressed" else f"{100.0 * _distance(before, after):.3g} %"
-        words += f", {by}, and {criterion.percent:g} % is allowed"
+        message += f", {by}, and {criterion.percent:g} % is allowed"
     return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, finding, words,
+        where.sequence, where.estimator, where.output, where.metric, finding, message,
         before, after, 100.0 * (after / before - 1.0) if before else None, criterion.percent,
     )  # fmt: skip
 
@@ -243,9 +245,9 @@ def judge_coverage(case: Case, estimator: str, before: Series, now: Series, boun
         lost = max(was - is_ for was, is_ in pairs)
         was, is_ = (float(np.mean([pair[side] for pair in pairs])) for side in (0, 1))
         too_much = lost > bounds.coverage_points
-        words = f"a run lost {lost:.1f} percent of its frames, {bounds.coverage_points:g} are allowed"
+        message = f"a run lost {lost:.1f} percent of its frames, {bounds.coverage_points:g} are allowed"
         finding: Finding = "regressed" if too_much else "same"
-        yield Verdict(case.source, estimator, output, COVERAGE, finding, words if too_much else "", was, is_)
+        yield Verdict(case.source, estimator, output, COVERAGE, finding, message if too_much else "", was, is_)
 
 
 def _values_of_both(before: Values, now: Values) -> list[tuple[float, float]]:
@@ -264,12 +266,12 @@ def judge_speed(case: Case, estimator: str, before: Series, now: Series, bounds:
         finding = "regressed"
     elif old > bounds.speed_ratio * new:
         finding = "better"
-    words = {
+    message = {
         "regressed": f"{new / old:.2f} times the time, over the reference's; {bounds.speed_ratio:g} is allowed",
         "better": f"{old / new:.2f} times as fast",
     }.get(finding, "")
     allowed = 100.0 * (bounds.speed_ratio - 1.0)
-    yield Verdict(case.source, estimator, "", SPEED, finding, words, old, new, 100.0 * (new / old - 1.0), allowed)
+    yield Verdict(case.source, estimator, "", SPEED, finding, message, old, new, 100.0 * (new / old - 1.0), allowed)
 
 
 def changed_metrics(values: Mapping[str, Sides]) -> dict[str, str]:

@@ -138,12 +138,12 @@ def _is_nearer(pairs: Pairs) -> bool:
 
 def _verdict(pairs: Pairs, finding: Finding, p: float, seen: float) -> Verdict:
     change = 100.0 * float(np.expm1(pairs.differences.mean()))
-    words = "" if finding == "same" else f"{percent_text(change)} over {pairs.before.size} seeds"
+    message = "" if finding == "same" else f"{percent_text(change)} over {pairs.before.size} seeds"
     if finding in FAILURES:
-        words += f", and chance explains that with p = {p:.2g}"
+        message += f", and chance explains that with p = {p:.2g}"
     where = pairs.where
     return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, finding, words,
+        where.sequence, where.estimator, where.output, where.metric, finding, message,
         before=geometric_mean(pairs.before), after=geometric_mean(pairs.after), change_percent=change,
         allowed_percent=pairs.criterion.percent, p=p, seen_percent=100.0 * float(np.expm1(seen)),
     )  # fmt: skip

@@ -22,32 +22,32 @@ class Timer:
         self._prepared: Any = None
         self._settings: Any = None
 
-    def where(self, asked: Json) -> Json:
+    def where(self, requested: Json) -> Json:
         """Return where the toolkit and each estimator come from; an estimator that is not there has no file."""
         from toolkit.errors import VislamError
         from toolkit.estimator import find
 
         files: dict[str, str | None] = {}
-        for name in asked["estimators"]:
+        for name in requested["estimators"]:
             try:
                 files[name] = sys.modules[find(name).load().__module__].__file__
             except VislamError:
                 files[name] = None
         return {"toolkit": sys.modules["toolkit"].__file__, "files": files}
 
-    def prepare(self, asked: Json) -> Json:
+    def prepare(self, requested: Json) -> Json:
         """Make a recording ready."""
         from toolkit.experiment.recording import Recording, prepare
         from toolkit.settings import settings_of
 
-        self._settings = settings_of(asked["settings"], "the baseline's settings")
-        truth = None if asked["truth"] is None else Path(asked["truth"])
+        self._settings = settings_of(requested["settings"], "the baseline's settings")
+        truth = None if requested["truth"] is None else Path(requested["truth"])
         recording = Recording(
-            asked["source"],
-            asked["seed"],
+            requested["source"],
+            requested["seed"],
             truth,
             start=self._settings.start,
-            duration_s=asked["duration_s"],
+            duration_s=requested["duration_s"],
             noise=self._settings.noise,
             frontend=self._settings.frontend,
             tracks=self._settings.tracks,
@@ -55,13 +55,13 @@ class Timer:
         self._prepared = prepare(recording)
         return {}
 
-    def run(self, asked: Json) -> Json:
+    def run(self, requested: Json) -> Json:
         """Run an estimator over the recording; return its seconds of processor time, and how it ended."""
         from toolkit import runner
         from toolkit.estimator import find
         from toolkit.progress import SILENT
 
-        name, prepared = asked["estimator"], self._prepared
+        name, prepared = requested["estimator"], self._prepared
         gc.collect()
         run = runner.run(name, find(name).load(), prepared.sequence, prepared.prior, SILENT, self._settings)
         return {"status": run.status, "cpu_s": None if run.timings is None else run.timings.cpu_s}
@@ -74,9 +74,9 @@ def main() -> None:
     os.dup2(2, 1)  # nothing that is printed shall look like an answer
     timer = Timer()
     for line in sys.stdin:
-        asked = json.loads(line)
+        requested = json.loads(line)
         try:
-            answer = getattr(timer, asked["do"])(asked)
+            answer = getattr(timer, requested["do"])(requested)
         except Exception as error:
             answer = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
         answers.write(json.dumps(answer) + "\n")

@@ -125,7 +125,7 @@ def check_trajectories(
             elif any(value is not None for value in before.scores[key]):
                 sides = _array(before.scores[key]), _array(now[key])
                 compared.append(Compared(Where(sequence, "", "", key), Criterion("larger", percent), *sides))
-    tested = _judged(compared, baseline.false_alarm_rate, accept_better=accept_better)
+    tested = _tested_together(compared, baseline.false_alarm_rate, accept_better=accept_better)
     order = list(baseline.sequences)
     verdicts = sorted([*verdicts, *tested], key=lambda verdict: order.index(verdict.sequence))
     unknown = sorted(set(there) - set(order))
@@ -168,12 +168,12 @@ def _coverage(sequence: str, before: ScoredSequence, now: Mapping[str, Values], 
     """Fail where the worst run covers less of the time than the worst one of the baseline did."""
     was, is_ = (float(_array(side[TIME_COVERAGE]).min()) for side in (before.scores, now))
     worse = was - is_ > allowed
-    words = f"the least of the runs fell from {was:.1f} to {is_:.1f} percent of the time, {allowed:g} less is allowed"
+    message = f"the least of the runs fell from {was:.1f} to {is_:.1f} percent of the time, {allowed:g} less is allowed"
     finding: Finding = "regressed" if worse else "same"
-    yield Verdict(sequence, "", "", TIME_COVERAGE, finding, words if worse else "", was, is_)
+    yield Verdict(sequence, "", "", TIME_COVERAGE, finding, message if worse else "", was, is_)
 
 
-def _judged(compared: list[Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
+def _tested_together(compared: list[Compared], rate: float, *, accept_better: bool) -> Iterator[Verdict]:
     """Yield a verdict for each metric: by a test where there are runs enough, else by its bound alone."""
     tested = [one for one in compared if _is_tested(one)]
     spreads = [MeanChange.of(one.before, one.after) for one in tested]
@@ -199,10 +199,10 @@ def _tested(
     change = 100.0 * float(np.expm1(spread.change))
     runs = f"{one.before.size} runs before, {one.after.size} now"
     p = min(p_values)
-    words = "" if finding == "same" else f"{percent_text(change)}, {runs}; chance explains that with p = {p:.2g}"
+    message = "" if finding == "same" else f"{percent_text(change)}, {runs}; chance explains that with p = {p:.2g}"
     where = one.where
     return Verdict(
-        where.sequence, where.estimator, where.output, where.metric, finding, words,
+        where.sequence, where.estimator, where.output, where.metric, finding, message,
         before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
         seen_percent=100.0 * float(np.expm1(spread.seen(one.criterion.margin, each))),

@@ -57,7 +57,7 @@ def adjusted(frames: list[StereoFrame], motions: list[Motion], guess: FirstGuess
     all_tracks = _tracks(frames).size
     values = problem.states()
     for _ in range(_ROUNDS):
-        graph, values = problem.solved(frames, values)
+        graph, values = problem.optimum(frames, values)
         scale2, mismatched = _fit(frames, values, sequence)
         if scale2 > _MOST_SIGMAS**2:
             raise NoSoundStartError(f"the tracks scatter by {np.sqrt(scale2):.0f} of their sigmas about any motion")
@@ -90,7 +90,9 @@ class _Problem:
             self.model.insert(values, Estimate(0, pose, v_world=velocity, bias=guess.bias), k)
         return values
 
-    def solved(self, frames: list[StereoFrame], start: gtsam.Values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    def optimum(
+        self, frames: list[StereoFrame], start: gtsam.Values
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the graph of some frames' sightings and its solution, found from states and, where known, points."""
         graph = gtsam.NonlinearFactorGraph()
         self._hold(graph)
@@ -109,12 +111,12 @@ class _Problem:
                 graph.push_back(self.increments[k - 1].factors(k))
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
         try:
-            solved = gtsam.Values(optimizer.optimize())
+            optimum = gtsam.Values(optimizer.optimize())
         except RuntimeError as refusal:
             raise _unless_indeterminate(refusal) from refusal
         if not np.isfinite(optimizer.error()):
             raise NoSoundStartError("the adjustment of the first frames has no finite error")
-        return graph, solved
+        return graph, optimum
 
     def _hold(self, graph: gtsam.NonlinearFactorGraph) -> None:
         if isinstance(self.sequence.noise, ImuNoise):
@@ -147,11 +149,11 @@ def _fit(frames: list[StereoFrame], values: gtsam.Values, sequence: Sequence) ->
         squares.append((((frame.uvs_px - predicted.uv_px) @ whitener.T) ** 2).sum(axis=1))
     tracks, row, sightings = np.unique(np.concatenate(ids), return_inverse=True, return_counts=True)
     chi2 = np.bincount(row, weights=np.concatenate(squares))
-    judged = sightings >= FEWEST_SIGHTINGS
+    decided = sightings >= FEWEST_SIGHTINGS
     freedom = 3 * (np.maximum(sightings, FEWEST_SIGHTINGS) - 1)
-    scale2 = float(np.median((chi2 / freedom)[judged]))
+    scale2 = float(np.median((chi2 / freedom)[decided]))
     bound = MISMATCHED_TRACK_FACTOR * chi2_bound(freedom, _PROBABILITY) * max(scale2, 1.0)
-    return scale2, tracks[judged & (chi2 > bound)]
+    return scale2, tracks[decided & (chi2 > bound)]
 
 
 def _hold_gauge(graph: gtsam.NonlinearFactorGraph, attitude: Array) -> None:

@@ -128,8 +128,8 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
 
 def requests_of(names: Iterable[str]) -> tuple[str, ...]:
     """Return the settings ``metrics.<name>`` without which the metrics of some keys or names are not computed."""
-    asked = set(metrics_called(names))
-    switches = (_on_request(file) for file in _found().files if asked.intersection(file.METRICS))
+    selected = set(metrics_called(names))
+    switches = (_on_request(file) for file in _found().files if selected.intersection(file.METRICS))
     return tuple(sorted({switch for switch in switches if switch}))
 
 

@@ -93,8 +93,8 @@ def score(evaluation: AgainstTruth) -> Scores:
         return scores.remarked([OFFSET], _RATE_REMARK.format(*rate))
     if abs(fit.offset_s) < max(_LEAST_S, _SIGMAS * fit.error_s):
         return scores
-    told = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
-    return scores.remarked([OFFSET], told)
+    remark = _REMARK.format(1e3 * fit.offset_s, 1e3 * fit.error_s, fit.after_m, fit.before_m)
+    return scores.remarked([OFFSET], remark)
 
 
 def _fit(evaluation: AgainstTruth) -> _Fit:

@@ -117,21 +117,21 @@ def _of_some_tracks(track_ids: IntArray) -> BoolArray:
 
 def _harm(paired: _Paired, kind: str) -> str:
     """Say by how much, and when most, the poses miss withheld tracks farther than the motion alone; else nothing."""
-    whole, said = _mean(paired.log_ratio), list[str]()
+    whole, notes = _mean(paired.log_ratio), list[str]()
     if _least(whole) > np.log(MOST_RATIO[kind]):
         ratio = float(np.exp(whole[0]))
-        said.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times as far ({paired.t_s.size} tracks)")
+        notes.append(f"{ratio:.2f} +- {ratio * whole[1]:.2f} times as far ({paired.t_s.size} tracks)")
     edges = np.linspace(paired.t_s.min(), paired.t_s.max(), _STRETCHES + 1)
     stretch = np.clip(np.searchsorted(edges, paired.t_s, side="right") - 1, 0, _STRETCHES - 1)
     many = [k for k in range(_STRETCHES) if np.count_nonzero(stretch == k) >= _FEWEST_IN_STRETCH]
     of_stretch = {k: _mean(paired.log_ratio[stretch == k]) for k in many}
     worst = max(many, key=lambda k: _least(of_stretch[k]), default=None)
     if worst is not None and _least(of_stretch[worst]) > np.log(MOST_RATIO_OF_STRETCH[kind]):
-        said.append(f"{np.exp(of_stretch[worst][0]):.2g} times at {edges[worst]:.0f}-{edges[worst + 1]:.0f} s")
-    if not said:
+        notes.append(f"{np.exp(of_stretch[worst][0]):.2g} times at {edges[worst]:.0f}-{edges[worst + 1]:.0f} s")
+    if not notes:
         return ""
     return (
-        f"explains withheld tracks worse than dead reckoning: it misses them {', '.join(said)} as the measured motion "
+        f"explains withheld tracks worse than dead reckoning: it misses them {', '.join(notes)} as the measured motion "
         "alone does"
     )
 

@@ -46,9 +46,9 @@ class Correction:
         per_sigma = 1.0 / np.where(sigma > 0.0, sigma, np.inf)
         shares, axes = np.linalg.eigh(per_sigma[:, None] * self.taken * per_sigma)
         # What is linearised anew may add to a covariance; less taken away than was added elsewhere tells nothing.
-        told = shares > max(LEAST_TAKEN, -shares[0])
-        length = axes[:, told].T @ (per_sigma * self.moved)
-        return CorrectionTest(float((length**2 / shares[told]).sum()), int(told.sum()))
+        observed = shares > max(LEAST_TAKEN, -shares[0])
+        length = axes[:, observed].T @ (per_sigma * self.moved)
+        return CorrectionTest(float((length**2 / shares[observed]).sum()), int(observed.sum()))
 
 
 def correction_test(before: Belief, after: Belief) -> CorrectionTest:

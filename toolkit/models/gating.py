@@ -46,8 +46,8 @@ def mean_below_bound(dof: IntArray | int, probability: float | None) -> Array:
 
 def mahalanobis_squared(residuals: Array, covs: Array) -> Array:
     """Return r^T S^-1 r (N,) of residuals (N, d) with covariances (N, d, d)."""
-    solved = np.linalg.solve(covs, residuals[..., None])[..., 0]
-    distance: Array = np.einsum("ni,ni->n", residuals, solved)
+    weighted = np.linalg.solve(covs, residuals[..., None])[..., 0]
+    distance: Array = np.einsum("ni,ni->n", residuals, weighted)
     return distance
 
 

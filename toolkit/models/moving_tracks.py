@@ -96,7 +96,7 @@ class MovingTracks:
             prediction = self._model.integrate(packet.motion, self._belief.bias).predict(self._belief)
             agree = self._take(_Step.of(self._belief, prediction), prediction, seen)
         self._path.pop(k - _MOST_FRAMES_BACK, None)
-        self._tracks = seen.judged(agree)
+        self._tracks = seen.checked(agree)
         sound = np.empty(order.size, dtype=bool)
         sound[order] = self._tracks.refusals < (REFUSALS if agree is None else 1)
         return sound
@@ -188,7 +188,7 @@ class _Tracks:
         refusals[new] = before.refusals[old]
         return replace(self, recent=recent, early=early, refusals=refusals)
 
-    def judged(self, agree: BoolArray | None) -> "_Tracks":
+    def checked(self, agree: BoolArray | None) -> "_Tracks":
         """Return the tracks after it was said which (N,) agree; None where nothing can be said."""
         refusals = self.refusals
         if agree is not None:
@@ -296,7 +296,7 @@ def _found(pairs: _Pairs, step: _Step, rig: StereoRig, rng: np.random.Generator)
         linear = pairs.linear(step.T_start_end @ se3_exp(error), rig)
         linear = linear._replace(residual_px=linear.residual_px + linear.d_uv_d_motion @ error)
         problem = _Problem.of(linear, root)
-    best, left = problem.solved(problem.chi2(best[None])[0] < bound)
+    best, left = problem.solution(problem.chi2(best[None])[0] < bound)
     error, error_cov = root @ best, root @ left @ root.T
     return _Found(error, error_cov, linear.chi2(error, error_cov) < bound)
 
@@ -322,7 +322,7 @@ class _Problem(NamedTuple):
         """Return the truncated squared residuals (C,) of C errors (C, 6), all tracks and the prediction together."""
         return np.asarray((errors**2).sum(axis=1) + np.minimum(self.chi2(errors), bound).sum(axis=1))
 
-    def solved(self, weights: Array | BoolArray) -> tuple[Array, Array]:
+    def solution(self, weights: Array | BoolArray) -> tuple[Array, Array]:
         """Return the most probable error (6,) where tracks (N,) have weights, and its covariance (6, 6)."""
         weighted = (self.jacobians * np.asarray(weights, dtype=float)[:, None, None]).reshape(-1, 6).T
         cov = np.linalg.inv(np.eye(6) + weighted @ self.jacobians.reshape(-1, 6))
@@ -333,8 +333,8 @@ def _softened(problem: _Problem, bound: float) -> Array:
     """Return the error (6,) that is found from none on, large residuals losing their weight by and by."""
     error = np.zeros(6)
     for factor in _SOFTENED:
-        error, _ = problem.solved((1.0 + problem.chi2(error[None])[0] / (factor * bound)) ** -2)
-    return problem.solved(problem.chi2(error[None])[0] < bound)[0]
+        error, _ = problem.solution((1.0 + problem.chi2(error[None])[0] / (factor * bound)) ** -2)
+    return problem.solution(problem.chi2(error[None])[0] < bound)[0]
 
 
 def _searched(problem: _Problem, best: Array, bound: float, most: float, rng: np.random.Generator) -> Array:
@@ -343,10 +343,10 @@ def _searched(problem: _Problem, best: Array, bound: float, most: float, rng: np
     rows = rng.random((_SAMPLES, len(problem.residuals))).argpartition(size - 1, axis=1)[:, :size]
     of_samples = problem.jacobians[rows].reshape(_SAMPLES, -1, 6)
     normal = np.eye(6) + transposed(of_samples) @ of_samples
-    told = transposed(of_samples) @ problem.residuals[rows].reshape(_SAMPLES, -1, 1)
-    shown = np.asarray(np.linalg.solve(normal, told)[..., 0], dtype=np.float64)
+    gradient = transposed(of_samples) @ problem.residuals[rows].reshape(_SAMPLES, -1, 1)
+    shown = np.asarray(np.linalg.solve(normal, gradient)[..., 0], dtype=np.float64)
     agree = problem.chi2(shown) < bound
-    refined = [problem.solved(agree[i])[0] for i in problem.costs(shown, bound).argsort()[:_REFINED]]
+    refined = [problem.solution(agree[i])[0] for i in problem.costs(shown, bound).argsort()[:_REFINED]]
     errors = np.stack([np.zeros(6), best, *refined])
     costs = np.where((errors**2).sum(axis=1) < most, problem.costs(errors, bound), np.inf)
     return np.asarray(errors[costs.argmin()])

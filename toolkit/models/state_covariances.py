@@ -42,7 +42,7 @@ _MOST_ROUNDED = 0.01
 _MOST_TIED = 50
 # A direction of a variable with less than this share of the information on its best one is lost in the sixteen digits
 # of the Jacobians: a landmark's depth beyond ten thousand million baselines.
-_LEAST_TOLD = 1e-10
+_LEAST_DETERMINED = 1e-10
 # So many rows may be added to a joint covariance before it is copied, without those that are not needed any more.
 _ROOM = 100
 
@@ -84,10 +84,10 @@ def _of_groups(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], b
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
     orders = (partial(_in_time, tied, together), [0]), (partial(_dissected, tied, beside), some)
-    for order, judged in orders:
+    for order, checked in orders:
         try:
             covs = _recovered(_eliminated(tied, order()), together)
-            if all(_is_right(covs[k], linear, states[k]) for k in judged):
+            if all(_is_right(covs[k], linear, states[k]) for k in checked):
                 return covs
         except RuntimeError as error:  # a variable that this order finds undetermined
             failure = error
@@ -125,8 +125,8 @@ def _terms(factor: gtsam.GaussianFactor, sizes: gtsam.VectorValues) -> list[tupl
 def _measured(jacobian: Array) -> Array:
     """Return the directions (d, r) that a Jacobian (m, d) says anything of, each as long as its standard deviation."""
     _, per_unit, directions = np.linalg.svd(jacobian, full_matrices=False)
-    told = per_unit > _LEAST_TOLD * per_unit[0]
-    return np.asarray(directions[told].T / per_unit[told])
+    determined = per_unit > _LEAST_DETERMINED * per_unit[0]
+    return np.asarray(directions[determined].T / per_unit[determined])
 
 
 def _is_right(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int]) -> bool:

@@ -73,7 +73,7 @@ def _images(comparison: Comparison) -> ImageRecording | None:
         return None
 
 
-def _errors_px(row: Row, sequence: Sequence, asked: BoolArray) -> Array | None:
+def _errors_px(row: Row, sequence: Sequence, requested: BoolArray) -> Array | None:
     """Return the error (N,) px of every sighting whose track has one that is asked for (N,); NaN where there is none.
 
     None where the row has no poses of its own.
@@ -81,7 +81,7 @@ def _errors_px(row: Row, sequence: Sequence, asked: BoolArray) -> Array | None:
     if row.repeats_causal or row.run.trajectory(row.output) is None:
         return None
     observations = sequence.observations
-    wanted = np.flatnonzero(np.isin(observations.track_id, observations.track_id[asked]))
+    wanted = np.flatnonzero(np.isin(observations.track_id, observations.track_id[requested]))
     poses = Evaluation(row.run, row.output, sequence).poses_of_frames
     with np.errstate(all="ignore"):  # a diverged run overflows; that becomes null
         found, found_px = errors_left_out(observations.select(wanted), poses, sequence.rig)

@@ -12,13 +12,13 @@ from toolkit.metrics import Metric, known_metrics, metrics_called
 from toolkit.report.scores_json import path_length_m
 from toolkit.report.table import MISSING, Table, cell, heading, number
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Window, outliers_in_words
+from toolkit.settings import Noise, Window, outlier_summary
 
 # The metric whose mean over seeds is held against its band, in a column of its own behind that of the mean.
 _BANDED = "nees_pose_mean"
 # What comes first in the table of a real drive: its drift, and the error that keeps the vertical. After an SE(3) fit
 # good estimators differ by luck there (one model solved twice differed by a metre). The drift says what the RPE would.
-_LEADING, _SAID_BY_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
+_LEADING, _SHOWN_AS_DRIFT = ("kitti_t_percent", "ate_yaw_m"), "rpe_100m_percent"
 # The columns of a table: None for the usual ones, "all", or metrics by key or name.
 Columns = None | Literal["all"] | tuple[str, ...]
 _MOTION = {"twist": "body twists", "imu": "raw IMU", "none": "no motion measured (smooth motion assumed)"}
@@ -35,7 +35,7 @@ class _Column(NamedTuple):
     cell: Callable[[Row], str]
 
 
-def columns_asked(names: tuple[str, ...]) -> Columns:
+def requested_columns(names: tuple[str, ...]) -> Columns:
     """Return the columns that some names ask for: the usual ones where there are none, all for the one word "all".
 
     Raises VislamError for a name that is no metric's.
@@ -116,7 +116,7 @@ def _for_a_drive(valued: list[Metric], usual: list[Metric]) -> list[Metric]:
     leading = [metric for key in _LEADING for metric in valued if metric.key == key]
     if len(leading) < len(_LEADING):
         return usual
-    return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SAID_BY_DRIFT))]
+    return [*leading, *(metric for metric in usual if metric.key not in (*_LEADING, _SHOWN_AS_DRIFT))]
 
 
 def explained_metrics(comparison: Comparison, columns: Columns = None) -> tuple[Metric, ...]:
@@ -187,7 +187,7 @@ def rules_line(comparison: Comparison) -> str:
     thinned = f", so that {left_out} of {sequence.frame_count} frames have none" if left_out else ""
     return (
         f"window {window.seconds(sequence.motion_kind):g} s, at most {window.most_states} states{thinned}; "
-        f"outliers: {outliers_in_words(settings.outliers)}"
+        f"outliers: {outlier_summary(settings.outliers)}"
         f"{_track_noise(settings.noise)}{_optional_parts(settings.noise)}"
     )
 

@@ -73,7 +73,7 @@ def onto_truth(run: Run, output: Output, sequence: Sequence) -> Alignment:
         return NOT_ALIGNED
 
 
-def alignment_words(sequence: Sequence) -> str:
+def alignment_text(sequence: Sequence) -> str:
     """Say how a figure's estimates are aligned."""
     if sequence.truth is None:
         return "There is no truth; every estimator starts from the same pose and nothing is aligned."
@@ -164,7 +164,7 @@ def _from_truth(comparison: Comparison) -> _Reference | None:
     if truth is None:
         return None
     caption = (
-        f"Position and heading error over time. {alignment_words(sequence)} "
+        f"Position and heading error over time. {alignment_text(sequence)} "
         "Dashed: causal, what was known at the time. Solid: final, which of a filter is its causal output too."
     )
     return _Reference(truth, lambda row: onto_truth(row.run, row.output, sequence), "error", caption)

@@ -214,9 +214,9 @@ def _array(values: Mapping[int, float]) -> Array:
 def _ends(before: Mapping[tuple[str, str], _Line], after: Mapping[tuple[str, str], _Line]) -> Iterator[Change]:
     """Yield each line whose runs ended otherwise, or that one side alone has."""
     for key in dict.fromkeys((*before, *after)):
-        told = [_counts(side[key]) if key in side else "" for side in (before, after)]
-        if told[0] != told[1]:
-            yield Change(" ".join(key), *told)
+        counts = [_counts(side[key]) if key in side else "" for side in (before, after)]
+        if counts[0] != counts[1]:
+            yield Change(" ".join(key), *counts)
 
 
 def _counts(line: _Line) -> str:

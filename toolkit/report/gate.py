@@ -108,12 +108,12 @@ def _escaped(text: str) -> str:
 
 def headline(check: Check) -> str:
     """Return the verdict in one line."""
-    judged = len(check.verdicts)
+    tested = len(check.verdicts)
     if check.passed:
-        return f"the gate passes: nothing got worse than {check.baseline} ({judged} comparisons)"
+        return f"the gate passes: nothing got worse than {check.baseline} ({tested} comparisons)"
     found = Counter(verdict.finding for verdict in check.failures)
     counts = ", ".join(f"{found[finding]} {words}" for finding, words in _FAILED.items() if found[finding])
-    return f"the gate fails: of {judged} comparisons with {check.baseline}, {counts}"
+    return f"the gate fails: of {tested} comparisons with {check.baseline}, {counts}"
 
 
 def failure_lines(check: Check) -> Iterator[str]:

@@ -27,16 +27,16 @@ _PACKAGES = {"toolkit": "vislam-toolkit", **NUMERIC_PACKAGES, "matplotlib": "mat
 _THREAD_VARIABLES = (*THREAD_VARIABLES, "TBB_NUM_THREADS")
 
 
-def manifest_document(comparison: Comparison, command: str, asked: Configuration) -> Manifest:
+def manifest_document(comparison: Comparison, command: str, requested: Configuration) -> Manifest:
     """Return the manifest of a comparison: made by a command, that came to be asked for this."""
     here = _run_here(comparison)
     versions = {name: installed_version(package) for name, package in _PACKAGES.items()}
-    request = msgspec.structs.replace(asked.request, sequences=(comparison.source,), estimators=here)
+    request = msgspec.structs.replace(requested.request, sequences=(comparison.source,), estimators=here)
     return Manifest(
         schema="vislam.manifest/1",
         command=command,
         compare=request,
-        settings=asked.settings,
+        settings=requested.settings,
         date=_now(),
         versions={"python": platform.python_version(), **versions},
         git_revision=_git_revision(),

@@ -125,16 +125,16 @@ def _medians_of_all(comparison: Comparison) -> Iterator[str]:
     metric = next((metric for metric in shown_metrics(comparison) if metric.best), None)
     if metric is None:
         return
-    told = []
+    listed = []
     for row in comparison.lines:
         found = row.quantiles_of_all(metric)
         if found is not None:
             ended = f"{100.0 * row.counts['ok'] / len(row.outcomes):.0f} % ok"
             median = f"none, {found.reason}" if found.median is None else f"{cell(found.median, metric)} {metric.unit}"
-            told.append(f"{_name_of(row)} {median} ({ended})")
-    if told:
+            listed.append(f"{_name_of(row)} {median} ({ended})")
+    if listed:
         what = f"median {metric.name} over all runs, one that did not end well counted as infinitely bad"
-        yield f"{what}: {'; '.join(told)}"
+        yield f"{what}: {'; '.join(listed)}"
 
 
 def _marks(comparison: Comparison) -> Iterator[str]:
@@ -144,7 +144,7 @@ def _marks(comparison: Comparison) -> Iterator[str]:
         if found is not None and row.mark:
             name = metrics_called((found.metric,))[0].name
             if row.mark == "contradicted":
-                yield f"{_name_of(row)} is contradicted: {_trend_in_words(found.mean, found.high)}"
+                yield f"{_name_of(row)} is contradicted: {_trend_text(found.mean, found.high)}"
                 continue
             yield (
                 f"{_name_of(row)} is {row.mark}: its {name} is {_figure(found.mean)}, and {_figure(found.low)} to "
@@ -153,7 +153,7 @@ def _marks(comparison: Comparison) -> Iterator[str]:
             )
 
 
-def _trend_in_words(trend: float, limit: float) -> str:
+def _trend_text(trend: float, limit: float) -> str:
     return (
         f"its tracks turn its state one way, {_figure(trend)} times as far (squared) as its covariance and the "
         f"measured motion allow, by chance at most {_figure(limit)}; look for what all tracks share, as a fault of "
@@ -166,9 +166,9 @@ def _refusals(comparison: Comparison) -> Iterator[str]:
     accepted = {row.estimator: row.value(ACCEPTED) for row in comparison.rows if row.output == "causal"}
     refused = {name: 100.0 - share for name, share in accepted.items() if share is not None and refuses_much(share)}
     if refused:
-        told = ", ".join(f"{name} {share:.0f} %" for name, share in refused.items())
+        listed = ", ".join(f"{name} {share:.0f} %" for name, share in refused.items())
         yield (
-            f"the outlier gate refused much of what it tested ({told}): many mismatches, or a model that does not "
+            f"the outlier gate refused much of what it tested ({listed}): many mismatches, or a model that does not "
             "hold, as of calibration, time stamps or noise"
         )
 
@@ -187,10 +187,10 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
 def dispute_lines(dispute: Dispute) -> Iterator[str]:
     """Yield a line for those who part from the measured motion, and one for who rests on a motion that is disputed."""
     if dispute.parted:
-        told = "; ".join(f"{_name_of(one.row)} by {_parted_in_words(one)}" for one in dispute.parted)
+        listed = "; ".join(f"{_name_of(one.row)} by {_parted_text(one)}" for one in dispute.parted)
         yield (
             "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
-            f"which squared is at most {_figure(FARTHEST)} times what they state: {told}"
+            f"which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
         )
     if dispute.doubts_motion:
         names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.witnesses)}"
@@ -200,7 +200,7 @@ def dispute_lines(dispute: Dispute) -> Iterator[str]:
         )
 
 
-def _parted_in_words(one: Parted) -> str:
+def _parted_text(one: Parted) -> str:
     apart = f"{_figure(one.distance_m)} m and {_figure(one.angle_deg)} deg"
     return f"{apart} at {one.t_s:.0f} s, {_figure(one.squared)} times"
 
@@ -277,13 +277,15 @@ def _difference(found: Paired, metric: Metric, best: str) -> str:
         return f"equal to that of {best} under all {found.n} seeds"
     decimals = max(0, 1 - math.floor(math.log10(found.error))) if found.error > 0.0 else metric.decimals
     figures = f"{found.mean:+.{decimals}f} ± {found.error:.{decimals}f}"
-    told = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
+    listed = f"{' '.join(filter(None, (figures, metric.unit)))} against {best}, paired over {found.n} seeds"
     if found.is_significant:
-        return told
+        return listed
     if found.seeds_needed > _MOST_SEEDS:
-        return f"{told}: as good as equal, {_MOST_SEEDS} seeds would not tell them apart"
+        return f"{listed}: as good as equal, {_MOST_SEEDS} seeds would not tell them apart"
     more = max(1, math.ceil(found.seeds_needed) - found.n)
-    return f"{told}: may be chance; {more} more seed{'s' if more > 1 else ''} would tell a difference as large as this"
+    return (
+        f"{listed}: may be chance; {more} more seed{'s' if more > 1 else ''} would tell a difference as large as this"
+    )
 
 
 def _equal(one: Row, other: Row) -> bool:

@@ -18,7 +18,7 @@ from toolkit.report.comparison_table import header_lines, sequence_line
 from toolkit.report.curves import (
     ErrorCurves,
     Errors,
-    alignment_words,
+    alignment_text,
     components,
     error_curves,
     onto_truth,
@@ -33,7 +33,7 @@ from toolkit.report.messages import (
     remark_lines,
 )
 from toolkit.report.records.report import (
-    AuditWords,
+    AuditMessage,
     CameraFrame,
     ComponentSeries,
     DrawnMap,
@@ -42,14 +42,14 @@ from toolkit.report.records.report import (
     ErrorKind,
     ErrorSeries,
     MeanNeesSeries,
+    Messages,
     NeesSeries,
     NisSeries,
     Report,
+    SeedsMessages,
     SeedsReport,
-    SeedsWords,
     StepTimes,
     Vector,
-    Words,
 )
 from toolkit.sequence import Sequence
 
@@ -76,12 +76,12 @@ def report_document(comparison: Comparison, frames: tuple[CameraFrame, ...] = ()
         schema="vislam.report/1",
         start_ns=int(comparison.sequence.frames_t_ns[0]),
         truth=None if truth_during(comparison.sequence) is None else TRUTH_FILE,
-        alignment=alignment_words(comparison.sequence),
+        alignment=alignment_text(comparison.sequence),
         error=None if curves is None else ErrorKind(what=curves.what, caption=_error_caption(comparison, curves)),
         runs=tuple(_row(row, comparison, _curve_of(row, curves)) for row in comparison.rows),
         steps=tuple(_steps(comparison)),
         maps=tuple(_map(run) for run in comparison.runs if len(run.landmarks)),
-        words=_words(comparison),
+        words=_messages(comparison),
         card=UNSET if comparison.card is None else card_record(comparison.card),
         frames=frames or UNSET,
     )
@@ -93,7 +93,7 @@ def seeds_report_document(over: Comparison) -> SeedsReport:
         schema="vislam.report/1",
         t_s=tuple(map(rounded, over.sequence.frames_s.tolist())),
         runs=tuple(_over_seeds(group) for group in over.rows),
-        words=SeedsWords(
+        words=SeedsMessages(
             sequence="; ".join(header_lines(over)),
             notes=tuple(note_lines(over)),
             verdicts=tuple(consistency_lines(over)),
@@ -106,7 +106,7 @@ def _error_caption(comparison: Comparison, curves: ErrorCurves) -> str:
     """Say how the errors are measured; with a truth the reader may choose what they are drawn over."""
     if comparison.sequence.truth is None:
         return curves.caption
-    return f"{alignment_words(comparison.sequence)} Dashed: causal, what was known at the time. Solid: final."
+    return f"{alignment_text(comparison.sequence)} Dashed: causal, what was known at the time. Solid: final."
 
 
 def _curve_of(row: Row, curves: ErrorCurves | None) -> Errors | None:
@@ -121,14 +121,14 @@ def _same_line(row: Row, other: Row) -> bool:
     return row.run is other.run and (row.run.final_is_causal or row.output == other.output)
 
 
-def _words(comparison: Comparison) -> Words:
-    return Words(
+def _messages(comparison: Comparison) -> Messages:
+    return Messages(
         sequence=sequence_line(comparison.sequence),
         notes=tuple(note_lines(comparison)),
         remarks=tuple(remark_lines(comparison)),
         start=comparison.prior.source,
         audit=tuple(
-            AuditWords(fault=f.fault, count=f.count, outcome=outcome(f), detail=f.detail) for f in comparison.findings
+            AuditMessage(fault=f.fault, count=f.count, outcome=outcome(f), detail=f.detail) for f in comparison.findings
         ),
         undecided=dict(comparison.undecided),
         facts=comparison.sequence.provenance.facts,

@@ -128,7 +128,7 @@ class MadeBy:
     """
 
     command: str
-    asked: Configuration
+    requested: Configuration
     figures: "FigureFormat" = "png"
     choice: "FigureChoice" = "few"
 
@@ -153,7 +153,7 @@ def write_run(comparison: Comparison, target: Path, made_by: MadeBy) -> None:
             _write_trajectories(comparison, directory)
         captions = _written_figures(comparison, directory / "figures", made_by)
         _write_text(directory / REPORT_TEXT, report_text(comparison, captions))
-        manifest = manifest_document(comparison, made_by.command, made_by.asked)
+        manifest = manifest_document(comparison, made_by.command, made_by.requested)
         _write_text(directory / MANIFEST, to_text(msgspec.structs.replace(manifest, files=_files_in(directory))))
 
 

@@ -13,7 +13,7 @@ from toolkit.metrics import Metric, describe, known_metrics
 from toolkit.report.curves import truth_during
 from toolkit.report.records.scores import (
     AuditEntry,
-    Judged,
+    ConsistencyMark,
     LogEntry,
     MetricOverSeeds,
     Metrics,
@@ -106,15 +106,15 @@ def _run(row: Row) -> ScoredRun:
         metrics=metrics,
         notes={key: notes[key] for key in sorted(notes)},
         log=tuple(row.run.log),
-        consistency=_judged(row),
+        consistency=_mark(row),
     )
 
 
-def _judged(row: Row) -> Judged | UnsetType:
+def _mark(row: Row) -> ConsistencyMark | UnsetType:
     found = row.consistency
     if found is None:
         return UNSET
-    return Judged(verdict=found.verdict, metric=found.metric, mean=found.mean, band=(found.low, found.high))
+    return ConsistencyMark(verdict=found.verdict, metric=found.metric, mean=found.mean, band=(found.low, found.high))
 
 
 def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
@@ -128,17 +128,19 @@ def _run_over_seeds(group: Row, over: Comparison) -> RunOverSeeds:
         metrics={metric.key: _metric(group, metric) for metric in metrics},
         notes={metric.key: group.reason(metric.key) for metric in metrics if group.spread(metric.key) is None},
         over_seeds=_whole_runs(group),
-        consistency=_judged(group),
+        consistency=_mark(group),
         ok_share=group.counts["ok"] / len(group.outcomes),
     )
 
 
 def _metric(group: Row, metric: Metric) -> MetricOverSeeds:
     spread = group.spread(metric.key)
-    told = (
+    described = (
         dict.fromkeys((field.name for field in fields(Spread)), None) | {"n": 0} if spread is None else asdict(spread)
     )
-    return MetricOverSeeds(**told, values=tuple(group.values(metric.key)), quantiles_all=_quantiles_all(group, metric))
+    return MetricOverSeeds(
+        **described, values=tuple(group.values(metric.key)), quantiles_all=_quantiles_all(group, metric)
+    )
 
 
 def _quantiles_all(group: Row, metric: Metric) -> QuantilesAll | UnsetType:

@@ -23,7 +23,7 @@ from toolkit.settings.records import (
     Window,
     as_values,
     changes_of,
-    outliers_in_words,
+    outlier_summary,
 )
 
 __all__ = [
@@ -45,7 +45,7 @@ __all__ = [
     "as_values",
     "changes_of",
     "describe",
-    "outliers_in_words",
+    "outlier_summary",
     "read_toml",
     "settings_of",
     "with_assignments",

@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from toolkit.errors import DataError, did_you_mean, no_such
-from toolkit.files.documents import in_words
+from toolkit.files.documents import readable
 from toolkit.files.reading import read_text_input
 from toolkit.settings.records import POLICIES, Settings, SettingsError
 
@@ -32,7 +32,7 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
         return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
         # In TOML and on the command line no value is called none.
-        what = in_words(error, values, Settings).replace(" or null", " or none")
+        what = readable(error, values, Settings).replace(" or null", " or none")
         raise SettingsError(f"{place}: {what}") from error
 
 
@@ -135,11 +135,11 @@ def _one(key: str, hint: Any, default: Any) -> Described:
     metas = list(_metas(hint))
     extra = {name: text for meta in metas for name, text in (meta.extra or {}).items()}
     bounds = {name: getattr(meta, name) for meta in metas for name in _BOUNDS if getattr(meta, name) is not None}
-    words = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
-    words += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
+    bounds_text = [f"{_BOUNDS[name]} {bound:g}" for name, bound in bounds.items()]
+    bounds_text += [" or ".join(map(str, get_args(part))) for part in _parts(hint) if get_origin(part) is Literal]
     meaning = next(meta.description for meta in metas if meta.description)
     shown = extra.get("none", "none") if default is None else _shown(default)
-    return Described(key, extra.get("unit", ""), shown, ", ".join(words), meaning)
+    return Described(key, extra.get("unit", ""), shown, ", ".join(bounds_text), meaning)
 
 
 def _shown(default: Any) -> str:

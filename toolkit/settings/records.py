@@ -25,7 +25,7 @@ class SettingsError(VislamError):
 
 def _setting(description: str, unit: str = "", *, none: str = "", **within: float) -> Meta:
     """Return what is told of a setting: what it is, its unit, what None stands for, and its range as Meta has it."""
-    extra = {key: words for key, words in {"unit": unit, "none": none}.items() if words}
+    extra = {key: text for key, text in {"unit": unit, "none": none}.items() if text}
     bounds: dict[str, Any] = {**within}
     return Meta(description=description, extra=extra, **bounds)
 
@@ -286,7 +286,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True):
 DEFAULTS = Settings()
 
 
-def outliers_in_words(outliers: Outliers) -> str:
+def outlier_summary(outliers: Outliers) -> str:
     """Return the name of an outlier policy, and what was set by itself."""
     named = msgspec.to_builtins(POLICIES[outliers.policy])
     changed = {key: value for key, value in msgspec.to_builtins(outliers).items() if value != named[key]}

@@ -6,7 +6,7 @@ Read ``tracklets`` (the tracks, by length), ``likelihood`` (their residuals, and
 """
 
 from toolkit.track_errors.card import Card, card_of
-from toolkit.track_errors.fit import Fit, fit_track_noise, in_words
+from toolkit.track_errors.fit import Fit, fit_track_noise, summary_of
 from toolkit.track_errors.statement import contradicted
 
-__all__ = ["Card", "Fit", "card_of", "contradicted", "fit_track_noise", "in_words"]
+__all__ = ["Card", "Fit", "card_of", "contradicted", "fit_track_noise", "summary_of"]

@@ -191,7 +191,7 @@ def _without_traces(noise: TrackNoise) -> TrackNoise:
     return TrackNoise(noise.white_px, walk_px, offset_px)
 
 
-def in_words(fit: Fit, stated_px2: Array) -> str:
+def summary_of(fit: Fit, stated_px2: Array) -> str:
     """Return the fitted noise in a line; where it is white, beside the covariance (3, 3) of (uL, uR, v) that stands."""
     noise = fit.noise
     parts = [f"white {_of_channels(noise.white_px)}"]

@@ -83,11 +83,11 @@ def look_ahead(build: Build, watched: Watched, counts: tuple[int, ...] = ()) -> 
     frames = len(watched.online)
     for count in counts or (2, frames // 2):
         early = answers(build, watched.sequence.truncated(count))
-        for k, (said, full) in enumerate(zip(early, watched.online, strict=False)):
-            if difference(said, full):
+        for k, (answer, full) in enumerate(zip(early, watched.online, strict=False)):
+            if difference(answer, full):
                 return (
                     f"its answer to frame {k} is another one where the packets from frame {count} on are withheld: "
-                    f"{difference(said, full)}"
+                    f"{difference(answer, full)}"
                 )
     return ""
 
@@ -147,8 +147,8 @@ def _largest(left: Array, right: Array) -> float:
 
 def changed_later(watched: Watched) -> str:
     """Say which answer changed after it was given."""
-    for k, (said, copies) in enumerate(zip(watched.online, watched.online_copies, strict=True)):
-        for array, copy in zip(arrays_of(said), copies, strict=True):
+    for k, (answer, copies) in enumerate(zip(watched.online, watched.online_copies, strict=True)):
+        for array, copy in zip(arrays_of(answer), copies, strict=True):
             if not np.array_equal(array, copy, equal_nan=True):
                 return f"its answer to frame {k} changed after it was given, by {_largest(array, copy):.3g}"
     return ""
@@ -165,9 +165,9 @@ def touched(watched: Watched) -> str:
 
 def not_finite(watched: Watched) -> str:
     """Say at which frame a pose, velocity or bias is no number."""
-    for k, said in enumerate(watched.online):
+    for k, answer in enumerate(watched.online):
         for name in ("T_world_imu", "v_world", "bias"):
-            value = None if said is None else getattr(said, name)
+            value = None if answer is None else getattr(answer, name)
             if value is not None and not np.isfinite(value).all():
                 return f"{name} of its answer to frame {k} is not finite"
     trajectory = watched.finished.trajectory
@@ -202,9 +202,9 @@ def unsound_covariance(watched: Watched) -> str:
 
 
 def _stated(watched: Watched) -> Iterator[tuple[str, Array]]:
-    for k, said in enumerate(watched.online):
-        if said is not None and said.cov is not None:
-            yield f"its answer to frame {k}", said.cov
+    for k, answer in enumerate(watched.online):
+        if answer is not None and answer.cov is not None:
+            yield f"its answer to frame {k}", answer.cov
     finals = watched.finished.trajectory.cov
     for k, cov in enumerate(() if finals is None else finals):
         yield f"its final state {k}", cov
@@ -231,7 +231,7 @@ def covariance_fault(cov: Array, sizes: tuple[int, ...]) -> str:
 
 def no_rotation(watched: Watched) -> str:
     """Say which pose has a rotation that is none."""
-    poses = [said.T_world_imu for said in watched.online if said is not None]
+    poses = [answer.T_world_imu for answer in watched.online if answer is not None]
     stacked = np.concatenate([np.array(poses).reshape(-1, 4, 4), watched.finished.trajectory.T_world_imu])
     rotations = stacked[:, :3, :3]
     with np.errstate(all="ignore"):
@@ -245,12 +245,12 @@ def no_rotation(watched: Watched) -> str:
 def wrong_stamps(watched: Watched) -> str:
     """Say where answers miss a frame, or have the stamp of another one."""
     frames_t_ns = watched.sequence.frames_t_ns
-    silent = sum(said is None for said in watched.online)
+    silent = sum(answer is None for answer in watched.online)
     if silent not in (0, len(watched.online)):
         return f"it answers at {len(watched.online) - silent} of {len(watched.online)} frames; answer at each, or none"
-    for k, said in enumerate(watched.online):
-        if said is not None and said.t_ns != frames_t_ns[k]:
-            return f"its answer to frame {k} has the stamp {said.t_ns} ns, the frame has {frames_t_ns[k]} ns"
+    for k, answer in enumerate(watched.online):
+        if answer is not None and answer.t_ns != frames_t_ns[k]:
+            return f"its answer to frame {k} has the stamp {answer.t_ns} ns, the frame has {frames_t_ns[k]} ns"
     final = watched.finished.trajectory
     if not np.array_equal(final.t_ns, frames_t_ns) or final.T_world_imu.shape != (frames_t_ns.size, 4, 4):
         return (

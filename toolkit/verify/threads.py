@@ -31,16 +31,18 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     """
     # Idle threads sleep at once: spinning, they starve a busy machine.
     environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {"OPENBLAS_THREAD_TIMEOUT": "4"}
-    words = [sys.executable, "-m", __name__, str(threads), *estimators]
+    arguments = [sys.executable, "-m", __name__, str(threads), *estimators]
     try:
-        done = subprocess.run(words, capture_output=True, text=True, env=environment, timeout=_TIMEOUT_S, check=False)
+        done = subprocess.run(
+            arguments, capture_output=True, text=True, env=environment, timeout=_TIMEOUT_S, check=False
+        )
     except subprocess.TimeoutExpired as error:
         raise EstimatorError(f"with {threads} threads it did not end within {_TIMEOUT_S} s") from error
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
         raise EstimatorError(f"with {threads} threads its process ended: {last[0]}")
-    said: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
-    return said
+    digests: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    return digests
 
 
 def other_bits(estimator: str) -> str:
@@ -51,7 +53,7 @@ def other_bits(estimator: str) -> str:
 
 
 def _digests(estimators: list[str]) -> dict[str, str]:
-    said = {}
+    digests = {}
     for scenario in (DRIVE, FLIGHT):
         sequence = simulate(replace(scenario, duration_s=_DURATION_S), _SEED)
         assert sequence.prior is not None
@@ -60,21 +62,21 @@ def _digests(estimators: list[str]) -> dict[str, str]:
             try:
                 run = runner.run(subject.name, subject.load(), sequence, sequence.prior, SILENT)
             except EstimatorError:
-                said[f"{word} on {sequence.name}"] = UNAVAILABLE
+                digests[f"{word} on {sequence.name}"] = UNAVAILABLE
                 continue
             digest = hashlib.sha256()
             for part in (run.causal, run.final, run.landmarks):
                 for array in arrays_of(part):
                     digest.update(array.tobytes())
-            said[f"{word} on {sequence.name}"] = digest.hexdigest()
-    return said
+            digests[f"{word} on {sequence.name}"] = digest.hexdigest()
+    return digests
 
 
-def main(words: list[str]) -> None:
+def main(arguments: list[str]) -> None:
     """Print the digests of the estimators named behind the number of threads."""
     if hasattr(os, "sched_setaffinity"):  # what GTSAM's pool goes by
-        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(words[0])])
-    print(json.dumps(_digests(words[1:])))
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(arguments[0])])
+    print(json.dumps(_digests(arguments[1:])))
 
 
 if __name__ == "__main__":

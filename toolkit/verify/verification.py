@@ -171,7 +171,7 @@ def verify(subject: Subject, word: str, progress: Progress = SILENT) -> Verifica
             try:
                 watched.append(watch(build, simulate(scenario, SEED)))
             except Exception as error:  # anybody's code, which may raise anything
-                raised = raised or f"{scenario.name}: {_error_in_words(error)}"
+                raised = raised or f"{scenario.name}: {_error_message(error)}"
         checks = [
             CheckedPromise(
                 "it runs to the end", "failed" if raised else "passed", raised, _RUNS_REMEDY if raised else ""
@@ -209,11 +209,11 @@ def _check(name: str, remedy: str, find: Callable[[], str]) -> CheckedPromise:
     try:
         found = find()
     except Exception as error:  # anybody's code, which may raise anything
-        found = _error_in_words(error)
+        found = _error_message(error)
     return CheckedPromise(name, "failed", found, remedy) if found else CheckedPromise(name, "passed")
 
 
-def _error_in_words(error: Exception) -> str:
+def _error_message(error: Exception) -> str:
     if isinstance(error, EstimatorError):
         return str(error)
     frames = error.__traceback__

@@ -102,14 +102,14 @@ class _Remembering(Context):
         found = super().resolve_value_type(val)
         if not isinstance(found, types.BaseFunction):
             return found
-        if found not in self._asked:
-            self._asked[found] = _asked_once(found)
-        return self._asked[found]
+        if found not in self._cached_types:
+            self._cached_types[found] = _with_cached_types(found)
+        return self._cached_types[found]
 
 
-def _asked_once(function: Any) -> Any:
+def _with_cached_types(function: Any) -> Any:
     """Return a type of functions that finds a call's signature once for each types of its arguments."""
-    asked, signatures = object.__new__(type(function)), {}
+    copied, signatures = object.__new__(type(function)), {}
 
     def get_call_type(context: Context, args: Any, kws: Any) -> Any:
         if kws:
@@ -118,8 +118,8 @@ def _asked_once(function: Any) -> Any:
             signatures[tuple(args)] = function.get_call_type(context, args, kws)
         return signatures[tuple(args)]
 
-    asked.__dict__.update(function.__dict__, get_call_type=get_call_type)
-    return asked
+    copied.__dict__.update(function.__dict__, get_call_type=get_call_type)
+    return copied
 
 
 @cache

@@ -78,7 +78,7 @@ def informed_pose(landmarks: Arrays, state: Arrays, eye: Arrays, noises: Array, 
     """
     points, covs, _, left_only = landmarks
     view, P = state
-    told, nis, accepted = out
+    information, nis, accepted = out
     here, H_pose, H_point = np.zeros(1, dtype=np.int64), np.empty((3, 6)), np.empty((3, 4))
     own, S, rows, residual = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 7)), np.empty((3, 1))
     for f in range(points.shape[0]):
@@ -105,11 +105,11 @@ def informed_pose(landmarks: Arrays, state: Arrays, eye: Arrays, noises: Array, 
             for i in range(3):
                 for a in range(6):
                     for c in range(7):
-                        told[a, c] += weight * rows[i, a] * rows[i, c]
+                        information[a, c] += weight * rows[i, a] * rows[i, c]
 
 
 @compiled
-def corrected_pose(told: Array, P: Array) -> tuple[Array, Array]:
+def corrected_pose(information: Array, P: Array) -> tuple[Array, Array]:
     """Return the error (d,) and the covariance (d, d) of the state given ``[M n]`` of its pose.
 
     As ``correction.updated_by_pose_sightings``: ``P_p (1 + M P_pp)^-1 [M P_p^T, n]``.
@@ -117,11 +117,11 @@ def corrected_pose(told: Array, P: Array) -> tuple[Array, Array]:
     d = P.shape[0]
     A, B, moved_by, cov = np.empty((6, 6)), np.empty((6, d + 1)), np.empty(d), np.empty((d, d))
     for a in range(6):
-        B[a, d] = told[a, 6]
+        B[a, d] = information[a, 6]
         for c in range(d):
             B[a, c] = 0.0
             for k in range(6):
-                B[a, c] += told[a, k] * P[c, k]
+                B[a, c] += information[a, k] * P[c, k]
         for c in range(6):
             A[a, c] = B[a, c] + (1.0 if a == c else 0.0)
     solve(A, B)
@@ -189,10 +189,10 @@ def correct(landmarks: Arrays, state: Arrays, camera: Arrays, rules: Array) -> A
     pose, P = state
     intrinsics, T_imu_cam, noises = camera
     eye = (intrinsics, inverses(T_imu_cam), np.eye(3))
-    told, nis, accepted = np.zeros((6, 7)), np.empty(points.shape[0]), np.empty(points.shape[0], dtype=np.bool_)
+    information, nis, accepted = np.zeros((6, 7)), np.empty(points.shape[0]), np.empty(points.shape[0], dtype=np.bool_)
     inverse = inverses(pose)
-    informed_pose(landmarks, ((inverse, pose, inverse), P), eye, noises, rules, (told, nis, accepted))
-    moved_by, cov = corrected_pose(told, P)
+    informed_pose(landmarks, ((inverse, pose, inverse), P), eye, noises, rules, (information, nis, accepted))
+    moved_by, cov = corrected_pose(information, P)
     step = np.zeros((1, 4, 4))
     exponential(moved_by, step)
     pose = products(pose, step)

@@ -146,12 +146,12 @@ def reduce(window: Window, calibration: Calibration) -> Reduced:
     information[np.arange(6), np.arange(6)] += _GAUGE
     information[np.arange(own), np.arange(own)] += _RIDGE
     cross = information[:own, own:]
-    solved = np.linalg.solve(information[:own, :own], np.column_stack([cross, gradient[:own]]))
-    per_common = solved[:, :-1]
+    solution = np.linalg.solve(information[:own, :own], np.column_stack([cross, gradient[:own]]))
+    per_common = solution[:, :-1]
     return Reduced(
         information[own:, own:] - cross.T @ per_common,
         gradients[:, own:] - gradients[:, :own] @ per_common,
-        _Back(solved[:, -1], per_common, seen, tracks),
+        _Back(solution[:, -1], per_common, seen, tracks),
     )
 
 

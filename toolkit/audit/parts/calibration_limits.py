@@ -48,7 +48,7 @@ BESIDE = {"imu": "IMU", "twist": "odometry"}
 class Wrong(NamedTuple):
     """One thing that is wrong: what is said of it, and what to check."""
 
-    said: str
+    summary: str
     check: str
 
 
@@ -78,7 +78,7 @@ def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
 
 
 def _intrinsics(found: SelfCalibration, rig: StereoRig, limits: Limits, beside: str) -> list[Wrong]:
-    value, told = found.value, list[Wrong]()
+    value, wrongs = found.value, list[Wrong]()
     given_px = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px])
     least = np.array([limits.focal, limits.focal, *limits.centre_px])
     off, error = np.abs(value[:4]) > least + limits.sigmas * found.error[:4], _with_systematic(found.error[:4], least)
@@ -86,9 +86,9 @@ def _intrinsics(found: SelfCalibration, rig: StereoRig, limits: Limits, beside: 
     error_px = np.append(fit_px[:2] * error[FOCAL], error[CENTRE])
     for k in np.flatnonzero(off).tolist():
         name = ("fx_px", "fy_px", "cx_px", "cy_px")[k]
-        said = f"tracks and {beside} fit {name} = {fit_px[k]:.1f} +- {error_px[k]:.1f}, not {given_px[k]:g}"
-        told.append(Wrong(said, "K"))
-    return told
+        summary = f"tracks and {beside} fit {name} = {fit_px[k]:.1f} +- {error_px[k]:.1f}, not {given_px[k]:g}"
+        wrongs.append(Wrong(summary, "K"))
+    return wrongs
 
 
 def _baseline(found: SelfCalibration, limits: Limits) -> list[Wrong]:
@@ -104,9 +104,9 @@ def _turn(found: SelfCalibration, limits: Limits) -> list[Wrong]:
     if not (np.abs(turn) > limits.turn_rad + limits.sigmas * error).any():
         return []
     error = _with_systematic(error, limits.turn_rad)
-    told = ", ".join(f"{t:+.3f} +- {e:.3f}" for t, e in zip(turn, error, strict=True))
-    said = f"the camera moves as if it were turned by ({told}) rad about its own x, y, z against T_imu_cam"
-    return [Wrong(said, "the rotation of T_imu_cam")]
+    wrongs = ", ".join(f"{t:+.3f} +- {e:.3f}" for t, e in zip(turn, error, strict=True))
+    summary = f"the camera moves as if it were turned by ({wrongs}) rad about its own x, y, z against T_imu_cam"
+    return [Wrong(summary, "the rotation of T_imu_cam")]
 
 
 def _clock(found: SelfCalibration, limits: Limits) -> list[Wrong]:
@@ -114,8 +114,8 @@ def _clock(found: SelfCalibration, limits: Limits) -> list[Wrong]:
     if abs(late_s) < limits.late_s + limits.sigmas * error_s:
         return []
     stamped = "early" if late_s > 0.0 else "late"
-    said = f"frames are stamped {1e3 * abs(late_s):.1f} +- {1e3 * error_s:.1f} ms too {stamped}"
-    return [Wrong(said, "the clocks of the camera and the IMU")]
+    summary = f"frames are stamped {1e3 * abs(late_s):.1f} +- {1e3 * error_s:.1f} ms too {stamped}"
+    return [Wrong(summary, "the clocks of the camera and the IMU")]
 
 
 def _with_systematic(error: Array, limit: Array | float) -> Array:

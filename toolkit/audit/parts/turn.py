@@ -42,7 +42,7 @@ def angle_of(turn: Turn) -> Scalar:
 
 def turn_by_velocities(whole: Regression) -> Turn:
     """Return the turn that brings the camera's velocities onto those of odometry."""
-    return _judged(whole.found[TURN], whole.formal[TURN, TURN], whole.cov[TURN, TURN], whole.in_motion, "twist")
+    return _tested(whole.found[TURN], whole.formal[TURN, TURN], whole.cov[TURN, TURN], whole.in_motion, "twist")
 
 
 def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
@@ -52,16 +52,16 @@ def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
     response, jacobian = intervals.w_radps - seen, np.concatenate([skew(seen), bias], axis=2)
     found, formal = robust_with_formal_cov(response, jacobian)
     cov = jackknife_cov(lambda *rows: robust_with_formal_cov(*rows)[0], response, jacobian)
-    return _judged(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES), "imu")
+    return _tested(found[:3], formal[:3, :3], cov[:3, :3], in_motion(seen, STRETCHES), "imu")
 
 
-def _judged(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
+def _tested(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
     """Return the turn (3,) about axes that can be judged: those of its formal covariance (3, 3).
 
     The covariance (3, 3) of a few stretches has none of its own.
     """
     variance, axes = np.linalg.eigh(formal)
     error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), variance))
-    judged = variance <= MOST_ERROR_RATIO**2 * variance.min()
-    by_chance_rad = chance_bound(error_rad[judged], np.sqrt(variance[judged]), stretches, INFLATION[kind])
-    return Turn((axes.T @ rad)[judged], error_rad[judged], np.maximum(by_chance_rad, LEAST_BOUND_RAD))
+    decidable = variance <= MOST_ERROR_RATIO**2 * variance.min()
+    by_chance_rad = chance_bound(error_rad[decidable], np.sqrt(variance[decidable]), stretches, INFLATION[kind])
+    return Turn((axes.T @ rad)[decidable], error_rad[decidable], np.maximum(by_chance_rad, LEAST_BOUND_RAD))

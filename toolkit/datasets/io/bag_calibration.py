@@ -108,8 +108,8 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
         if calibration.cameras is None:
             raise DataError(f"{mav0}: the calibration lacks distortion_model or intrinsics of a camera; add them")
         pair = rectified(*calibration.cameras, calibration.T_right_left)
-        told = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
-        return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, told)
+        notes = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
+        return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes)
     T_imu_left = source.tree.between(source.frames.body, source.frames.left)
     # An IMU has no camera's axes: where both name one frame, programs have written the same name everywhere.
     if T_imu_left is None or (source.chosen.imu is not None and source.frames.body == source.frames.left):
@@ -118,8 +118,8 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
     stated = next(filter(None, map(kalibr_noise, _folders_beside(source.path))), None)
     noise = () if twist else (_NO_NOISE if stated is None else _STATED,)
     tf = "the transforms of /tf that never change" if source.in_tf else "/tf_static"
-    told = (f"calibration from {how} and {tf}", *noise)
-    return Mounted(pair, T_imu_left, twist or stated or mems_imu(), told, as_they_are)
+    notes = (f"calibration from {how} and {tf}", *noise)
+    return Mounted(pair, T_imu_left, twist or stated or mems_imu(), notes, as_they_are)
 
 
 def _not_joined(source: Source) -> str:

@@ -73,9 +73,9 @@ class Chosen:
         return any(_RECTIFIED in word for word in self.left.name.split("/")[-2:])
 
 
-def choose(path: Path, topics: Sequence[Topic], asked: str | None) -> Chosen:
+def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen:
     """Return which topics are what; raises DataError where one asked for, or a pair of images, is not there."""
-    given = _asked(path, topics, asked)
+    given = _requested(path, topics, requested)
     usable = [topic for topic in topics if topic.type in KNOWN_TYPES and not topic.unreadable and topic.count]
     left, right = _pair(path, topics, usable, given)
     truth = given.get("truth") or _truth(usable)
@@ -99,10 +99,10 @@ def choose(path: Path, topics: Sequence[Topic], asked: str | None) -> Chosen:
     return replace(chosen, facts=_facts(topics, chosen, given))
 
 
-def _asked(path: Path, topics: Sequence[Topic], asked: str | None) -> dict[str, Topic]:
+def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> dict[str, Topic]:
     """Return the topics asked for by role, as in left=/cam0/image_raw,imu=/imu0."""
     by_name, given = {topic.name: topic for topic in topics}, {}
-    for part in filter(None, (text.strip() for text in (asked or "").split(","))):
+    for part in filter(None, (text.strip() for text in (requested or "").split(","))):
         role, equals, name = (text.strip() for text in part.partition("="))
         if not equals or role not in ROLES:
             raise DataError(f"--topics: {no_such('role', role, ROLES)}; write left=/cam0/image_raw,right=...,imu=...")

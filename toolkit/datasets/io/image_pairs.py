@@ -161,8 +161,8 @@ def _numbered(folder: Path) -> dict[int, Path]:
 def _partners(t_ns: Mapping[int, int], right_t_ns: Mapping[int, int]) -> dict[int, int]:
     """Return the number of the right stamp nearest to each left one, by number; none beyond half an interval."""
     numbers, stamps = (np.array(list(items), dtype=np.int64) for items in (right_t_ns.keys(), right_t_ns.values()))
-    asked = np.array(sorted(t_ns.values()), dtype=np.int64)
-    reach_ns = 0.5 * float(np.median(np.diff(asked))) if asked.size > 1 else np.inf
+    wanted_ns = np.array(sorted(t_ns.values()), dtype=np.int64)
+    reach_ns = 0.5 * float(np.median(np.diff(wanted_ns))) if wanted_ns.size > 1 else np.inf
     off_ns = {number: np.abs(stamps - stamp) for number, stamp in t_ns.items()}
     return {number: int(numbers[off.argmin()]) for number, off in off_ns.items() if off.min() <= reach_ns}
 
@@ -235,18 +235,18 @@ def _stamp_ns(stem: str) -> int | None:
     return int(f"{whole}{fraction[:9]:0<9}") if point else int(whole[:19])
 
 
-def _nearest(t_ns: IntArray, asked_ns: IntArray) -> IntArray:
+def _nearest(t_ns: IntArray, wanted_ns: IntArray) -> IntArray:
     """Return the row of the stamp nearest to each asked one, -1 where none is of the same instant."""
     if t_ns.size == 0:
-        return np.full(asked_ns.size, -1)
+        return np.full(wanted_ns.size, -1)
     order = np.argsort(t_ns, kind="stable")
-    after = np.clip(np.searchsorted(t_ns[order], asked_ns), 1, max(t_ns.size - 1, 1))
+    after = np.clip(np.searchsorted(t_ns[order], wanted_ns), 1, max(t_ns.size - 1, 1))
     before = after - 1
     after = np.minimum(after, t_ns.size - 1)
     nearer = np.where(
-        np.abs(t_ns[order[after]] - asked_ns) < np.abs(t_ns[order[before]] - asked_ns), order[after], order[before]
+        np.abs(t_ns[order[after]] - wanted_ns) < np.abs(t_ns[order[before]] - wanted_ns), order[after], order[before]
     )
-    return np.where(np.abs(t_ns[nearer] - asked_ns) <= _SAME_INSTANT_NS, nearer, -1)
+    return np.where(np.abs(t_ns[nearer] - wanted_ns) <= _SAME_INSTANT_NS, nearer, -1)
 
 
 def check_both_cameras(root: Path, left: Path, right: Path) -> None:

@@ -323,6 +323,6 @@ def columns_given(what: str, given: Any) -> Columns:
     except (TypeError, KeyError, IndexError, ValueError) as error:
         raise DataError(f"{what}: is no mapping of column names to values ({error}); give a dict of arrays") from error
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise DataError(f"{what}: its columns differ in length: {told}")
+        counts = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise DataError(f"{what}: its columns differ in length: {counts}")
     return Columns(Path(what), values)

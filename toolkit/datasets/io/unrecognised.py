@@ -28,9 +28,9 @@ _BELOW, _ABOVE = 3, 4
 
 def why_unrecognised(path: Path, recognised: Callable[[Path], bool]) -> str:
     """Return what a path of no format is, and what to do; ``recognised`` says whether a path is a recording."""
-    told = _of_folder(path, recognised) if path.is_dir() else _of_file(path) if is_regular(path) else ""
-    if told:
-        return told
+    guess = _of_folder(path, recognised) if path.is_dir() else _of_file(path) if is_regular(path) else ""
+    if guess:
+        return guess
     whole = next((above for above in islice(path.absolute().parents, _ABOVE) if recognised(above)), None)
     if whole is not None:
         return f"is a part of a recording: name the whole, {printable(str(whole))}; by itself it is of no known format"

@@ -51,19 +51,19 @@ class Exchange:
         return se3(np.swapaxes(turned, 1, 2) if inverted else turned, positions)
 
     @property
-    def in_words(self) -> str:
+    def description(self) -> str:
         """Say what must be done to the axes: "y and z exchanged (positions alone)"."""
         order = np.abs(self.matrix).argmax(axis=1)
         moved = [axis for axis in range(3) if order[axis] != axis]
         turned = [_NAMES[axis] for axis in range(3) if self.matrix[axis].sum() < 0.0]
-        said = []
+        changes = []
         if len(moved) == 2:
-            said.append(f"{_NAMES[moved[0]]} and {_NAMES[moved[1]]} exchanged")
+            changes.append(f"{_NAMES[moved[0]]} and {_NAMES[moved[1]]} exchanged")
         elif moved:
-            said.append(f"x, y and z taken from what stands as {', '.join(_NAMES[axis] for axis in order)}")
+            changes.append(f"x, y and z taken from what stands as {', '.join(_NAMES[axis] for axis in order)}")
         if turned:
-            said.append(f"the sign of {' and '.join(turned)} turned")
-        return f"{' and '.join(said)} ({self.struck})"
+            changes.append(f"the sign of {' and '.join(turned)} turned")
+        return f"{' and '.join(changes)} ({self.struck})"
 
 
 @cache
@@ -139,7 +139,7 @@ def _named(fit: "_Fit") -> str | None:
         return None
     least_rad = min(_FITTING_RAD, fit.turned_rad(_AS_GIVEN) / _TIMES)
     fitting = (one for one in exchanges() if fit.off_share(one.matrix) < _FITTING_SHARE)
-    return next((one.in_words for one in fitting if fit.turned_rad(one) < least_rad), None)
+    return next((one.description for one in fitting if fit.turned_rad(one) < least_rad), None)
 
 
 _AS_GIVEN = Exchange(np.eye(3), "positions alone")

@@ -62,7 +62,7 @@ def efficient(sequence: Sequence, output: Output) -> Efficient:
     sequence's measurements, placed at the first pose. Raises Unavailable where the truth lacks what the state has, or
     is not exact.
     """
-    return _solved(_problem_at_truth(sequence), output)
+    return _efficient(_problem_at_truth(sequence), output)
 
 
 @lru_cache(maxsize=2)
@@ -71,10 +71,10 @@ def claimed_bound(sequence: Sequence, at: Trajectory, output: Output) -> Array:
 
     Raises Unavailable where a frame has no estimate of the whole state.
     """
-    return _solved(_problem_at_estimate(sequence, at), output).covs
+    return _efficient(_problem_at_estimate(sequence, at), output).covs
 
 
-def _solved(problem: "_Problem", output: Output) -> Efficient:
+def _efficient(problem: "_Problem", output: Output) -> Efficient:
     try:
         return _causal(problem) if output == "causal" else _final(problem)
     except (np.linalg.LinAlgError, RuntimeError) as error:  # GTSAM's
@@ -303,8 +303,8 @@ class _Information:
         self._landmarks = self._landmarks[~leaving]
 
     def _join(self, rows: IntArray) -> None:
-        grown = len(self._matrix) + 3 * len(rows)
-        matrix, vector = np.zeros((grown, grown)), np.zeros(grown)
+        full_size = len(self._matrix) + 3 * len(rows)
+        matrix, vector = np.zeros((full_size, full_size)), np.zeros(full_size)
         matrix[: len(self._matrix), : len(self._matrix)], vector[: len(self._vector)] = self._matrix, self._vector
         self._matrix, self._vector = matrix, vector
         self._landmarks = np.concatenate([self._landmarks, rows])

@@ -109,8 +109,8 @@ class Evaluation(AgainstTruth):
         """The estimated pose of every frame (K, 4, 4), NaN where there is none."""
         frames_t_ns, estimate = self.sequence.frames_t_ns, self.estimate
         poses = np.full((frames_t_ns.size, 4, 4), np.nan)
-        row, said = rows_of(frames_t_ns, estimate.t_ns)
-        poses[said] = estimate.T_world_imu[row[said]]
+        row, answered = rows_of(frames_t_ns, estimate.t_ns)
+        poses[answered] = estimate.T_world_imu[row[answered]]
         return poses
 
     @cached_property

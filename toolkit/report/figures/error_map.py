@@ -21,7 +21,7 @@ from toolkit.experiment.comparison import Comparison
 from toolkit.geometry import Array
 from toolkit.metrics import Evaluation, Unavailable, in_sample
 from toolkit.metrics.parts.residuals import rmse
-from toolkit.report.curves import alignment_words, errors_to, onto_truth, shown_output, truth_during
+from toolkit.report.curves import alignment_text, errors_to, onto_truth, shown_output, truth_during
 from toolkit.report.figures.style import (
     LABEL_PT,
     MUTED_COLOUR,
@@ -160,7 +160,7 @@ def _figure(comparison: Comparison, shown: Sequence[_Coloured], kind: _Kind) -> 
     figure.suptitle(f"{comparison.name}: {kind.what}, from above", fontsize=TITLE_PT, x=0.01, ha="left")
     figure.supxlabel("x [m]", fontsize=LABEL_PT)
     figure.supylabel("y [m]", fontsize=LABEL_PT)
-    return NamedFigure(kind.name, f"{kind.caption} {alignment_words(comparison.sequence)} {_SCALE}", figure)
+    return NamedFigure(kind.name, f"{kind.caption} {alignment_text(comparison.sequence)} {_SCALE}", figure)
 
 
 def _line(one: _Coloured, scale: ScalarMappable) -> LineCollection:

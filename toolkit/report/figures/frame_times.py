@@ -33,11 +33,11 @@ def draw(comparison: Comparison) -> Iterator[NamedFigure]:
         stroke = stroke_of(comparison, run.estimator, "final")
         axes.plot(step_ms, ".", color=stroke["color"], markersize=2.5, alpha=0.35)
         cpu_ms = _MS * timings.cpu_s / timings.step_s.size
-        told = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
+        label = f"{run.estimator}: {float(step_ms.mean()):.2f} ms, CPU {cpu_ms:.2f} ms"
         if timings.finish_s > timings.step_s.sum():
-            told += f", end {timings.finish_s:.1f} s"
+            label += f", end {timings.finish_s:.1f} s"
         (median,) = axes.plot(running_median(step_ms), linewidth=width_of(comparison, run.estimator), **stroke)
-        entries.append(Entry(told, (median,)))
+        entries.append(Entry(label, (median,)))
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     widened = max(1.0, np.sqrt(10.0 * low / high))  # a decade at least, so that jitter alone does not fill the axis

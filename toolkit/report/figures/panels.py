@@ -65,8 +65,8 @@ def finish(figure: Figure, panels: dict[str, Axes], what: str, title: str, entri
     """Give the figure its title, its vertical axis and its legend, which stands in a spare panel where there is one."""
     for axes in panels.values():
         if not axes.has_data():
-            words = "nothing to show"
-            axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
+            text = "nothing to show"
+            axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color=MUTED_COLOUR, fontsize=SMALL_PT)
     figure.suptitle(title, fontsize=TITLE_PT, x=0.01, ha="left")
     figure.supylabel(what, fontsize=LABEL_PT)
     spare = figure.axes[len(panels) :]
@@ -126,24 +126,24 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
         shares.setdefault(estimator, []).append(series.in_band_percent)
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
-        words = ", ".join(f"{percent:.0f} %" for percent in percents)
-        annotate(panels, estimator, (f"{words} in band", words))
+        texts = ", ".join(f"{percent:.0f} %" for percent in percents)
+        annotate(panels, estimator, (f"{texts} in band", texts))
     scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
     return figure
 
 
-def annotate(panels: dict[str, Axes], name: str, words: Sequence[str]) -> None:
+def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
     """Write above a panel, to the right: the first of the words for which there is room."""
     room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
-    told = next((one for one in words if len(name) + len(one) <= room), words[-1])
-    panels[name].set_title(told, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
+    fitting = next((one for one in texts if len(name) + len(one) <= room), texts[-1])
+    panels[name].set_title(fitting, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
 
 
 def output_entries(outputs: Collection[Output]) -> list[Entry]:
     """Return the legend's entries for the outputs that are drawn; a filter's final output repeats its causal one."""
-    words: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
-    return [Entry.of_line(words[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
+    texts: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
+    return [Entry.of_line(texts[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
 
 
 def band_entry() -> Entry:

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from toolkit.estimate import Run
 from toolkit.experiment.comparison import Comparison, plain_name
 from toolkit.geometry import Array, IntArray
-from toolkit.report.curves import alignment_words, onto_truth, shown_output, truth_during
+from toolkit.report.curves import alignment_text, onto_truth, shown_output, truth_during
 from toolkit.report.figures.style import (
     LANDMARK_COLOUR,
     MUTED_COLOUR,
@@ -173,9 +173,9 @@ def _one(comparison: Comparison, run: Run) -> NamedFigure:
     tracks = {run.estimator: track_of(comparison, run)}
     title = f"{run.estimator}{_trouble(run)} on {comparison.name}, from above"
     figure = _figure(comparison, tracks, truth, run, title)
-    mapped = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
+    map_size = f"{len(run.landmarks)} landmarks" if len(run.landmarks) else "it makes no map"
     caption = (
-        f"Trajectory of {run.estimator} from above, from the dot on; {mapped}. {alignment_words(comparison.sequence)}"
+        f"Trajectory of {run.estimator} from above, from the dot on; {map_size}. {alignment_text(comparison.sequence)}"
     )
     return NamedFigure(f"top_{plain_name(run.estimator)}", caption, figure)
 
@@ -188,7 +188,7 @@ def _figure_of_all(comparison: Comparison, runs: list[Run]) -> NamedFigure:
     figure = _figure(comparison, tracks, truth, mapper, f"{comparison.name}: all estimators, from above")
     of_whom = "" if mapper is None else f" over the landmarks of {mapper.estimator}"
     caption = (
-        f"All trajectories{of_whom}, each from its dot on. {alignment_words(comparison.sequence)} The square is "
+        f"All trajectories{of_whom}, each from its dot on. {alignment_text(comparison.sequence)} The square is "
         "enlarged beside the map: there most of them lie on one another, and differ most."
     )
     if any(run.status != "ok" for run in runs):

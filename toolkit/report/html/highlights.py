@@ -16,11 +16,11 @@ class _Question(NamedTuple):
     A ``contest`` has no answer where only one estimator has the metric.
     """
 
-    asks: str
+    question_text: str
     outputs: tuple[str, ...]
     keys: tuple[str, ...]
     unit: str
-    tells: Callable[[str, float], str]
+    answer_text: Callable[[str, float], str]
     distance: Callable[[float], float] = abs
     contest: bool = False
 
@@ -76,9 +76,9 @@ def _eligible(rows: list[Row]) -> Iterator[Row]:
 
 
 def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
-    asked = [row for row in rows if row["output"] in question.outputs]
+    scored = [row for row in rows if row["output"] in question.outputs]
     for key in question.keys:
-        given = [(row, row["metrics"][key]) for row in asked if row["metrics"].get(key) is not None]
+        given = [(row, row["metrics"][key]) for row in scored if row["metrics"].get(key) is not None]
         ranked = sorted(given, key=lambda pair: question.distance(pair[1]))
         if ranked:
             (best, value), *others = ranked
@@ -86,10 +86,10 @@ def _answer(question: _Question, rows: list[Row]) -> dict[str, str] | None:
                 return None
             after = next(((row, v) for row, v in others if row["estimator"] != best["estimator"]), None)
             return {
-                "asks": question.asks,
+                "asks": question.question_text,
                 "answer": best["estimator"],
                 "row": best["id"],
-                "tells": question.tells(key, value),
+                "tells": question.answer_text(key, value),
                 "next": "" if after is None else f"next: {after[0]['estimator']}, {_short(after[1])}{question.unit}",
             }
     return None

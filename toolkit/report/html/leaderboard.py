@@ -164,5 +164,5 @@ def _value(run: EvaluatedRun, evaluation: EvaluatedSystems) -> float | None:
 
 
 def _named(run: EvaluatedRun, value: float | None) -> str:
-    told = run.log[0] if run.status != "ok" else f"{value:.4g}" if value is not None else "no value"
-    return f"{run.item.system}, {run.item.sequence}, {run.item.run}: {told}"
+    entry = run.log[0] if run.status != "ok" else f"{value:.4g}" if value is not None else "no value"
+    return f"{run.item.system}, {run.item.sequence}, {run.item.run}: {entry}"

@@ -19,7 +19,7 @@ from toolkit.metrics import known_metrics
 from toolkit.report import curves
 from toolkit.report.html.highlights import highlights
 from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
-from toolkit.report.records.scores import Judged, RunOverSeeds
+from toolkit.report.records.scores import ConsistencyMark, RunOverSeeds
 from toolkit.report.run_files import DrawnPath, RunFiles, SeedsFiles
 
 Json = dict[str, Any]
@@ -239,7 +239,7 @@ def seeds_case(files: SeedsFiles, case_id: str, title: str, colours: dict[str, i
 def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -> list[Json]:
     rows: list[Json] = []
     for i, (run, drawn) in enumerate(zip(files.scores.runs, files.report.runs, strict=True)):
-        if i > 0 and _say_the_same(files.scores.runs[i - 1], run):
+        if i > 0 and _are_the_same(files.scores.runs[i - 1], run):
             rows[-1]["output"] = "both"
             continue
         rows.append(
@@ -262,9 +262,9 @@ def _rows_over_seeds(files: SeedsFiles, case_id: str, colours: dict[str, int]) -
     return rows
 
 
-def mark_of(judged: Judged | UnsetType) -> str:
+def mark_of(mark: ConsistencyMark | UnsetType) -> str:
     """Return what a run is marked as, nothing where it is consistent or cannot be judged."""
-    return "" if judged is UNSET or judged.verdict == "consistent" else judged.verdict
+    return "" if mark is UNSET or mark.verdict == "consistent" else mark.verdict
 
 
 def _status(run: RunOverSeeds) -> str:
@@ -273,7 +273,7 @@ def _status(run: RunOverSeeds) -> str:
     return "ok" if run.counts["ok"] == seeds else f"{run.counts['ok']} of {seeds} ok"
 
 
-def _say_the_same(causal: RunOverSeeds, final: RunOverSeeds) -> bool:
+def _are_the_same(causal: RunOverSeeds, final: RunOverSeeds) -> bool:
     """Say whether a final row repeats the causal one before it: every error of every seed is the same."""
     same = causal.estimator == final.estimator and causal.output == "causal"
     keys = ("ate_none_m", "ate_se3_m", "ate_yaw_m", "heldout_reproj_rmse_px", "nees_pose_mean")

@@ -190,7 +190,7 @@ class CameraFrame(Struct, frozen=True, kw_only=True):
             _check_lengths({"u_px": self.u_px, f"off_px of {one.estimator}": one.off_px})
 
 
-class AuditWords(Struct, frozen=True, kw_only=True):
+class AuditMessage(Struct, frozen=True, kw_only=True):
     """A fault of the recording and what became of it."""
 
     fault: str
@@ -199,14 +199,14 @@ class AuditWords(Struct, frozen=True, kw_only=True):
     detail: str
 
 
-class Words(Struct, frozen=True, kw_only=True):
+class Messages(Struct, frozen=True, kw_only=True):
     """What the report says."""
 
     sequence: Annotated[str, Meta(description="the recording in a line")]
     notes: tuple[str, ...]
     remarks: tuple[str, ...]
     start: str
-    audit: tuple[AuditWords, ...]
+    audit: tuple[AuditMessage, ...]
     undecided: Undecided = UNSET
     facts: tuple[str, ...]
     changes: Annotated[dict[str, str], Meta(description="on a ladder, what each rung changes")]
@@ -223,7 +223,7 @@ class Report(Struct, frozen=True, kw_only=True):
     runs: Annotated[tuple[DrawnRun, ...], Meta(description="one for each of metrics.json, in its order")]
     steps: tuple[StepTimes, ...]
     maps: tuple[DrawnMap, ...]
-    words: Words
+    words: Messages
     card: Annotated[CardRecord | UnsetType, Meta(description="of the recording's tracks, where asked for")] = UNSET
     frames: Annotated[
         tuple[CameraFrame, ...] | UnsetType, Meta(description="some images with their tracks, where there are images")
@@ -247,7 +247,7 @@ class DrawnOverSeeds(Struct, frozen=True, kw_only=True):
     position_rms_m: Annotated[Numbers | None, Meta(description="root mean square over the seeds, not aligned")]
 
 
-class SeedsWords(Struct, frozen=True, kw_only=True):
+class SeedsMessages(Struct, frozen=True, kw_only=True):
     """What the report over seeds says."""
 
     sequence: Annotated[str, Meta(description="the recording and the seeds in a line")]
@@ -262,7 +262,7 @@ class SeedsReport(Struct, frozen=True, kw_only=True):
     schema: Literal["vislam.report/1"]
     t_s: Annotated[Times, Meta(description="of the frames")]
     runs: Annotated[tuple[DrawnOverSeeds, ...], Meta(description="one for each of seeds.json, in its order")]
-    words: SeedsWords
+    words: SeedsMessages
 
     def __post_init__(self) -> None:
         for i, run in enumerate(self.runs):

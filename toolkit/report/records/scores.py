@@ -56,7 +56,7 @@ Undecided = (
 )
 
 
-class Judged(Struct, frozen=True, kw_only=True):
+class ConsistencyMark(Struct, frozen=True, kw_only=True):
     """What a run's errors, or its innovations, say of the uncertainty it states."""
 
     verdict: Annotated[
@@ -74,7 +74,10 @@ class Judged(Struct, frozen=True, kw_only=True):
 
 
 Consistency = (
-    Annotated[Judged, Meta(description="absent where neither NEES nor NIS nor a trend tells, and before it was added")]
+    Annotated[
+        ConsistencyMark,
+        Meta(description="absent where neither NEES nor NIS nor a trend tells, and before it was added"),
+    ]
     | UnsetType
 )
 
