@@ -25,13 +25,13 @@ def check(evidence: Evidence) -> Symptom | None:
     seen_px = uv_px[np.isfinite(uv_px).all(axis=1), :2]  # v may be the mean of two rows, with finer steps
     if len(seen_px) < LEAST:
         return None
-    step_px, step_text = _step_px(seen_px)
+    step_px, grid = _step_px(seen_px)
     if step_px is None:
         return None
     rounding_px, stated_px = step_px / np.sqrt(12.0), float(np.sqrt(rig.cov_uv_px2[0, 0]))
     return Symptom(
         count=len(seen_px),
-        detail=f"{step_text}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px that are stated of uL",
+        detail=f"{grid}: rounding adds errors of {rounding_px:.2g} px to the {stated_px:.2g} px that are stated of uL",
         treatment="write them with all the digits that the tracker has; far points suffer most",
         remedy=None,
         harmful=False,

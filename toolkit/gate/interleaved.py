@@ -285,5 +285,5 @@ def _git(*arguments: str, remedy: str, folder: str = ".") -> bytes:
         raise BaselineError(f"git cannot be run ({error}); name a wheel") from error
     if done.returncode:
         error_text = printable(done.stderr.decode(errors="replace").strip()) or "it is not known here"
-        raise BaselineError(f"git {message[0]} {message[-1]}: {error_text}; {remedy}")
+        raise BaselineError(f"git {arguments[0]} {arguments[-1]}: {error_text}; {remedy}")
     return done.stdout

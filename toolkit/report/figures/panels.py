@@ -126,8 +126,8 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
         shares.setdefault(estimator, []).append(series.in_band_percent)
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
-        texts = ", ".join(f"{percent:.0f} %" for percent in percents)
-        annotate(panels, estimator, (f"{texts} in band", texts))
+        shares = ", ".join(f"{percent:.0f} %" for percent in percents)
+        annotate(panels, estimator, (f"{shares} in band", shares))
     scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
     return figure
@@ -142,8 +142,8 @@ def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
 
 def output_entries(outputs: Collection[Output]) -> list[Entry]:
     """Return the legend's entries for the outputs that are drawn; a filter's final output repeats its causal one."""
-    texts: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
-    return [Entry.of_line(texts[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
+    names: dict[Output, str] = {"causal": "causal", "final": "final (a filter's causal output too)"}
+    return [Entry.of_line(names[output], COLOUR_OF[output], line_of(output)) for output in sorted(outputs)]
 
 
 def band_entry() -> Entry:
