@@ -126,15 +126,15 @@ def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: s
         shares.setdefault(estimator, []).append(series.in_band_percent)
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
-        shares = ", ".join(f"{percent:.0f} %" for percent in percents)
-        annotate(panels, estimator, (f"{shares} in band", shares))
+        text = ", ".join(f"{percent:.0f} %" for percent in percents)
+        annotate(panels, estimator, (f"{text} in band", text))
     scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
     return figure
 
 
 def annotate(panels: dict[str, Axes], name: str, texts: Sequence[str]) -> None:
-    """Write above a panel, to the right: the first of the words for which there is room."""
+    """Write above a panel, to the right: the first of the texts for which there is room."""
     room = int(WIDTH_IN * 72.0 / columns_for(len(panels)) / (0.6 * TITLE_PT)) - 3
     fitting = next((one for one in texts if len(name) + len(one) <= room), texts[-1])
     panels[name].set_title(fitting, fontsize=SMALL_PT, loc="right", color=MUTED_COLOUR)
