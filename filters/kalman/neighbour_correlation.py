@@ -16,6 +16,8 @@ from toolkit.geometry import Array, IntArray
 # Neighbours are counted up to these distances (px): about the width of a tracker's patch, and its doubles. Where to end
 # was chosen with three of the seven drives and MH_01 in view, beyond which nothing is alike.
 _RADII_PX = np.array([20.0, 40.0, 80.0, 160.0])
+# Sightings whose pairs are looked at together, up to the end of a frame: all pairs of a run can take 200 MB.
+_AT_ONCE = 5000
 # A sum of correlations is beyond chance from so many standard errors on.
 _STANDARD_ERRORS = 4.0
 
@@ -44,6 +46,13 @@ class NeighbourCorrelation:
         """Take in the whitened residuals (N, 3) of sightings (N, 3) px in frames (N,), without outliers."""
         if not len(frames):
             return
+        order = np.argsort(frames, kind="stable")
+        first_of_frame = np.flatnonzero(np.diff(frames[order], prepend=-1))
+        begins = first_of_frame[np.flatnonzero(np.diff(first_of_frame // _AT_ONCE, prepend=-1))]
+        for rows in np.split(order, begins[1:]):
+            self._add_pairs(frames[rows], uvs_px[rows], whitened[rows])
+
+    def _add_pairs(self, frames: IntArray, uvs_px: Array, whitened: Array) -> None:
         apart_px = (2.0 * _RADII_PX[-1] + float(np.ptp(uvs_px[:, 0]))) * frames
         places = np.column_stack([uvs_px[:, 0] + apart_px, uvs_px[:, 2]])
         one, other = KDTree(places).query_pairs(_RADII_PX[-1], output_type="ndarray").T

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from filters.kalman import neighbour_correlation
 from filters.kalman.neighbour_correlation import NeighbourCorrelation, freed_of_poses
 from filters.kalman.residual_correlation import ResidualCorrelation
 from toolkit.geometry import Array, IntArray
@@ -56,6 +57,15 @@ def test_frame_by_frame_is_as_all_at_once() -> None:
     for k in range(FRAMES):
         found.add(np.zeros(CLUSTERS * SIZE, dtype=np.int64), uvs_px[frames == k], errors[frames == k])
     assert found.erring_as_one() == pytest.approx(learnt(frames, uvs_px, errors).erring_as_one(), rel=1e-12)
+
+
+def test_in_what_order_sightings_come_and_how_many_are_looked_at_together_changes_nothing(monkeypatch) -> None:
+    frames, uvs_px, errors = clusters(7, alike=0.5)
+    at_once, order = learnt(frames, uvs_px, errors), np.random.default_rng(7).permutation(len(frames))
+    for most in (1, 100, 1000):
+        monkeypatch.setattr(neighbour_correlation, "_AT_ONCE", most)
+        found = learnt(frames[order], uvs_px[order], errors[order])
+        assert found.erring_as_one() == pytest.approx(at_once.erring_as_one(), rel=1e-12)
 
 
 def test_what_repeats_from_frame_to_frame_proves_no_more_than_once() -> None:
