@@ -1,7 +1,7 @@
 """Short clean recordings of every kind, and the faults that can be planted in them."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -50,7 +50,7 @@ def with_observations(sequence: Sequence, rows: object = slice(None), **columns:
 def with_samples(sequence: Sequence, rows: object) -> Sequence:
     """Return the sequence with the motion samples of an index, in that order."""
     m = sequence.motion
-    kept = {name: getattr(m, name)[rows] for name in m.__dataclass_fields__ if name != "pairing"}
+    kept = {field.name: getattr(m, field.name)[rows] for field in fields(m) if field.name != "pairing"}
     return replace(sequence, motion=replace(m, **kept))
 
 
@@ -65,7 +65,7 @@ def not_finite(sequence: Sequence) -> Plant:
     uv_px[100:2100:50, 0] = np.nan
     values[40:100:20, 4] = np.inf
     m = sequence.motion
-    names = [name for name in m.__dataclass_fields__ if name not in ("t_ns", "pairing")]
+    names = [field.name for field in fields(m) if field.name not in ("t_ns", "pairing")]
     motion = replace(m, **dict(zip(names, (values[:, :3], values[:, 3:]), strict=True)))
     return Plant("not-finite", with_observations(replace(sequence, motion=motion), uv_px=uv_px), 40 + 3)
 
