@@ -34,7 +34,7 @@ def of(scenario: str, duration_s: float) -> tuple[Array, Array]:
 ])  # fmt: skip
 def test_exchanged_axes_of_a_path_in_space_are_named(words: str) -> None:
     truth, estimate = of("flight", 8.0)
-    (exchange,) = (one for one in exchanges() if one.in_words == words)
+    (exchange,) = (one for one in exchanges() if one.description == words)
     file = Exchange(exchange.matrix.T, exchange.struck).reread(estimate)
     assert exchanged(truth, file) == words
     with pytest.raises(DataError, match="and not as given"):
@@ -49,7 +49,7 @@ def test_exchanged_axes_of_a_drive_on_a_plane_show_by_its_orientations() -> None
 
 
 def exchange_of(words: str) -> Exchange:
-    return next(one for one in exchanges() if one.in_words == words)
+    return next(one for one in exchanges() if one.description == words)
 
 
 @pytest.mark.parametrize(("scenario", "duration_s"), [("flight", 8.0), ("drive", 8.0), ("drive", 30.0)])

@@ -176,4 +176,4 @@ def test_a_version_that_cannot_run_is_told(tmp_path):
     (tmp_path / "toolkit").mkdir()
     (tmp_path / "toolkit" / "__init__.py").write_text("raise ValueError('of another time')")
     with timers((tmp_path,), ()) as (old, _), pytest.raises(BaselineError, match=r"timed: ValueError: of another time"):
-        old.ask("where", estimators=[])
+        old.request("where", estimators=[])

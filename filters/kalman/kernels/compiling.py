@@ -79,14 +79,14 @@ class _Passes(CompilerBase):
 
 
 class _Remembering(Context):
-    """numba's rules of types, which are asked once what comes of a call with arguments of some types.
+    """numba's rules of types, which find once what comes of a call with arguments of some types.
 
     They would try a dozen of them, for arrays, tuples and texts, at each product of two numbers, and once more where
     it becomes code.
     """
 
     def __init__(self, rules: Context) -> None:
-        self.__dict__ = {**rules.__dict__, "_signatures": {}, "_asked": {}}
+        self.__dict__ = {**rules.__dict__, "_signatures": {}, "_cached_types": {}}
 
     def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
         """Return the signature of a call."""
@@ -98,7 +98,7 @@ class _Remembering(Context):
         return self._signatures[key]
 
     def resolve_value_type(self, val: Any) -> Any:
-        """Return the type of a value, of a function one that is asked once."""
+        """Return the type of a value, of a function one that finds each signature once."""
         found = super().resolve_value_type(val)
         if not isinstance(found, types.BaseFunction):
             return found
