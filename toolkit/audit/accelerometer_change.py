@@ -44,16 +44,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if abs(step.value) < least:
         hidden = least / gravity
         return None if hidden < LARGEST_HIDDEN else Undecided(f"a change by less than {hidden:.0%} would not show")
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=(
             f"from about {share * sequence.duration_s:.0f} s on the accelerometer reads a gravity that is "
             f"{abs(step.value):.2f} +- {step.error:.2f} m/s^2 {'more' if step.value > 0.0 else 'less'} than before"
         ),
         treatment="its range or its scale have changed, or it was knocked: no one bias holds for the recording",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -32,16 +32,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return Undecided(f"too little change of rotation: {known}")
     if abs(change_s) < least_s:
         return None
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=(
             f"frames and motion samples part by {1e3 * change_s:.0f} +- {1e3 * error_s:.0f} ms from the first half of "
             "the recording to the second"
         ),
         treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -31,13 +31,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if not found:
         return None
     samples = "the IMU" if sequence.motion_kind == "imu" else "odometry"
-    return Symptom(
+    return Symptom.warning(
         count=len(found),
         detail=f"vision and {samples} disagree at {', '.join(_detail(*one) for one in sorted(found, key=_begin))}",
         treatment="moving objects or wrong samples: distrust every estimate from there on",
-        remedy=None,
-        harmful=False,
-        warns=True,
         spans_ns=tuple(_in_ns(span, int(sequence.frames_t_ns[0])) for _, span in found),
     )
 

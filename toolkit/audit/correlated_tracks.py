@@ -37,15 +37,13 @@ def check(evidence: Evidence) -> Symptom | None:
     value, error = found
     if value < MOST_CORRELATION + SIGMAS * error:
         return None
-    return Symptom(
+    return Symptom.information(
         count=1,
         detail=(
             f"the errors of a track's sightings go together: from one step to the next their correlation is "
             f"{value:+.2f} +- {error:.2f}, where it is -0.5 if each errs by itself; to count them as white is too sure"
         ),
         treatment="'vislam card' shows how, noise.tracks=fitted tells them",
-        remedy=None,
-        harmful=False,
     )
 
 

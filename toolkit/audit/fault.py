@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-
-import numpy as np
+from typing import Self
 
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.deviations import Fallen, fallen_mps
@@ -12,8 +11,10 @@ from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, i
 from toolkit.audit.parts.one_step import OneStep, one_step
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
 from toolkit.models.camera_motion import CameraMotion, camera_motion
-from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
+
+# Times from and to (ns) at which a fault is there.
+Spans = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Finding:
     detail: str
     blocking: bool
     warning: bool = False
-    spans_ns: tuple[tuple[int, int], ...] = ()
+    spans_ns: Spans = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,17 @@ class Symptom:
     harmful: bool = True
     warns: bool = False
     spoils_vision: bool = False
-    spans_ns: tuple[tuple[int, int], ...] = ()
+    spans_ns: Spans = ()
+
+    @classmethod
+    def information(cls, count: int, detail: str, treatment: str) -> Self:
+        """Return what is worth knowing, spoils nothing and needs no repair."""
+        return cls(count, detail, treatment, remedy=None, harmful=False)
+
+    @classmethod
+    def warning(cls, count: int, detail: str, treatment: str, spans_ns: Spans = ()) -> Self:
+        """Return what may spoil results, or those of its spans, and has no sound repair."""
+        return cls(count, detail, treatment, remedy=None, harmful=False, warns=True, spans_ns=spans_ns)
 
 
 @dataclass(frozen=True)
@@ -106,12 +117,6 @@ class Evidence:
         if self.spoilt_by or not is_comparable(self.sequence):
             return None
         return compare(self.sequence, self.camera_motion)
-
-    @property
-    def known_s(self) -> float:
-        """How long the camera's own motion is known (s)."""
-        step_s = float(np.median(np.diff(self.sequence.frames_t_ns))) / NS_PER_S
-        return step_s * float(self.camera_motion.known.sum())
 
     @cached_property
     def alignment(self) -> Alignment | None:

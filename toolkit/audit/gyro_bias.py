@@ -63,12 +63,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
             remedy=_taken_off(evidence.sequence, bias_radps),
         )
     if prior is None or not denied.any():
-        return Symptom(
+        return Symptom.information(
             count=int(biased.sum()),
             detail=detail,
             treatment="left to the estimators, which carry a gyro bias",
-            remedy=None,
-            harmful=False,
         )
     stated = ", ".join(f"{b:.4f} +- {_sigma_radps(prior)[k]:.4f}" for k, b in enumerate(prior.bias[3:]))
     return Symptom(

@@ -44,13 +44,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     places = [f"{frame_s[intervals.interval[k]]:.1f} s (by {angle_rad[k]:.3f} rad)" for k in stay or jumps.tolist()]
     if not stay:
         return Undecided(f"the camera jumps at {', '.join(places)}, and its velocity does not show that it stays so")
-    return Symptom(
+    return Symptom.warning(
         count=len(stay),
         detail=f"the image jumps, and not the vehicle, at {', '.join(places)}",
         treatment="the camera was knocked or the image was cropped anew: cut the recording there",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -58,16 +58,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     axes_m = [f"{found.lacking_m[k]:+.2f} +- {found.error_m[k]:.2f} m along {'xyz'[k]}" for k in axes]
     other_point = "" if kind == "imu" else ", and which point of the vehicle the velocities are of"
     given = metres(evidence.sequence.rig.T_imu_cam[:3, 3])
-    return Symptom(
+    return Symptom.warning(
         count=len(axes),
         detail=(
             f"residuals turn with the vehicle: the camera is off by {', '.join(axes_m)} from {given}, where T_imu_cam "
             f"has it{found.slip}"
         ),
         treatment=f"check the translation of T_imu_cam{other_point}",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

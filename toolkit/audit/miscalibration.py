@@ -53,13 +53,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         wrongs.append(Wrong(summary, "the scale and the bias of the accelerometer"))
     if not wrongs:
         return None if calibration.hidden is None else Undecided(calibration.hidden)
-    return Symptom(
+    return Symptom.warning(
         count=len(wrongs),
         detail="; ".join(one.summary for one in wrongs),
         treatment=f"check {', '.join(dict.fromkeys(one.check for one in wrongs))}",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

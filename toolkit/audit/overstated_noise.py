@@ -38,16 +38,13 @@ def check(evidence: Evidence) -> Symptom | None:
     findings = list(_refuted(t_ns / NS_PER_S - t_ns[0] / NS_PER_S, values, noise))
     if not findings:
         return None
-    return Symptom(
+    return Symptom.warning(
         count=len(findings),
         detail="; ".join(findings),
         treatment=(
             "estimators told so hardly use the IMU: check its noise (imu0/sensor.yaml, imu.yaml), which is a density "
             "for one sample a second"
         ),
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -30,13 +30,10 @@ def check(evidence: Evidence) -> Symptom | None:
                 findings.append(f"{name} at {column[at_end][0]:.3g} {unit} ({at_end.sum()} samples)")
     if not findings:
         return None
-    return Symptom(
+    return Symptom.warning(
         count=int(rows.sum()),
         detail=f"samples pile up at the end of a range: {', '.join(findings)}",
         treatment="what was beyond is lost: use a sensor of a larger range",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -46,16 +46,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return _hidden(step, least + abs(step.value))
     frame = intervals.interval[fast][np.argmax(np.arange(len(ratio)) * STRETCHES // len(ratio) == after)]
     at_s = (evidence.sequence.frames_t_ns[frame] - evidence.sequence.frames_t_ns[0]) / NS_PER_S
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=(
             f"from about {at_s:.0f} s on the odometry is {100.0 * abs(step.value):.1f} +- {100.0 * step.error:.1f} % "
             f"{'faster' if step.value > 0.0 else 'slower'} beside the camera than before"
         ),
         treatment="wheels, their scale or depths have changed: no one scale mends the recording",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -31,13 +31,10 @@ def check(evidence: Evidence) -> Symptom | None:
             remedy=None,
             spoils_vision=True,
         )
-    return Symptom(
+    return Symptom.warning(
         count=int(sequence.motion.t_ns.size),
         detail=detail,
         treatment="between two samples the motion is a straight line, whose error no stated noise holds",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

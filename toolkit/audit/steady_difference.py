@@ -24,15 +24,13 @@ def check(evidence: Evidence) -> Symptom | None:
     differences = [one for one in (_scale(evidence), _direction(evidence)) if one is not None]
     if not differences:
         return None
-    return Symptom(
+    return Symptom.information(
         count=len(differences),
         detail=f"vision and odometry part all along: {'; '.join(differences)}",
         treatment=(
             "a focal length, a baseline, a principal point or wheels that are off, or slip and pitch, which make as "
             "much in sound recordings of cars; estimators count on none of it"
         ),
-        remedy=None,
-        harmful=False,
     )
 
 

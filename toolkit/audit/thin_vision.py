@@ -25,16 +25,13 @@ def check(evidence: Evidence) -> Symptom | None:
     longest = max(spans, key=lambda span: frame_s[span[1]] - frame_s[span[0]])
     share = sum(end - begin for begin, end in spans) / known.size
     seen = len(sequence.observations) / sequence.frame_count
-    return Symptom(
+    return Symptom.warning(
         count=len(spans),
         detail=(
             f"the tracks do not tell how the camera moves for {share:.0%} of the time, the longest at "
             f"{frame_s[longest[0]]:.1f}-{frame_s[longest[1]]:.1f} s ({seen:.1f} sightings a frame over all)"
         ),
         treatment="there every estimate rests on the motion samples, or on a few tracks that may be wrong",
-        remedy=None,
-        harmful=False,
-        warns=True,
         spans_ns=tuple((int(sequence.frames_t_ns[begin]), int(sequence.frames_t_ns[end])) for begin, end in spans),
     )
 

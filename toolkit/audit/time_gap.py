@@ -59,12 +59,10 @@ def _frames_symptom(sequence: Sequence) -> Symptom | None:
     if holes.size == 0:
         return None
     longest_s = float(np.diff(sequence.frames_t_ns)[holes].max()) / NS_PER_S
-    return Symptom(
+    return Symptom.information(
         count=holes.size,
         detail=f"{holes.size} hole(s) in the frames, the longest of {longest_s:.2f} s",
         treatment="the motion samples bridge them",
-        remedy=None,
-        harmful=False,
     )
 
 

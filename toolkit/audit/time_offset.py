@@ -92,13 +92,10 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
 def _changing(detail: str, change: Scalar) -> Symptom:
     """Tell of an offset that no constant shift mends, for half of the recording has another one."""
     parted = f"{1e3 * change.value:.0f} +- {1e3 * change.error:.0f} ms"
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=f"{detail}, but by {parted} more in the second half than in the first",
         treatment="a clock drifts or was set: stamp both by one clock, or cut the recording there",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 
@@ -149,7 +146,7 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
     if not near:
         return None
     shifts = " or ".join(f"{1e3 * shift:+.0f}" for shift in near)
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=(
             f"twists come as often as frames, and each frame {1e3 * late_s:.0f} ms after one: a camera's clock that is "
@@ -157,9 +154,6 @@ def _as_often(sequence: Sequence, offset: Scalar) -> Symptom | None:
             f"{1e3 * offset.error:.0f} ms, which does not tell that from none"
         ),
         treatment="if frames and twists were taken together, give them the same stamps",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 

@@ -107,7 +107,7 @@ def _scatters(evidence: Evidence, scatter: float, error: float) -> str:
 
 
 def _symptom(detail: str, treatment: str) -> Symptom:
-    return Symptom(count=1, detail=detail, treatment=treatment, remedy=None, harmful=False, warns=True)
+    return Symptom.warning(count=1, detail=detail, treatment=treatment)
 
 
 def _tail(chi2: Array) -> Symptom | None:

@@ -190,7 +190,7 @@ def _by_another_clock(evidence: Evidence, truth: Truth) -> Symptom | None:
 
 
 def _symptom(detail: str, treatment: str) -> Symptom:
-    return Symptom(count=1, detail=detail, treatment=treatment, remedy=None, harmful=False, warns=True)
+    return Symptom.warning(count=1, detail=detail, treatment=treatment)
 
 
 class _Windows(NamedTuple):

@@ -33,16 +33,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
     if kind == "imu":
         measured, causes = "IMU's", ": check K and the baseline"
-    return Symptom(
+    return Symptom.warning(
         count=1,
         detail=(
             f"vision's steps are {100.0 * abs(scale):.1f} +- {100.0 * error:.1f} % "
             f"{'longer' if scale > 0.0 else 'shorter'} than the {measured}"
         ),
         treatment=f"disparities, baseline or focal length are off{causes}",
-        remedy=None,
-        harmful=False,
-        warns=True,
     )
 
 
