@@ -190,7 +190,7 @@ class LandmarkCorrelation(ResidualCorrelation):
         self, uvs_px: Array, whitened: Array, points: Array, T_world_imu: Array, images: multiview.Images
     ) -> None:
         """Take in what one image shows together, where sightings have come to count for less."""
-        if self.share == 1.0 or not len(points):
+        if not self._counts_neighbours or self.share == 1.0 or not len(points):
             return
         there = images.linearised(points, T_world_imu[None], self._rig)
         H_pose = left_only.whitener(uvs_px, self._rig) @ left_only.seen_rows(uvs_px, there.d_uv_d_pose[:, 0])
