@@ -1,5 +1,6 @@
 """Many processes give what one gives, and what goes wrong in one of them stays there."""
 
+import gc
 import os
 import signal
 import sys
@@ -8,16 +9,17 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import Popen
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from loky.backend.synchronize import SemLock
 
 from toolkit.errors import DataError
 from toolkit.estimate import Trajectory
 from toolkit.experiment.units import Outcome, Scored, Unit, run_unit
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import Lost, WorkerProcess, results_of
 from toolkit.metrics import cost
 from toolkit.progress import SILENT
 
@@ -277,6 +279,38 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
     assert (tmp_path / "run").exists() == ("what has ended is kept in run" in told)
     assert {path.name for path in tmp_path.rglob("*")} <= {"run", "outcomes.jsonl"}
     _assert_gone(vislam.pid)
+
+
+def test_a_signal_while_a_process_starts_leaves_nothing_that_it_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    shared: list[str] = []
+
+    def register(name: str, kind: str) -> None:
+        real.register(name, kind)
+        shared.append(name)
+        signal.raise_signal(signal.SIGTERM)
+
+    def unregister(name: str, kind: str) -> None:
+        real.unregister(name, kind)
+        shared.remove(name)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    synchronize = sys.modules[SemLock.__module__]  # loky.backend's attribute of this name is another module
+    real = synchronize.resource_tracker
+    monkeypatch.setattr(synchronize, "resource_tracker", SimpleNamespace(register=register, unregister=unregister))
+    before = signal.signal(signal.SIGTERM, interrupt)
+    process = WorkerProcess()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            process.submit(int)
+        assert shared
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        process.end()
+    del process
+    gc.collect()
+    assert not shared
 
 
 def test_no_process_outlives_one_that_is_killed(tmp_path: Path, starts_group: StartsGroup) -> None:

@@ -29,6 +29,7 @@ from loky import ProcessPoolExecutor
 from loky.process_executor import BrokenProcessPool
 
 from toolkit.errors import SystemLimitError
+from toolkit.files.writing import uninterrupted
 from toolkit.progress import Progress
 from toolkit.threads import THREAD_VARIABLES
 
@@ -58,9 +59,10 @@ class WorkerProcess:
     def submit(self, work: Callable[..., R], *arguments: Any) -> "Future[R]":
         """Have the process do some work after what it has to do already; where it dies, BrokenProcessPool is raised.
 
+        A signal waits until the process is started: half-made, what it shares would be left behind and be told of.
         Raises SystemLimitError where the system lets no process be started.
         """
-        with _interrupts_held_back(), _refusals_shown():
+        with uninterrupted(), _interrupts_held_back(), _refusals_shown():
             # Started with the first process, Python's own tracker would let interrupts through to it again.
             resource_tracker.ensure_running()
             if self._executor is None:
