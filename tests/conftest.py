@@ -31,7 +31,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from toolkit import runner
-from toolkit.audit import Audit
+from toolkit.audit import Audit, Finding
 from toolkit.estimate import Run
 from toolkit.estimator import find
 from toolkit.experiment import pipeline, recording, workers
@@ -201,6 +201,31 @@ def without_pixels() -> Callable[[], AbstractContextManager[None]]:
     without; the first line of the README and a test of run directories render theirs.
     """
     return _without_pixels
+
+
+_audit = recording.audit
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _remembers_audits() -> Iterator[None]:
+    """Have runs audit the same recording once in all tests of a worker, whichever way it was loaded.
+
+    Of what was left as it was no more than the findings is kept.
+    """
+    kept: dict[tuple[object, ...], tuple[Sequence | None, tuple[Finding, ...], Mapping[str, str]]] = {}
+
+    def remembered(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
+        key = (sequence.name, sequence.provenance, sequence.content_hash(), keep)
+        if key not in kept:
+            found = _audit(sequence, keep)
+            repaired = None if found.sequence is sequence else found.sequence
+            kept[key] = repaired, found.findings, found.undecided
+        repaired, findings, undecided = kept[key]
+        return Audit(sequence if repaired is None else repaired, findings, undecided)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "audit", remembered)
+        yield
 
 
 _audited_recording = recording.audited_recording
