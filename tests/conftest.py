@@ -2,6 +2,7 @@
 
 # ruff: noqa: E402 - the number of threads must be set before NumPy is imported
 
+import ctypes
 import fcntl
 import gc
 import json
@@ -30,7 +31,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from toolkit import runner
-from toolkit.audit import Audit
+from toolkit.audit import Audit, Finding
 from toolkit.estimate import Run
 from toolkit.estimator import find
 from toolkit.experiment import pipeline, recording, workers
@@ -57,6 +58,23 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
     gc.disable()  # until the tests are found: all that is made meanwhile stays
+    _keep_freed_memory()
+
+
+# Numbers of mallopt's options in glibc's malloc.h, and what is asked of each in bytes.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+_NEVER_TRIMMED, _LARGEST_FROM_HEAP = 1 << 30, 1 << 25
+
+
+def _keep_freed_memory() -> None:
+    """Have memory that was freed kept for what comes next, where the C library can be told to.
+
+    Large arrays would be mapped, cleared and given back to the system each time: a tenth of the time of audits.
+    """
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):
+        library.mallopt(_M_TRIM_THRESHOLD, _NEVER_TRIMMED)
+        library.mallopt(_M_MMAP_THRESHOLD, _LARGEST_FROM_HEAP)
 
 
 # What takes longest comes first, or one worker would still be at it when all others have ended. What stays together
@@ -183,6 +201,31 @@ def without_pixels() -> Callable[[], AbstractContextManager[None]]:
     without; the first line of the README and a test of run directories render theirs.
     """
     return _without_pixels
+
+
+_audit = recording.audit
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _remembers_audits() -> Iterator[None]:
+    """Have runs audit the same recording once in all tests of a worker, whichever way it was loaded.
+
+    Of what was left as it was no more than the findings is kept.
+    """
+    kept: dict[tuple[object, ...], tuple[Sequence | None, tuple[Finding, ...], Mapping[str, str]]] = {}
+
+    def remembered(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
+        key = (sequence.name, sequence.provenance, sequence.content_hash(), keep)
+        if key not in kept:
+            found = _audit(sequence, keep)
+            repaired = None if found.sequence is sequence else found.sequence
+            kept[key] = repaired, found.findings, found.undecided
+        repaired, findings, undecided = kept[key]
+        return Audit(sequence if repaired is None else repaired, findings, undecided)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "audit", remembered)
+        yield
 
 
 _audited_recording = recording.audited_recording

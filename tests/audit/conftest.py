@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from toolkit.arrays import content_digest
 from toolkit.audit import Audit, audit, fault
 from toolkit.geometry import Array, IntArray, se3
 from toolkit.measured_motion import TwistSamples
@@ -190,34 +191,33 @@ def plant(request: pytest.FixtureRequest) -> Plant:
     return PLANTS[fault](clean(scenario, duration_s=30.0 if fault == "twist-lag" else None))
 
 
-def _once(
-    function: Callable[..., Any], of: Callable[..., tuple[object, ...]] = lambda *given: given
-) -> Callable[..., Any]:
-    """Return a function that remembers what came of the same objects; it keeps them, so that none takes their id."""
-    kept: dict[tuple[int, ...], tuple[object, Any]] = {}
+def _once(function: Callable[..., Any], content: Callable[[Sequence], str]) -> Callable[..., Any]:
+    """Return a function of a sequence, and of what follows from it, that remembers what came of the same content."""
+    kept: dict[str, Any] = {}
 
-    def remembered(*given: Any) -> Any:
-        key = tuple(map(id, of(*given)))
+    def remembered(sequence: Sequence, *derived: Any) -> Any:
+        key = content(sequence)
         if key not in kept:
-            kept[key] = given, function(*given)
-        return kept[key][1]
+            kept[key] = function(sequence, *derived)
+        return kept[key]
 
     return remembered
 
 
-@pytest.fixture(scope="module")
-def derived_once() -> Iterator[None]:
-    """Derive what several faults look at once of a recording, though it is audited three times: whole, kept, repaired.
+def _tracks(sequence: Sequence) -> str:
+    return content_digest((sequence.observations, sequence.frames_t_ns, sequence.rig))
 
-    What follows from the same tracks, or from the same recording, is the same: an audit itself goes by that.
+
+@pytest.fixture(scope="package", autouse=True)
+def _derived_once() -> Iterator[None]:
+    """Derive what several faults look at once of the same tracks, or of the same recording, for all tests of a worker.
+
+    Most faults are planted in few recordings, many of them beside the tracks, and are audited more than once.
     """
     with pytest.MonkeyPatch.context() as patch:
-        tracks = _once(
-            fault.camera_motion, lambda sequence: (sequence.observations, sequence.frames_t_ns, sequence.rig)
-        )
-        patch.setattr(fault, "camera_motion", tracks)
-        for name in ("compare", "alignment", "self_calibration"):
-            patch.setattr(fault, name, _once(getattr(fault, name)))
+        patch.setattr(fault, "camera_motion", _once(fault.camera_motion, _tracks))
+        for name in ("alignment", "self_calibration"):
+            patch.setattr(fault, name, _once(getattr(fault, name), Sequence.content_hash))
         yield
 
 

@@ -11,8 +11,6 @@ from toolkit.audit import audit, faults
 from toolkit.errors import VislamError
 from toolkit.sequence import Sequence, check_runnable
 
-pytestmark = pytest.mark.usefixtures("derived_once")
-
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
 @pytest.mark.parametrize("seed", range(5))

@@ -10,7 +10,7 @@ import re
 import shutil
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ import pytest
 import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.internal.conjecture import providers
 
 from toolkit.cli import main
 from toolkit.datasets import load_references, load_sequence
@@ -34,6 +35,14 @@ Test = Callable[..., None]
 VALUES = ("nan", "inf", "-inf", "0", "-1", "1e300", "-1e300", "1e-300", "1e19", "99999999999999999999", "", "x", "null")
 _DTYPES = ("f4", "i8", "u1", "c16", "U8", "?", "i2")
 _NUMBER = re.compile(rb"-?\d[\d.eE+-]*")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_numbers_of_modules() -> Iterator[None]:
+    """Keep Hypothesis from drawing numbers out of the modules that are loaded, which the tests before decide."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(providers, "_get_local_constants", providers.Constants)
+        yield
 
 
 @dataclass(frozen=True)

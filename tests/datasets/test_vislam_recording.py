@@ -12,6 +12,7 @@ import pytest
 
 from toolkit.datasets import load_sequence, vislam_recording
 from toolkit.errors import DataError, OutputError
+from toolkit.geometry import Array
 from toolkit.measured_motion import TwistSamples
 from toolkit.sequence import Sequence
 from toolkit.simulation import DRIVE, FLIGHT, SCENARIOS, simulate
@@ -335,3 +336,13 @@ def test_numbers_with_an_imaginary_part_are_refused(drive: Sequence, tmp_path: P
     np.savez(folder / "recording.npz", **(arrays | {"motion_values": arrays["motion_values"].astype(complex)}))
     with pytest.raises(DataError, match="motion_values holds complex128, expected real numbers"):
         vislam_recording.load(folder)
+
+
+@pytest.mark.parametrize("spoil", [np.zeros_like, np.negative])
+def test_a_start_whose_covariance_is_none_is_refused(
+    drive: Sequence, tmp_path: Path, spoil: Callable[[Array], Array]
+) -> None:
+    assert drive.prior is not None
+    vislam_recording.save(replace(drive, prior=replace(drive.prior, cov=spoil(drive.prior.cov))), tmp_path / "made")
+    with pytest.raises(DataError, match="prior_cov is not positive definite"):
+        vislam_recording.load(tmp_path / "made")

@@ -244,7 +244,12 @@ def _prior(text: Text, arrays: Arrays) -> Prior | None:
     if text["prior"] is None:
         return None
     parts: dict[str, Array] = {name: arrays[f"prior_{name}"] for name in ("T_world_imu", "v_world", "bias", "cov")}
-    return Prior(**parts, source=text["prior"]["source"])
+    prior = Prior(**parts, source=text["prior"]["source"])
+    try:
+        np.linalg.cholesky(prior.cov)
+    except np.linalg.LinAlgError as error:
+        raise DataError("prior_cov is not positive definite; save the recording again") from error
+    return prior
 
 
 def _truth(text: Text, arrays: Arrays) -> Truth | None:
