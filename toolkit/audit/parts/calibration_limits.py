@@ -63,6 +63,16 @@ def wrong(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> list[Wron
     ]
 
 
+def doubtful(found: SelfCalibration, rig: StereoRig, kind: MotionKind) -> str | None:
+    """Say what is wrong beyond chance and no more than sound recordings have."""
+    by_chance = LIMITS[kind]._replace(focal=0.0, centre_px=(0.0, 0.0), turn_rad=0.0)
+    differences = [*_intrinsics(found, rig, by_chance, BESIDE[kind]), *_turn(found, by_chance)]
+    if not differences:
+        return None
+    said = "; ".join(one.summary for one in differences)
+    return f"{said}: that is more than chance and no more than in sound recordings"
+
+
 def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
     """Say how large faults of the intrinsics and of where the camera looks would not show, where that is much."""
     limits = LIMITS[kind]
@@ -75,6 +85,12 @@ def hidden(found: SelfCalibration, kind: MotionKind) -> str | None:
     turn_rad = limits.turn_rad + limits.sigmas * float(found.error[TURN].max())
     parts += [f"a camera turned by {turn_rad:.2f} rad"] if turn_rad > limits.hidden_turn_rad else []
     return f"too little rotation: {', '.join(parts)} would not show" if parts else None
+
+
+def hidden_baseline(found: SelfCalibration, kind: MotionKind) -> float:
+    """Return by what share a baseline must be off to be told, whichever way it is."""
+    limits = LIMITS[kind]
+    return float(limits.baseline + limits.sigmas * found.error[BASELINE] + abs(found.value[BASELINE]))
 
 
 def _intrinsics(found: SelfCalibration, rig: StereoRig, limits: Limits, beside: str) -> list[Wrong]:
