@@ -143,6 +143,8 @@ class Evidence:
         truth = self.sequence.truth
         if truth is None or self.spoilt_by or not is_comparable(self.sequence):
             return None
+        if self.camera_motion.known.sum() < LEAST_INTERVALS:
+            return None
         return truth_clock(self.sequence, self.camera_motion, truth)
 
     def after(self, remedy: Sequence) -> "Evidence":

@@ -228,6 +228,18 @@ def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0)
     return _with_values(sequence, sequence.motion.values * np.repeat([1.0, dose], 3))
 
 
+def gyro_axis_scale(sequence: Sequence, dose: float = 0.9, seed: int = 0) -> Sequence:
+    """Multiply the rates about the axis that turns most by the dose: a channel of another sensitivity."""
+    scale = np.ones(6)
+    scale[3 + int(np.argmax(np.std(sequence.motion.values[:, 3:], axis=0)))] = dose
+    return _with_values(sequence, sequence.motion.values * scale)
+
+
+def coarse_samples(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
+    """Round motion samples to multiples of the dose: a converter of few bits, a log of few digits."""
+    return _with_values(sequence, dose * np.round(sequence.motion.values / dose))
+
+
 def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Add a constant of the dose (rad/s), in a direction drawn, to every angular velocity: a warm gyro."""
     axis = np.random.default_rng(seed).standard_normal(3)
