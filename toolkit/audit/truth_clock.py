@@ -6,8 +6,8 @@ a vehicle goes evenly, a clock that is fast looks like a truth that is too long.
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 
-# Where the clocks must be farther apart than this (s) to show, it is said.
-LARGEST_S = 0.1
+# Where the clocks must be farther apart than this (s) to show, it is said: half a metre of a drive.
+LARGEST_S = 0.05
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:

@@ -16,12 +16,12 @@ import numpy as np
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable, moved_by
-from toolkit.audit.parts.robust import chance_sigmas, median_error
+from toolkit.audit.parts.robust import Scalar, chance_sigmas, median_error
 from toolkit.audit.parts.truth_clock import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Truth
+from toolkit.sequence import Sequence, Truth
 
 # Long enough that the noise of single frames hardly counts, short enough that five seconds hold ten of them.
 WINDOW_S = 0.5
@@ -62,6 +62,24 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
     return _broken(truth) or _by_another_clock(evidence) or _compared_with(evidence, truth)
+
+
+def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
+    """Return how many times as long as the camera's own a trajectory's steps are, where that factor alone parts them.
+
+    None where it is chance or no more than sound recordings have, or where the tracks do not tell.
+    """
+    evidence = Evidence(sequence)
+    if not is_comparable(sequence) or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
+        return None
+    both = _windows(evidence, trajectory)
+    moved = _moving(both.displaced_m, LEAST_MOVED_M)
+    if moved.sum() < LEAST_WINDOWS:
+        return None
+    scale, only_longer = _longer(*both.displaced_m[:, moved])
+    if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
+        return None
+    return Scalar(1.0 / scale.value, scale.error / scale.value**2)
 
 
 def _broken(truth: Truth) -> Symptom | None:
@@ -106,8 +124,7 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
         if share.value - share.by_chance > MOST_OFF
     }
     seen, true = both.displaced_m[:, moved]
-    scale = _ratio(seen, true)
-    only_longer = scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
+    scale, only_longer = _longer(seen, true)
     if "turns" in elsewhere or (elsewhere and not only_longer):
         return _symptom(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
@@ -269,6 +286,12 @@ def _compared(each: Array) -> _Compared:
 def _off(both: Array) -> _Compared:
     """Return the share by which the two of (2, M, 3) differ, of the larger."""
     return _compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
+
+
+def _longer(seen: Array, true: Array) -> tuple[_Compared, bool]:
+    """Return the ratio of displacements (M, 3) along the true ones, and whether it is all by which they differ."""
+    scale = _ratio(seen, true)
+    return scale, scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
 
 
 def _ratio(seen: Array, true: Array) -> _Compared:

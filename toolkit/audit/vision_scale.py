@@ -15,6 +15,9 @@ from toolkit.audit.parts.calibration_limits import hidden_baseline
 SYSTEMATIC = {"twist": 0.03, "imu": 0.025}
 # A scale that is known worse than this is not judged; where a fault must be larger than that to show, it is said.
 LARGEST_ERROR, LARGEST_HIDDEN = 0.02, 0.08
+# Beside odometry a difference is told from chance on (`steady_difference`); where that is more, it is said: 2 % of all
+# disparities make runs on `drive` six times as wrong.
+LARGEST_CHANCE = 0.02
 # Beside an IMU nothing else holds the scale for as long as its noise hides it: a fault of it is as good as all of the
 # drift of a stereo system with an IMU, about a percent of the way.
 LARGEST_HIDDEN_BESIDE_IMU = 0.01
@@ -68,10 +71,18 @@ def _unseen(evidence: Evidence, least: float) -> Undecided | None:
         known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would hide"
         return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
     if least + abs(scale) < LARGEST_HIDDEN:
-        return None
+        return _unseen_at_all(scale, error, found.scale_by_chance + abs(scale))
     known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
     hidden = least + abs(scale)
     return Undecided(f"{known}, as in sound recordings: a fault of less than {100.0 * hidden:.0f} % would not show")
+
+
+def _unseen_at_all(scale: float, error: float, hidden: float) -> Undecided | None:
+    """Say from where on beside odometry not even a steady difference is told, where that is much."""
+    if hidden < LARGEST_CHANCE:
+        return None
+    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, as by chance"
+    return Undecided(f"{known}: a scale that is off by less than {100.0 * hidden:.1f} % would not show")
 
 
 FAULT = Fault(
