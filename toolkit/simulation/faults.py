@@ -270,6 +270,18 @@ def camera_clock_step(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> 
     return _with_frames_at(sequence, sequence.frames_t_ns + np.where(later, ns(dose), 0))
 
 
+def alternate_frames_late(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
+    """Stamp every other frame so many seconds late: two buffers, of which one is read after the other."""
+    odd = np.arange(sequence.frame_count) % 2 == 1
+    return _with_frames_at(sequence, sequence.frames_t_ns + np.where(odd, ns(dose), 0))
+
+
+def frame_jitter(sequence: Sequence, dose: float = 0.015, seed: int = 0) -> Sequence:
+    """Stamp each frame up to so many seconds early or late, evenly drawn, less than half a step: a busy computer."""
+    off_s = np.random.default_rng(seed).uniform(-dose, dose, sequence.frame_count)
+    return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(1e9 * off_s).astype(np.int64))
+
+
 def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
     """Let the camera's clock run fast by a share of the time: a cheap quartz, frames counted and not stamped."""
     since_ns = sequence.frames_t_ns - sequence.frames_t_ns[0]
