@@ -24,7 +24,7 @@ from toolkit.sequence import Sequence, Truth
 # recordings have 9 +- 2 ms at most (0027), chosen with them in view.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 # The fit takes in these shares of the intervals about the middle, one after the other, with so many steps each.
-SHARES, STEPS = (0.3, 0.6, 1.0), (2, 2, 3)
+SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
 # As many intervals at least, of which the truth may not reach some.
 FEWEST = LEAST_INTERVALS + 10
 # The slope of the truth's rates is taken over this share of a step of the frames to either side.
