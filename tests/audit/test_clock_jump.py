@@ -73,3 +73,26 @@ def test_stamps_that_tremble_together_are_no_jumps(seed: int) -> None:
     stamps = np.interp(sound.motion.t_ns, sound.frames_t_ns, sound.frames_t_ns + late_ns).astype(np.int64)
     motion = sound.motion.of(stamps, sound.motion.values)
     assert clock_jump.check(Evidence(replace(sound, frames_t_ns=sound.frames_t_ns + late_ns, motion=motion))) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_told(seed: int) -> None:
+    """What its tracks move by is noise, of which every interval has as much, however long it is."""
+    standing = faults.standstill(recording("drive", seed), 6.0, seed)
+    speed_mps = np.linalg.norm(standing.motion.values[:, :3], axis=1)
+    stands_s = standing.elapsed_s(standing.motion.t_ns[speed_mps < 0.2])
+    at_s = float(np.median(stands_s)) + 0.03
+    samples_s = standing.elapsed_s(standing.motion.t_ns)
+    for leap_s in (0.5, 2.0):
+        kept = [(t_s < at_s - 0.5 * leap_s) | (t_s > at_s + 0.5 * leap_s) for t_s in (standing.frames_s, samples_s)]
+        paused = keep_samples(keep_frames(standing, np.flatnonzero(kept[0])), kept[1])
+        leap_ns = round(leap_s * 1e9)
+        jumped = replace(
+            standing,
+            frames_t_ns=standing.frames_t_ns + np.where(standing.frames_s > at_s, leap_ns, 0),
+            motion=replace(standing.motion, t_ns=standing.motion.t_ns + np.where(samples_s > at_s, leap_ns, 0)),
+        )
+        for sequence in (paused, jumped):
+            said = clock_jump.check(Evidence(sequence))
+            assert isinstance(said, Undecided)
+            assert "do not tell whether time passed" in said.why

@@ -125,6 +125,12 @@ CASES = [
     Case(faults.displaced_camera, 1.0, "lever-arm", "warned", "the camera is off by", IMU),
     Case(faults.outlier_tracks, 0.6, "track-scatter", "warned", "times as much as the stated noise"),
     Case(faults.linear_unit, 0.8, "miscalibration", "warned", "times gravity", IMU),
+    Case(faults.alternate_frames_late, 0.02, "uneven-stamps", "warned", "the camera's motion follows", TWIST),
+    Case(faults.frame_jitter, 0.015, "uneven-stamps", "warned", "the camera's motion follows", TWIST),
+    Case(faults.truth_clock_rate, 1.04, "truth-clock", "warned", "times as fast by the truth's stamps"),
+    Case(faults.unwritten_orientations, 1.0, "truth-mismatch", "warned", "all orientations of the truth are one"),
+    Case(faults.gyro_axis_scale, 0.85, "gyro-scale", "warned", "times as fast as the camera about"),
+    Case(faults.coarse_samples, 0.1, "coarse-samples", "warned", "in steps of 0.1 rad/s"),
     Case(faults.blackout, 1.0, "thin-vision", "warned", "s ("),
     Case(faults.few_tracks, 3.0, "thin-vision", "warned", "for 100% of the time"),
 ]

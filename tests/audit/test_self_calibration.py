@@ -1,5 +1,6 @@
 """The calibration that tracks and an IMU fit: exact where they are, honest where they err, told beyond its limits."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -222,3 +223,14 @@ def test_an_offset_between_chance_and_certainty_is_not_decidable() -> None:
     outcome = audit(late)
     assert "time-offset" not in {finding.fault for finding in outcome.findings}
     assert "frames look as if stamped late by 17 +- 5 ms" in outcome.undecided["time-offset"]
+
+
+def test_a_focal_length_beyond_chance_and_below_what_counts_is_said() -> None:
+    """Two percent on 6 s of a flight are eight standard errors, and double the error of what is estimated."""
+    sound = simulate(replace(FLIGHT, duration_s=6.0, varied=True), 7301)
+    assert "more than chance" not in audit(sound).undecided.get("miscalibration", "")
+    said = audit(faults.wrong_focal_length(sound, 1.02))
+    told = re.search(r"fit fx_px = (\S+) \+- (\S+), not", said.undecided["miscalibration"])
+    assert told is not None
+    assert float(told[1]) == pytest.approx(sound.rig.fx_px, abs=4.0 * float(told[2]))
+    assert "more than chance" in said.undecided["miscalibration"]

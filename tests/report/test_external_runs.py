@@ -1,5 +1,6 @@
 """A trajectory file becomes a run at the frames, or one line says why it is not of this recording."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -208,3 +209,16 @@ def test_positions_in_millimetres_are_named_with_the_ratio(tmp_path: Path, recor
     blind = [replace(recording, truth=None)] if isinstance(recording.motion, TwistSamples) else []
     for known in (recording, *blind):
         assert "it is in millimetres: divide its positions by 1000" in refusal(tmp_path, far, known)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 1.3])
+def test_another_scale_is_remarked_on_without_a_truth(tmp_path: Path, recording: Sequence, scale: float) -> None:
+    """By the camera's own steps, which an estimate of any other scale does not make."""
+    truth = truth_of(recording)
+    scaled = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], scale * truth.positions))
+    run = read_as_run(tmp_path, scaled, replace(recording, truth=None))
+    told = [re.search(r"its steps are (\S+) \+- (\S+) times as long", entry) for entry in run.log]
+    (found,) = [match for match in told if match] or [None]
+    assert (found is None) == (scale == 1.0)
+    if found is not None:
+        assert float(found[1]) == pytest.approx(scale, rel=0.02)  # the noise of the tracks lengthens vision's steps

@@ -11,12 +11,12 @@ from toolkit.errors import DataError
 from toolkit.geometry import se3_inverse
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
-from toolkit.simulation import SCENARIOS, faults, simulate, standstill, track_faults
+from toolkit.simulation import SCENARIOS, clock_faults, faults, simulate, standstill, track_faults
 from toolkit.track_noise import CHANNELS
 
 INJECTORS = {
     name: function
-    for module in (faults, standstill, track_faults)
+    for module in (faults, clock_faults, standstill, track_faults)
     for name, function in getmembers(module, isfunction)
     if function.__module__ == module.__name__ and not name.startswith("_")
 }

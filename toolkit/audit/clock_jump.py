@@ -132,9 +132,21 @@ def _steps_gone(sequence: Sequence, frame: int) -> Iterator[Scalar]:
     for moved, least in ((camera.v_mps, LEAST_M), (camera.w_radps, LEAST_RAD)):
         beside = np.flatnonzero(camera.known & (np.arange(camera.known.size) != here))
         size = np.linalg.norm(moved, axis=1)
-        if beside.size < FEWEST_AROUND or np.median(size[beside]) < least:
+        if beside.size < FEWEST_AROUND or np.median(size[beside]) < least or _is_noise(moved, beside, here):
             continue
         yield _ratio(size, beside, here)
+
+
+def _is_noise(moved: Array, beside: IntArray, here: int) -> bool:
+    """Say whether motions (n, 3) beside one at ``here`` have no direction in common, as noise of what stands has none.
+
+    That is where the lines through them come no farther from zero than so many of their standard errors.
+    """
+    line = np.stack([np.ones(beside.size), beside - here], axis=1)
+    found, *_ = np.linalg.lstsq(line, moved[beside])
+    variance = float(np.sum((moved[beside] - line @ found) ** 2)) / (beside.size - 2)
+    error = np.sqrt(variance * np.linalg.inv(line.T @ line)[0, 0])
+    return bool(np.linalg.norm(found[0]) < APART * error)
 
 
 def _ratio(size: Array, beside: IntArray, here: int) -> Scalar:

@@ -10,6 +10,7 @@ from toolkit.audit.parts.deviations import Fallen, fallen_mps
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import OneStep, one_step
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
+from toolkit.audit.parts.truth_clock import TruthClock, truth_clock
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 
@@ -135,6 +136,16 @@ class Evidence:
         """The camera's velocity less what the IMU gained, of a recording that has ``intervals``."""
         assert self.intervals is not None
         return fallen_mps(self.sequence, self.camera_motion, self.intervals)
+
+    @cached_property
+    def truth_clock(self) -> TruthClock | None:
+        """The truth's clock beside the frames'; None without a truth, or where nothing can be compared."""
+        truth = self.sequence.truth
+        if truth is None or self.spoilt_by or not is_comparable(self.sequence):
+            return None
+        if self.camera_motion.known.sum() < LEAST_INTERVALS:
+            return None
+        return truth_clock(self.sequence, self.camera_motion, truth)
 
     def after(self, remedy: Sequence) -> "Evidence":
         """Return the evidence after a repair; what tracks alone show is kept where it left them as they were."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, hidden, wrong
+from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, doubtful, hidden, wrong
 from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
@@ -83,7 +83,8 @@ def _calibration(evidence: Evidence, intervals: Intervals) -> _Calibration:
 
 def _fitted(found: SelfCalibration | None, rig: StereoRig, kind: MotionKind) -> _Calibration:
     if found is not None:
-        return _Calibration(wrong(found, rig, kind), hidden(found, kind))
+        doubt = doubtful(found, rig, kind) if kind == "imu" else None  # beside odometry that is `steady_difference`
+        return _Calibration(wrong(found, rig, kind), "; ".join(filter(None, (doubt, hidden(found, kind)))) or None)
     unseen = f"no tracks are seen for long enough beside the {BESIDE[kind]}"
     return _Calibration([], f"the intrinsics: {unseen}, or no calibration near the given one fits them")
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.alignment import chained
-from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, is_comparable, moved_by
-from toolkit.audit.parts.robust import chance_sigmas, median_error
-from toolkit.audit.time_offset import camera_offset
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable, moved_by
+from toolkit.audit.parts.robust import Scalar, chance_sigmas, median_error
+from toolkit.audit.parts.truth_clock import LEAST_OFFSET_S, OFFSET_SIGMAS
 from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
 from toolkit.resampling import NS_PER_S
-from toolkit.sequence import Truth
+from toolkit.sequence import Sequence, Truth
 
 # Long enough that the noise of single frames hardly counts, short enough that five seconds hold ten of them.
 WINDOW_S = 0.5
@@ -46,8 +46,6 @@ DRIVES, MOST_STANDING = 5.0, 0.5
 # Root mean squares, as shares of the motion: a truth that is so far off is tried in other readings, and taken to
 # be of one where it is so many times nearer then. In sound recordings at hand it never is.
 LEAST_APART, TIMES_NEARER = 0.1, 3.0
-# An offset of the truth's clock beyond so many standard errors and so much (s) counts.
-OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
 # Lengths (m) that a truth is written in by mistake; millimetres and centimetres are converted (`units`).
 LENGTHS = {"feet": 0.3048, "yards": 0.9144, "inches": 0.0254, "kilometres": 1000.0}
 _WHERE = "check the baseline and the focal length (the camera's calibration file), and the unit of the truth"
@@ -63,7 +61,25 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
         return None
     if evidence.camera_motion.known.sum() < LEAST_INTERVALS:
         return None
-    return _broken(truth) or _by_another_clock(evidence, truth) or _compared_with(evidence, truth)
+    return _broken(truth) or _by_another_clock(evidence) or _compared_with(evidence, truth)
+
+
+def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
+    """Return how many times as long as the camera's own a trajectory's steps are, where that factor alone parts them.
+
+    None where it is chance or no more than sound recordings have, or where the tracks do not tell.
+    """
+    evidence = Evidence(sequence)
+    if not is_comparable(sequence) or evidence.camera_motion.known.sum() < LEAST_INTERVALS:
+        return None
+    both = _windows(evidence, trajectory)
+    moved = _moving(both.displaced_m, LEAST_MOVED_M)
+    if moved.sum() < LEAST_WINDOWS:
+        return None
+    scale, only_longer = _longer(*both.displaced_m[:, moved])
+    if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
+        return None
+    return Scalar(1.0 / scale.value, scale.error / scale.value**2)
 
 
 def _broken(truth: Truth) -> Symptom | None:
@@ -90,7 +106,7 @@ def _broken(truth: Truth) -> Symptom | None:
 def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | None:
     both = _windows(evidence, truth)
     moved, turned = _moving(both.displaced_m, LEAST_MOVED_M), _moving(both.turned_rad, LEAST_TURNED_RAD)
-    if (stands := _standing(both, moved)) is not None:
+    if (stands := _standing(both, moved) or _looking_one_way(truth, both)) is not None:
         return stands
     if moved.sum() < LEAST_WINDOWS:
         return Undecided(
@@ -108,14 +124,23 @@ def _compared_with(evidence: Evidence, truth: Truth) -> Symptom | Undecided | No
         if share.value - share.by_chance > MOST_OFF
     }
     seen, true = both.displaced_m[:, moved]
-    scale = _ratio(seen, true)
-    only_longer = scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
+    scale, only_longer = _longer(seen, true)
     if "turns" in elsewhere or (elsewhere and not only_longer):
         return _symptom(f"the truth's motion is not the camera's: {' and '.join(elsewhere.values())}", _OTHER)
     if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
-        return None
+        return _doubtful(scale) if only_longer else None
     unit = "".join(f", as of one in {name}" for name, m in LENGTHS.items() if abs(scale.value / m - 1.0) < SYSTEMATIC)
     return _symptom(f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's{unit}", _WHERE)
+
+
+def _doubtful(scale: "_Compared") -> Undecided | None:
+    """Say of a scale that it is more than chance and no more than sound recordings have."""
+    if abs(scale.value - 1.0) <= scale.by_chance:
+        return None
+    return Undecided(
+        f"vision's steps are {scale.value:.3f} +- {scale.error:.3f} times the truth's, which is more than chance and "
+        "no more than in sound recordings: the truth's unit, the baseline or the focal length may be off by it"
+    )
 
 
 def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:
@@ -131,6 +156,22 @@ def _standing(both: "_Windows", moved: BoolArray) -> Symptom | None:
         f"the truth stands still in {apart.sum()} of {moved.size} windows of {WINDOW_S:g} s in which the camera moves "
         f"at {speed_mps:.2g} m/s",
         "it is no truth of this motion, or was frozen: leave it out, for errors and consistency against it say nothing",
+    )
+
+
+def _looking_one_way(truth: Truth, both: "_Windows") -> Symptom | None:
+    """Tell of a truth whose orientations are all one, as where none was written, in windows in which the camera turns.
+
+    A truth that was measured repeats no orientation exactly, so that noise of the camera alone has to be less.
+    """
+    turns_rad = np.linalg.norm(both.turned_rad[0], axis=1)
+    turns = turns_rad > LEAST_TURNED_RAD
+    if np.ptp(truth.T_world_imu[:, :3, :3], axis=0).max() > 0.0 or turns.sum() < LEAST_WINDOWS:
+        return None
+    return _symptom(
+        f"all orientations of the truth are one, and in {turns.sum()} of {turns.size} windows of {WINDOW_S:g} s the "
+        f"camera turns by {float(np.median(turns_rad[turns])):.2g} rad (median)",
+        "write the orientations, or leave the truth out: errors of orientation and NEES against it say nothing",
     )
 
 
@@ -165,22 +206,13 @@ def _apart(both: "_Windows") -> float:
     return float(np.sqrt(sum(squared)))
 
 
-def _by_another_clock(evidence: Evidence, truth: Truth) -> Symptom | None:
-    """Tell of a truth that turns as the camera does at other times: its rates take the place of the gyro's."""
-    sequence, camera = evidence.sequence, evidence.camera_motion
-    step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
-    in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
-    if sequence.motion_kind == "none" or not in_order:
+def _by_another_clock(evidence: Evidence) -> Symptom | None:
+    """Tell of a truth that turns as the camera does at other times, unless by a clock of another pace."""
+    clock = evidence.truth_clock
+    if clock is None or clock.offset is None or clock.runs_otherwise:
         return None
-    R_world_imu = truth.T_world_imu[:, :3, :3]
-    w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
-    middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
-    turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
-    as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
-    rows = np.flatnonzero(camera.known)
-    seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
-    found = camera_offset(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
-    if found is None or abs(found.value) < max(LEAST_OFFSET_S, OFFSET_SIGMAS * found.error):
+    found = clock.offset
+    if abs(found.value) < max(LEAST_OFFSET_S, OFFSET_SIGMAS * found.error):
         return None
     return _symptom(
         f"the camera turns as the truth does when the truth's stamps are shifted by {-1e3 * found.value:.0f} +- "
@@ -254,6 +286,12 @@ def _compared(each: Array) -> _Compared:
 def _off(both: Array) -> _Compared:
     """Return the share by which the two of (2, M, 3) differ, of the larger."""
     return _compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
+
+
+def _longer(seen: Array, true: Array) -> tuple[_Compared, bool]:
+    """Return the ratio of displacements (M, 3) along the true ones, and whether it is all by which they differ."""
+    scale = _ratio(seen, true)
+    return scale, scale.value > 0.0 and _off(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
 
 
 def _ratio(seen: Array, true: Array) -> _Compared:

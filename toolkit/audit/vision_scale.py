@@ -3,14 +3,24 @@
 A share of the depths scales every step of the camera. Odometry shows it in velocities, an IMU in accelerations.
 """
 
+import numpy as np
+
 from toolkit.audit.disagreement import MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
+from toolkit.audit.parts.bundle import BASELINE
+from toolkit.audit.parts.calibration_limits import hidden_baseline
 
 # A scale counts that is no chance, beyond what sound recordings at hand have: 0.044 +- 0.007 beside the odometry of
 # cars, 0.028 +- 0.006 beside an IMU. Chosen with them in view.
 SYSTEMATIC = {"twist": 0.03, "imu": 0.025}
 # A scale that is known worse than this is not judged; where a fault must be larger than that to show, it is said.
 LARGEST_ERROR, LARGEST_HIDDEN = 0.02, 0.08
+# Beside odometry a difference is told from chance on (`steady_difference`); where that is more, it is said: 2 % of all
+# disparities make runs on `drive` six times as wrong.
+LARGEST_CHANCE = 0.02
+# Beside an IMU nothing else holds the scale for as long as its noise hides it: a fault of it is as good as all of the
+# drift of a stereo system with an IMU, about a percent of the way.
+LARGEST_HIDDEN_BESIDE_IMU = 0.01
 
 
 def check(evidence: Evidence) -> Symptom | Undecided | None:
@@ -18,18 +28,13 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     if evidence.intervals is None:
         return evidence.blind
     kind, found = evidence.sequence.motion_kind, evidence.alignment
-    if found is None or found.scale.error > LARGEST_ERROR:
-        known = "unknown"
-        if found is not None:
-            least = SYSTEMATIC[kind] + found.scale_by_chance
-            known = f"known to {100.0 * found.scale.error:.0f} %, a fault of less than {100.0 * least:.0f} % would hide"
-        return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
+    known = found is not None and found.scale.error <= LARGEST_ERROR
+    least = np.inf if found is None else SYSTEMATIC[kind] + found.scale_by_chance
+    if found is None or not known or abs(found.scale.value) < least:
+        return _unseen(evidence, least if known else np.inf)
     scale, error = found.scale
-    least = SYSTEMATIC[kind] + found.scale_by_chance
     if kind == "twist" and not 1.0 / MOST_RATIO < 1.0 + scale < MOST_RATIO:
         return None  # a disagreement, and told as such
-    if abs(scale) < least:
-        return _hidden(scale, error, least + abs(scale))
     measured, causes = ("odometry's", ", or wheels: check K, the baseline and the unit of the samples")
     if kind == "imu":
         measured, causes = "IMU's", ": check K and the baseline"
@@ -43,12 +48,41 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     )
 
 
-def _hidden(scale: float, error: float, hidden: float) -> Undecided | None:
-    """Say how large a fault the scale may hide that is found, where that is much."""
-    if hidden < LARGEST_HIDDEN:
-        return None
+def _unseen(evidence: Evidence, least: float) -> Undecided | None:
+    """Say how large a scale must be to be told, where that is much: by this, or by points that are followed for longer.
+
+    ``least`` is from where on the regression's scale counts, infinite where it is not judged.
+    """
+    found, fitted = evidence.alignment, evidence.self_calibration
+    if fitted is not None:
+        hidden = hidden_baseline(fitted, "imu")
+        if hidden < LARGEST_HIDDEN_BESIDE_IMU:
+            return None
+        factor = float(np.exp(fitted.value[BASELINE]))
+        seen = (
+            f"tracks and IMU fit a baseline {factor:.3f} +- {factor * fitted.error[BASELINE]:.3f} times the given one"
+        )
+        return Undecided(f"too little change of velocity: {seen}, and less than {100.0 * hidden:.1f} % would not show")
+    if found is None:
+        return Undecided("too little change of velocity: the scale of vision against the samples is unknown")
+    scale, error = found.scale
+    if not np.isfinite(least):
+        share = 100.0 * (SYSTEMATIC[evidence.sequence.motion_kind] + found.scale_by_chance)
+        known = f"known to {100.0 * error:.0f} %, a fault of less than {share:.0f} % would hide"
+        return Undecided(f"too little change of velocity: the scale of vision against the samples is {known}")
+    if least + abs(scale) < LARGEST_HIDDEN:
+        return _unseen_at_all(scale, error, found.scale_by_chance + abs(scale))
     known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %"
+    hidden = least + abs(scale)
     return Undecided(f"{known}, as in sound recordings: a fault of less than {100.0 * hidden:.0f} % would not show")
+
+
+def _unseen_at_all(scale: float, error: float, hidden: float) -> Undecided | None:
+    """Say from where on beside odometry not even a steady difference is told, where that is much."""
+    if hidden < LARGEST_CHANCE:
+        return None
+    known = f"vision's steps are off by {100.0 * scale:+.1f} +- {100.0 * error:.1f} %, as by chance"
+    return Undecided(f"{known}: a scale that is off by less than {100.0 * hidden:.1f} % would not show")
 
 
 FAULT = Fault(

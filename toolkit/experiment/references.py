@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from toolkit.audit.truth_mismatch import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     backwards,
@@ -19,7 +20,7 @@ from toolkit.errors import DataError
 from toolkit.estimate import Landmarks, Output, Run, Trajectory
 from toolkit.experiment.comparison import plain_name
 from toolkit.metrics.parts.association import associate, median_period_ns, poses_at
-from toolkit.sequence import Sequence
+from toolkit.sequence import Sequence, Truth
 
 _OTHER_TERMS = (
     "its start, its noise and its cost are its own, and it may have seen the tracks that are withheld from the others"
@@ -64,9 +65,18 @@ def _external(name: str, poses: PosesFile, recording: Sequence, sequence: Sequen
     if recording.truth is not None:
         matched = associate(trajectory, recording.truth, median_period_ns(recording.frames_t_ns))
         check_axes(what, matched.truth, matched.estimate)
-    return _run(
-        name, trajectory, sequence, "final", f"read from {what} ({poses.format}, {len(poses)} poses)", _AS_FINAL
-    )
+    remarks = [] if recording.truth is not None else _of_another_scale(trajectory, sequence)
+    read = f"read from {what} ({poses.format}, {len(poses)} poses)"
+    return _run(name, trajectory, sequence, "final", read, *remarks, _AS_FINAL)
+
+
+def _of_another_scale(trajectory: Trajectory, sequence: Sequence) -> list[str]:
+    """Remark on steps that are longer or shorter than those that the stereo tracks alone show, where no truth tells."""
+    found = steps_beside_camera(sequence, Truth(trajectory.t_ns, trajectory.T_world_imu))
+    if found is None:
+        return []
+    times = f"{found.value:.3f} +- {found.error:.3f} times as long as those of the camera by its stereo tracks"
+    return [f"its steps are {times}: another unit or scale, or a baseline or a focal length that is off"]
 
 
 def _stamped(poses: PosesFile, recording: Sequence, sequence: Sequence) -> Trajectory:

@@ -13,10 +13,16 @@ from typing import Any
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.geometry import Array, BoolArray, IntArray, se3, se3_inverse, so3_exp
+from toolkit.geometry import Array, BoolArray, se3, se3_inverse, so3_exp
 from toolkit.models.stereo import project, triangulate
-from toolkit.sequence import Observations, Sequence
-from toolkit.simulation.spans import ns, span_s
+from toolkit.sequence import Observations, Sequence, Truth
+from toolkit.simulation.clock_faults import alternate_frames_late as alternate_frames_late  # noqa: PLC0414 - injectors
+from toolkit.simulation.clock_faults import camera_clock as camera_clock  # noqa: PLC0414 - like those below
+from toolkit.simulation.clock_faults import camera_clock_drift as camera_clock_drift  # noqa: PLC0414
+from toolkit.simulation.clock_faults import camera_clock_step as camera_clock_step  # noqa: PLC0414
+from toolkit.simulation.clock_faults import clock_jump as clock_jump  # noqa: PLC0414
+from toolkit.simulation.clock_faults import frame_jitter as frame_jitter  # noqa: PLC0414
+from toolkit.simulation.spans import span_s
 from toolkit.simulation.standstill import standstill as standstill  # noqa: PLC0414 - an injector like those below
 
 Fault = Callable[[Sequence, float, int], Sequence]
@@ -228,6 +234,18 @@ def angular_unit(sequence: Sequence, dose: float = 180.0 / np.pi, seed: int = 0)
     return _with_values(sequence, sequence.motion.values * np.repeat([1.0, dose], 3))
 
 
+def gyro_axis_scale(sequence: Sequence, dose: float = 0.9, seed: int = 0) -> Sequence:
+    """Multiply the rates about the axis that turns most by the dose: a channel of another sensitivity."""
+    scale = np.ones(6)
+    scale[3 + int(np.argmax(np.std(sequence.motion.values[:, 3:], axis=0)))] = dose
+    return _with_values(sequence, sequence.motion.values * scale)
+
+
+def coarse_samples(sequence: Sequence, dose: float = 0.1, seed: int = 0) -> Sequence:
+    """Round motion samples to multiples of the dose: a converter of few bits, a log of few digits."""
+    return _with_values(sequence, dose * np.round(sequence.motion.values / dose))
+
+
 def gyro_bias(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
     """Add a constant of the dose (rad/s), in a direction drawn, to every angular velocity: a warm gyro."""
     axis = np.random.default_rng(seed).standard_normal(3)
@@ -241,39 +259,7 @@ def wrong_noise(sequence: Sequence, dose: float = 2.0, seed: int = 0) -> Sequenc
     return replace(sequence, rig=rig, noise=sequence.noise.scaled(dose))
 
 
-# The clocks ---------------------------------------------------------------------------------------------------------
-
-
-def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
-    """Stamp frames so many seconds late: exposure and transfer not accounted for, a clock set by hand.
-
-    Frames that leave the time of the motion samples are cut off. The truth stays on the motion's clock.
-    """
-    return _with_frames_at(sequence, sequence.frames_t_ns + ns(dose))
-
-
-def camera_clock_step(sequence: Sequence, dose: float = 0.05, seed: int = 0) -> Sequence:
-    """Stamp the frames of the second half so many seconds late: the camera's clock alone is set on the way."""
-    later = np.arange(sequence.frame_count) >= sequence.frame_count // 2
-    return _with_frames_at(sequence, sequence.frames_t_ns + np.where(later, ns(dose), 0))
-
-
-def camera_clock_drift(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:
-    """Let the camera's clock run fast by a share of the time: a cheap quartz, frames counted and not stamped."""
-    since_ns = sequence.frames_t_ns - sequence.frames_t_ns[0]
-    return _with_frames_at(sequence, sequence.frames_t_ns + np.rint(dose * since_ns).astype(np.int64))
-
-
-def clock_jump(sequence: Sequence, dose: float = -0.5, seed: int = 0) -> Sequence:
-    """Let frames and samples be stamped on by a clock that has jumped so many seconds: a daemon sets the time."""
-    at_ns = sequence.frames_t_ns[0] + ns(span_s(sequence, 0.0, seed)[0])
-    motion, frames_t_ns = sequence.motion, sequence.frames_t_ns
-    frames_t_ns = frames_t_ns + np.where(frames_t_ns > at_ns, ns(dose), 0)
-    samples_t_ns = motion.t_ns + np.where(motion.t_ns > at_ns, ns(dose), 0)
-    return replace(sequence, frames_t_ns=frames_t_ns, motion=replace(motion, t_ns=samples_t_ns))
-
-
-# The calibration and the truth --------------------------------------------------------------------------------------
+# The calibration and the truth; clocks are in ``clock_faults`` --------------------------------------------------------
 
 
 def zero_intrinsics(sequence: Sequence, dose: float = 0.0, seed: int = 0) -> Sequence:
@@ -352,12 +338,30 @@ def displaced_camera(sequence: Sequence, dose: float = 0.3, seed: int = 0) -> Se
 
 def truth_unit(sequence: Sequence, dose: float = 1000.0, seed: int = 0) -> Sequence:
     """Multiply the true positions and velocities by the dose: 1000 for millimetres."""
-    truth = sequence.truth
-    if truth is None:
-        raise DataError(f"{sequence.name}: no truth, whose unit could be wrong")
+    truth = _truth_of(sequence)
     T_world_imu = se3(truth.T_world_imu[:, :3, :3], dose * truth.T_world_imu[:, :3, 3])
     v_world = None if truth.v_world is None else dose * truth.v_world
     return replace(sequence, truth=replace(truth, T_world_imu=T_world_imu, v_world=v_world))
+
+
+def truth_clock_rate(sequence: Sequence, dose: float = 1.03, seed: int = 0) -> Sequence:
+    """Multiply the time of the truth, from its first pose on, by the dose: a quartz of another temperature."""
+    truth = _truth_of(sequence)
+    since_ns = np.rint(dose * (truth.t_ns - truth.t_ns[0])).astype(np.int64)
+    return replace(sequence, truth=replace(truth, t_ns=truth.t_ns[0] + since_ns))
+
+
+def unwritten_orientations(sequence: Sequence, dose: float = 1.0, seed: int = 0) -> Sequence:
+    """Write every true orientation as the identity: a file of positions alone. A dose of 0 leaves them."""
+    truth = _truth_of(sequence)
+    T_world_imu = se3(np.broadcast_to(np.eye(3), (len(truth.t_ns), 3, 3)), truth.T_world_imu[:, :3, 3])
+    return replace(sequence, truth=replace(truth, T_world_imu=T_world_imu)) if dose else sequence
+
+
+def _truth_of(sequence: Sequence) -> Truth:
+    if sequence.truth is None:
+        raise DataError(f"{sequence.name}: no truth, which could be wrong")
+    return sequence.truth
 
 
 def _struck_tracks(sequence: Sequence, share: float, seed: int) -> BoolArray:
@@ -378,22 +382,6 @@ def _with_values(sequence: Sequence, values: Array) -> Sequence:
 def _with_samples(sequence: Sequence, kept: BoolArray) -> Sequence:
     arrays: dict[str, Any] = {k: x[kept] for k, x in vars(sequence.motion).items() if isinstance(x, np.ndarray)}
     return replace(sequence, motion=replace(sequence.motion, **arrays))
-
-
-def _with_frames_at(sequence: Sequence, frames_t_ns: IntArray) -> Sequence:
-    """Return the sequence with other stamps of its frames (K,), without those outside the motion samples."""
-    moved, motion_t_ns = replace(sequence, frames_t_ns=frames_t_ns), sequence.motion.t_ns
-    inside = (frames_t_ns >= motion_t_ns[0]) & (frames_t_ns <= motion_t_ns[-1])
-    return moved if inside.all() else _with_first_frames_cut(moved, inside)
-
-
-def _with_first_frames_cut(sequence: Sequence, inside: BoolArray) -> Sequence:
-    """Return the sequence with the frames of a mask (K,) that is one stretch; the prior goes with the first one."""
-    seen, first = sequence.observations, int(np.argmax(inside))
-    rows = inside[seen.frame]
-    kept = Observations(seen.frame[rows] - first, seen.track_id[rows], seen.uv_px[rows])
-    prior = sequence.prior if first == 0 else None
-    return replace(sequence, frames_t_ns=sequence.frames_t_ns[inside], observations=kept, prior=prior)
 
 
 def _with_rig(sequence: Sequence, **fields: Any) -> Sequence:

@@ -1,0 +1,63 @@
+"""Stamps that come unevenly while the images do not: told, and never where images are lost or come unevenly."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from toolkit.audit import uneven_stamps
+from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.parts.subsets import keep_frames
+from toolkit.sequence import Sequence
+from toolkit.simulation import SCENARIOS, faults, simulate
+
+SCENARIOS_OF = ("drive", "drive-imu", "flight")
+
+
+def simulated(scenario: str, seed: int = 71) -> Sequence:
+    return simulate(replace(SCENARIOS[scenario], duration_s=10.0, varied=True), seed)
+
+
+def with_frames_lost(sequence: Sequence) -> Sequence:
+    lost = np.random.default_rng(5).uniform(size=sequence.frame_count) < 0.3
+    lost[[0, -1]] = False
+    return keep_frames(sequence, np.flatnonzero(~lost))
+
+
+@pytest.mark.parametrize("fault", [faults.alternate_frames_late, faults.frame_jitter])
+@pytest.mark.parametrize("scenario", SCENARIOS_OF)
+def test_stamps_that_the_cameras_motion_does_not_follow_are_told(scenario: str, fault: faults.Fault) -> None:
+    found = uneven_stamps.check(Evidence(fault(simulated(scenario), 0.015, 3)))
+    assert isinstance(found, Symptom) and found.warns
+    told = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+    assert told is not None
+    # None of it, and less: a stamp that is late lengthens one step and shortens the next by the same.
+    assert -0.5 < float(told[1]) < 0.1
+
+
+@pytest.mark.parametrize("seed", [71, 72, 73])
+@pytest.mark.parametrize("scenario", SCENARIOS_OF)
+def test_frames_that_are_lost_or_stamped_rightly_are_not_accused(scenario: str, seed: int) -> None:
+    sound = simulated(scenario, seed)
+    for sequence in (sound, with_frames_lost(sound), faults.camera_clock(sound, 0.03)):
+        assert uneven_stamps.check(Evidence(sequence)) is None
+
+
+def test_the_motion_follows_all_of_the_steps_where_stamps_are_right() -> None:
+    sound = with_frames_lost(simulated("flight"))
+    camera, step_s = Evidence(sound).camera_motion, np.diff(sound.frames_t_ns) / 1e9
+    rates = np.hstack([camera.v_mps, camera.w_radps])
+    followed = uneven_stamps._followed(rates, step_s, camera.known)
+    assert followed is not None
+    assert followed.value == pytest.approx(1.0, abs=4.0 * followed.error + 0.02)
+
+
+def test_a_vehicle_that_stands_tells_nothing() -> None:
+    standing = faults.frame_jitter(faults.standstill(simulated("drive"), 8.0, 1), 0.015, 3)
+    camera = Evidence(standing).camera_motion
+    still = np.linalg.norm(camera.v_mps, axis=1) < 0.05
+    step_s = np.diff(standing.frames_t_ns) / 1e9
+    rates = np.hstack([camera.v_mps, camera.w_radps])
+    followed = uneven_stamps._followed(rates, step_s, camera.known & still)
+    assert followed is None or followed.value + 5.0 * followed.error > 0.5

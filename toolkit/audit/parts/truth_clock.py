@@ -1,0 +1,204 @@
+"""The truth's clock beside the frames': how far its stamps are off, and how fast it runs.
+
+The truth turns as the camera does, at the same times if both are stamped by one clock. Its rates of rotation take the
+place of a gyro's; an offset is found as that of a gyro is (`rotation_offset`), a rate beside an offset by Gauss-Newton,
+from the middle of the recording outwards, for what lies far from it is displaced by more than it lasts. Source:
+Furgale, Rehder & Siegwart, "Unified temporal and spatial calibration for multi-sensor systems" (2013), section III.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, Integral, Intervals
+from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, Scalar, spread
+from toolkit.audit.parts.rotation_offset import MOST_UNEXPLAINED, SCATTER, camera_offset
+from toolkit.geometry import Array, IntArray, so3_log
+from toolkit.jackknife import jackknife_error
+from toolkit.models.camera_motion import CameraMotion
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, Truth
+
+# An offset counts beyond so many standard errors and so much (s), a rate where it makes as much at both ends. Sound
+# recordings have 9 +- 2 ms at most (0027), chosen with them in view.
+OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
+# The fit takes in these shares of the intervals about the middle, one after the other, with so many steps each.
+SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
+# As many intervals at least, of which the truth may not reach some.
+FEWEST = LEAST_INTERVALS + 10
+# The slope of the truth's rates is taken over this share of a step of the frames to either side.
+SLOPE_STEP = 0.1
+# A clock that is faster or slower by more is none; beyond, other stretches of a motion fit as well.
+MOST_RATE = 0.1
+
+
+class TruthClock(NamedTuple):
+    """How much later than by their stamps (s) the frames are by the truth's clock, and by what share faster that runs.
+
+    Each is None where nothing tells. ``half_s`` is half of the recording's duration.
+    """
+
+    offset: Scalar | None
+    rate: Scalar | None
+    half_s: float
+
+    @property
+    def runs_otherwise(self) -> bool:
+        """Whether the rate is no chance and parts the clocks."""
+        if self.rate is None:
+            return False
+        return abs(self.rate.value) * self.half_s > max(LEAST_OFFSET_S, OFFSET_SIGMAS * self.rate.error * self.half_s)
+
+    @property
+    def unseen_s(self) -> float:
+        """How far (s) the clocks may be apart somewhere without showing."""
+        if self.offset is None or self.rate is None:
+            return np.inf
+        return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
+
+
+class BesideTruth(NamedTuple):
+    """The camera's rates of rotation in the IMU's axes (M, 3) rad/s over M intervals, and the recording in which the
+    truth's rates stand for a gyro's."""
+
+    sequence: Sequence
+    seen: Intervals
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, sequence: Sequence, camera: CameraMotion, truth: Truth) -> Self | None:
+        """Put both side by side; None where there is no sequence of finite poses in the order of time."""
+        step_s = np.diff(truth.t_ns)[:, None] / NS_PER_S
+        in_order = truth.t_ns.size >= LEAST_INTERVALS and (step_s > 0.0).all() and np.isfinite(truth.T_world_imu).all()
+        if sequence.motion_kind == "none" or not in_order:
+            return None
+        R_world_imu = truth.T_world_imu[:, :3, :3]
+        w_radps = so3_log(R_world_imu[:-1].swapaxes(1, 2) @ R_world_imu[1:]) / step_s
+        middle_ns = truth.t_ns[:-1] + np.diff(truth.t_ns) // 2
+        turning = np.concatenate([np.zeros_like(w_radps), w_radps], axis=1)
+        rows = np.flatnonzero(camera.known)
+        seen = Intervals(rows, camera.w_radps[rows], None, camera.w_radps[rows], camera.v_mps[rows])
+        as_gyro = replace(sequence, motion=sequence.motion.of(middle_ns, turning))
+        return cls(as_gyro, seen, camera.w_radps[rows] @ sequence.rig.T_imu_cam[:3, :3].T)
+
+
+def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> TruthClock | None:
+    """Compare the clocks; None where the truth is no motion, or no other one was measured."""
+    beside = BesideTruth.of(sequence, camera, truth)
+    if beside is None:
+        return None
+    offset = camera_offset(beside.sequence, beside.seen, beside.w_imu_radps)
+    rate = rate_of_clock(beside, 0.0 if offset is None else offset.value)
+    return TruthClock(offset, rate, 0.5 * sequence.duration_s)
+
+
+def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
+    """Return by what share faster the truth's clock runs than the frames'; None where nothing tells.
+
+    ``offset_s`` is, nearly, how much later than by its stamp the middle frame is by the truth's clock. The standard
+    error is that of a jackknife over stretches of the recording.
+    """
+    clocks = _Clocks.of(beside)
+    try:
+        fitted = clocks.fitted(offset_s)
+        if fitted is None:
+            return None
+        found, at = fitted
+        return Scalar(float(found[1]), SCATTER * jackknife_error(_rate, *at))
+    except np.linalg.LinAlgError:  # the truth turns in one stretch at most
+        return None
+
+
+class _Linearised(NamedTuple):
+    """The camera's rates of rotation less the truth's (m, 3) rad/s, and its Jacobian by offset and rate (m, 3, 2)."""
+
+    unexplained: Array
+    jacobian: Array
+
+
+class _Clocks(NamedTuple):
+    """The integral of the truth's rates, stamps of the frames (K,), and what the camera sees of M intervals.
+
+    ``since_s`` (K,) is the time since the middle of the frames.
+    """
+
+    truth: Integral
+    frames_t_ns: IntArray
+    since_s: Array
+    interval: IntArray
+    w_imu_radps: Array
+
+    @classmethod
+    def of(cls, beside: BesideTruth) -> Self:
+        motion, t_ns = beside.sequence.motion, beside.sequence.frames_t_ns
+        since_s = (t_ns - t_ns[0]) / NS_PER_S
+        truth = Integral.of(motion.t_ns, motion.values[:, 3:])
+        return cls(truth, t_ns, since_s - 0.5 * since_s[-1], beside.seen.interval, beside.w_imu_radps)
+
+    @property
+    def step_s(self) -> float:
+        return float(np.median(np.diff(self.since_s)))
+
+    def rates(self, shift_s: Array) -> Array:
+        """Return the truth's mean rates (M, 3) over the intervals, whose frames are shifted (K,)."""
+        return self.truth.means(self.frames_t_ns + np.rint(shift_s * NS_PER_S).astype(np.int64))[self.interval]
+
+    def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
+        """Return the equations of those of the rows that the truth reaches, where these are enough.
+
+        A clock that is fast shows less turning in a second. That a focal length does as well; it counts for nothing.
+        """
+        shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
+        at_ns = self.frames_t_ns + shift_s * NS_PER_S
+        inside = (at_ns[self.interval] >= self.truth.t_ns[0]) & (at_ns[self.interval + 1] <= self.truth.t_ns[-1])
+        used = rows[inside[rows]]
+        if used.size < LEAST_INTERVALS:
+            return None
+        slope = (self.rates(shift_s + apart_s) - self.rates(shift_s - apart_s))[used] / (2.0 * apart_s)
+        middle_s = 0.5 * (self.since_s[:-1] + self.since_s[1:])[self.interval[used]]
+        unexplained = self.w_imu_radps[used] - (1.0 + found[1]) * self.rates(shift_s)[used]
+        return _Linearised(unexplained, np.stack([slope, middle_s[:, None] * slope], axis=2))
+
+    def fitted(self, offset_s: float) -> tuple[Array, "_Linearised"] | None:
+        """Return offset and rate (2,) and the equations there; None where they do not fit what the camera sees."""
+        found, count, at = np.array([offset_s, 0.0]), self.interval.size, None
+        for share, steps in zip(SHARES, STEPS, strict=True):
+            aside = min(round(0.5 * (1.0 - share) * count), max(count - FEWEST, 0) // 2)
+            rows = np.arange(aside, count - aside)
+            for _ in range(steps):
+                at = self.linearised(found, rows)
+                if at is None:
+                    return None
+                found = found + _solved(*at)
+                found[1] = np.clip(found[1], -MOST_RATE, MOST_RATE)
+        is_one = at is not None and abs(found[1]) < MOST_RATE and self.fits(found, offset_s)
+        return (found, at) if at is not None and is_one else None
+
+    def fits(self, found: Array, offset_s: float) -> bool:
+        """Say whether the rate explains what the offset alone does not, where it displaces the ends by a step.
+
+        By less other turns do not fit by chance.
+        """
+        if abs(found[1]) * self.since_s[-1] < self.step_s:
+            return True
+        rows = np.arange(self.interval.size)
+        both = [self.linearised(one, rows) for one in (found, np.array([offset_s, 0.0]))]
+        with_rate, without = (np.inf if at is None else float(np.sum(spread(at.unexplained) ** 2)) for at in both)
+        return with_rate < MOST_UNEXPLAINED * without
+
+
+def _solved(unexplained: Array, jacobian: Array) -> Array:
+    """Return offset and rate (2,) by least squares with Cauchy weights; raises LinAlgError where nothing turns."""
+    scale = np.maximum(spread(unexplained), 1e-9)
+    x, y = (jacobian / scale[:, None]).reshape(-1, 2), (unexplained / scale).ravel()
+    weight = np.ones(y.size)
+    for _ in range(ITERATIONS):
+        weighted = x.T * weight
+        found = np.linalg.solve(weighted @ x, weighted @ y)
+        weight = 1.0 / (1.0 + (y - x @ found) ** 2 / CAUCHY_SIGMAS**2)
+    return np.asarray(found)
+
+
+def _rate(unexplained: Array, jacobian: Array) -> float:
+    return float(_solved(unexplained, jacobian)[1])
