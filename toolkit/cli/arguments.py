@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
 from toolkit.errors import VislamError, did_you_mean, no_such, one_line
+from toolkit.threads import MOST_WORKERS
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
     from toolkit.experiment.recording import Recording
     from toolkit.settings import Settings
-
-# Each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
-MOST_WORKERS = 1024
 
 _EXIT_STATUSES = """\
 exit status:

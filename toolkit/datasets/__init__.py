@@ -162,7 +162,7 @@ def built_in_names() -> tuple[str, ...]:
 
 
 def load_sequence(
-    source: str, seed: int = 0, frontend: Frontend = DEFAULTS.frontend, progress: Progress = SILENT
+    source: str | Path, seed: int = 0, frontend: Frontend = DEFAULTS.frontend, progress: Progress = SILENT
 ) -> Sequence:
     """Load a built-in sequence by its name, made with the seed, or a recording by its path.
 
@@ -170,6 +170,11 @@ def load_sequence(
     says whether and how tracks are made of images. Raises DataError where the source is neither, no format recognises
     it, or it cannot be read.
     """
+    if not isinstance(source, str | Path):
+        raise DataError(f"a SEQUENCE is a path or a built-in name, not {source!r}")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise DataError(f"{source}: seed is {seed!r}, expected a whole number from 0 on")
+    source = str(source)
     if source in built_ins():
         check_built_in(source, frontend)
         return built_ins()[source](seed)

@@ -101,6 +101,12 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
         if key not in hints:
             keys = [described.key for described in describe()]
             known = [*keys, *{section.partition(".")[0] for section in keys}, "estimators"]
+            section, _, name = key.partition(".")
+            if f"{prefix}{key}" in keys and name:
+                raise SettingsError(
+                    f"{place}: {key!r} is one key here; write {{{section!r}: {{{name!r}: ...}}}}, or in TOML {key} "
+                    "without quotes"
+                )
             raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
