@@ -82,10 +82,7 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         own=_own_beside(named, own),
         settings=_with_seeds(settings, None if seed is None else _whole("seed", seed), seeds),
         truth=None if truth is None else _path("truth", truth),
-        trajectories={
-            name: _path(f"trajectories[{name!r}]", file)
-            for name, file in _by_name("trajectories", trajectories).items()
-        },
+        trajectories=_paths("trajectories", trajectories),
         keep=frozenset(_names("keep", keep)),
         max_frames=None if max_frames is None else _whole("max_frames", max_frames),
         part=Part(_number("from_s", from_s), None if to_s is None else _number("to_s", to_s), _whole("every", every)),
@@ -161,6 +158,10 @@ def _path(what: str, given: str | Path) -> Path:
     if isinstance(given, str | Path):
         return Path(given)
     raise SettingsError(f"{what} is {_kind(given)}; give a path")
+
+
+def _paths(what: str, given: Mapping[str, str | Path] | None) -> dict[str, Path]:
+    return {name: _path(f"{what}[{name!r}]", file) for name, file in _by_name(what, given).items()}
 
 
 def _kind(value: object) -> str:
