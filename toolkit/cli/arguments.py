@@ -32,7 +32,8 @@ exit status:
   3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
-  70   a defect of vislam itself; VISLAM_TRACEBACK=1 shows where
+  70   a defect of vislam itself, or of a package that adds to it, which the
+       message names; VISLAM_TRACEBACK=1 shows where
   71   the system's means do not suffice: memory, processes, a cluster, an
        encoding
   130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,

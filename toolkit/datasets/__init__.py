@@ -189,6 +189,9 @@ def load_sequence(
             sequence = reader.load_with_seed(path, seed)
         else:
             sequence = reader.load(path)
+        if not isinstance(sequence, Sequence):
+            file, given = getattr(reader, "__file__", reader), type(sequence).__name__
+            raise DataError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
         check_stated(sequence)
     return sequence
 
