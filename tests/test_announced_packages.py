@@ -196,3 +196,26 @@ def test_a_defect_that_comes_back_from_another_process_keeps_its_place(announce:
     error.__cause__ = RuntimeError(f'\n"""\nTraceback (most recent call last):\n  File "{file}", line 7, in load\n"""')
     assert discovery.line_of_another_package(error) == f"{file}, line 7"
     assert discovery.line_of_another_package(ValueError("boom")) == ""
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ("replace(drawn, name=3)", "a recording: its name is of type int, expected str"),
+        ("replace(drawn, observations=None)", "drive: its observations is of type NoneType, expected Observations"),
+        ("replace(drawn, provenance='x')", "drive: its provenance is of type str"),
+        (
+            "replace(drawn, rig=replace(drawn.rig, fx_px=None))",
+            "drive: its rig.fx_px is of type NoneType, expected Real",
+        ),
+        ("replace(drawn, motion=replace(drawn.motion, v_mps=drawn.motion.v_mps[1:]))", "motion.v_mps has 10 rows, and"),
+        ("replace(drawn, frames_t_ns=drawn.frames_t_ns[:3])", "is of frame 3, there are 3"),
+    ],
+)
+def test_a_part_of_a_sequence_that_is_none_is_named(announce: Announce, tmp_path: Path, answer: str, why: str) -> None:
+    drawn = "drawn = simulate(replace(DRIVE, duration_s=1.0), 0)\n    return "
+    text = DATASET[: DATASET.index("return replace(")] + drawn + answer + "\n"
+    announce("toolkit.datasets", {"theirs.py": text})
+    (tmp_path / "some.file").write_text("theirs")
+    with pytest.raises(DataError, match=re.escape(why)):
+        datasets.load_sequence(str(tmp_path / "some.file"))
