@@ -8,7 +8,6 @@ from all of them and serves the held-out reprojection error.
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from numbers import Real
 from typing import Self
 
 import numpy as np
@@ -375,7 +374,6 @@ def why_not_sightings(sequence: Sequence) -> str:
 
 def check_stated(sequence: Sequence) -> None:
     """Raise DataError, which names the field, where a noise, a calibration or a name can be none."""
-    _check_types(sequence)
     if len(sequence.name) > LONGEST_NAME:
         raise DataError(f"a name of {len(sequence.name)} characters is too long for a recording; shorten it")
     rig = sequence.rig
@@ -392,22 +390,3 @@ def check_stated(sequence: Sequence) -> None:
             raise DataError(f"{sequence.name}: {key} is not finite; a calibration needs every value")
     if not (np.isfinite(rig.cov_uv_px2).all() and (np.linalg.eigvalsh(rig.cov_uv_px2) > 0.0).all()):
         raise DataError(f"{sequence.name}: rig.cov_uv_px2 is no covariance: its noise must be positive in every axis")
-
-
-def _check_types(sequence: Sequence) -> None:
-    """Raise DataError where a part is of another type, or a table of another length, than whoever loads one returns."""
-    whose = sequence.name if isinstance(sequence.name, str) else "a recording"
-    parts = {"name": str, "rig": StereoRig, "observations": Observations, "provenance": Provenance}
-    found = {part: (getattr(sequence, part), kind) for part, kind in parts.items()}
-    if isinstance(sequence.rig, StereoRig):
-        of_rig = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")
-        found |= {f"rig.{part}": (getattr(sequence.rig, part), Real) for part in of_rig}
-    for part, (value, kind) in found.items():
-        if not isinstance(value, kind):
-            raise DataError(f"{whose}: its {part} is of type {type(value).__name__}, expected {kind.__name__}")
-    for vector in getattr(sequence.motion, "VECTORS", ()):
-        if len(getattr(sequence.motion, vector)) != sequence.motion.t_ns.size:
-            rows, stamps = len(getattr(sequence.motion, vector)), sequence.motion.t_ns.size
-            raise DataError(f"{whose}: motion.{vector} has {rows} rows, and there are {stamps} stamps")
-    if why := why_not_sightings(sequence):
-        raise DataError(f"{whose}: {why}")

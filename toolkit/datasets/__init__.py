@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
+from toolkit.datasets.io.returned import check_types
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
@@ -192,6 +193,7 @@ def load_sequence(
         if not isinstance(sequence, Sequence):
             file, given = getattr(reader, "__file__", reader), type(sequence).__name__
             raise DataError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
+        check_types(sequence)
         check_stated(sequence)
     return sequence
 

@@ -32,8 +32,19 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
         return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
         # In TOML and on the command line no value is called none.
-        what = readable(error, values, Settings).replace(" or null", " or none")
-        raise SettingsError(f"{place}: {what}") from error
+        what = readable(error, values, Settings).replace(" or null", " or none").replace("object", "a section of keys")
+        given_text = _given(what.partition(":")[0], values) if what.endswith("got string") else ""
+        raise SettingsError(f"{place}: {what}{given_text}") from error
+
+
+def _given(key: str, values: Mapping[str, Any]) -> str:
+    """Return a text that stands where another type is expected, and the unit in which a number is."""
+    section, _, name = key.rpartition(".")
+    text = values.get(section, {}).get(name) if section else values.get(name)
+    if not isinstance(text, str):
+        return ""
+    unit = next((described.unit for described in describe() if described.key == key), "")
+    return f" {text!r}" + (f"; it is a number, in {unit}" if unit else "")
 
 
 def _with_none(given: Mapping[str, Any], record: type[Struct]) -> dict[str, Any]:
@@ -149,6 +160,8 @@ def _one(key: str, hint: Any, default: Any) -> Described:
 
 
 def _shown(default: Any) -> str:
+    if isinstance(default, bool):  # as TOML writes it
+        return str(default).lower()
     return f"{default:.4g}" if isinstance(default, float) else str(default)
 
 
