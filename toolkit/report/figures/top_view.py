@@ -302,8 +302,11 @@ def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
     place = (float(low[0]), float(low[1]), 2.0 * half, 2.0 * half)
     square = axes.indicate_inset(place, under, edgecolor=MUTED_COLOUR, alpha=1.0, linewidth=0.8, zorder=5)
     assert square.connectors is not None, "the panel is given"
-    for line, facing in zip(square.connectors, _corners_facing(axes, under), strict=True):
-        line.set_visible(facing)
+    facing = _corners_facing(axes, under)
+    for line, shown in zip(square.connectors, facing, strict=True):
+        line.set_visible(shown)
+    if facing[0]:  # the map is on the left, and so would be the numbers, under the lines
+        under.yaxis.tick_right()
     # Drawn before the map, for its place is known then alone, and the lines end at its corners.
     under.set_zorder(axes.get_zorder() - 1)
 
