@@ -194,6 +194,12 @@ def test_figures_come_by_name(result: Result, over: Result) -> None:
         result.figures["top_batch"]
 
 
+def test_the_band_of_errors_over_seeds_is_named(over: Result) -> None:
+    figure = over.figures["errors_over_seeds"]
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+    assert "quartiles (lines: medians)" in [text.get_text() for legend in legends for text in legend.get_texts()]
+
+
 def test_a_figure_is_drawn_without_those_that_come_after_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     def two(_: Comparison) -> Iterator[NamedFigure]:
         yield NamedFigure("top_all", "From above.", Figure())
