@@ -1,14 +1,19 @@
 """Metrics and datasets of another distribution are found where it announces its packages, with no list of names."""
 
+import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from toolkit import datasets, discovery, metrics
-from toolkit.errors import DataError, VislamError
+from filters import dead_reckoning
+from toolkit import datasets, discovery, metrics, runner
+from toolkit.cli import main
+from toolkit.errors import DataError, ExtensionError, VislamError
+from toolkit.simulation import DRIVE, simulate
 
 METRIC = """'''A metric of another project.'''
 
@@ -128,3 +133,89 @@ def test_two_datasets_cannot_share_a_name(announce: Announce) -> None:
     announce(datasets.ENTRY_POINT_GROUP, {"course_npz.py": DATASET})
     with pytest.raises(DataError, match="two dataset modules are called course-npz"):
         datasets.formats()
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (METRIC.replace("ORDER", "ORDR"), "answer.py: a metric file defines METRICS, a tuple of Metric records, ORDER"),
+        (METRIC.replace("True),)", "True))"), "a metric file defines METRICS, a tuple"),
+        (METRIC.replace("def score", "def scored"), "a metric file defines METRICS"),
+        (METRIC.replace("in_contract=True", 'best="bigger"'), "the metric answer has best='bigger'; it is one of"),
+        (METRIC.replace('("the", "answer")', '"answer"'), "the metric answer has heading='answer'; it is two lines"),
+    ],
+)
+def test_a_metric_file_that_is_none_is_named(announce: Announce, text: str, why: str) -> None:
+    announce("toolkit.metrics", {"answer.py": text})
+    with pytest.raises(ExtensionError, match=re.escape(why)):
+        metrics.known_metrics()
+
+
+@pytest.mark.parametrize("answer", ['Scores({"other": 1.0})', '{"answer": 1.0}', "None"])
+def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer: str) -> None:
+    announce("toolkit.metrics", {"answer.py": METRIC.replace('Scores({"answer": 42.0})', answer)})
+    sequence = simulate(replace(DRIVE, duration_s=0.5), 0)
+    assert sequence.prior is not None
+    run = runner.run("dead-reckoning", dead_reckoning.build, sequence, sequence.prior)
+    with pytest.raises(ExtensionError, match=r"answer\.py: score answers with Scores of \['answer'\], here with"):
+        metrics.score_run(run, "causal", sequence)
+
+
+def test_a_metric_that_is_unavailable_is_named_where_it_is_asked_for(announce: Announce) -> None:
+    announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
+    with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
+        metrics.metrics_called(["answer"])
+
+
+def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp_path: Path) -> None:
+    announce(
+        "toolkit.datasets",
+        {"theirs.py": DATASET.replace("return replace(", "return str(").replace(", name=", ") or (")},
+    )
+    (tmp_path / "some.file").write_text("theirs")
+    with pytest.raises(DataError, match=r"theirs\.py answered with a str; it returns a Sequence"):
+        datasets.load_sequence(str(tmp_path / "some.file"))
+
+
+def test_a_defect_of_another_package_is_not_blamed_on_vislam(
+    announce: Announce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = DATASET.replace("    from dataclasses", "    1 / 0\n    from dataclasses")
+    announce("toolkit.datasets", {"theirs.py": broken})
+    (tmp_path / "some.file").write_text("theirs")
+    assert main(["check-data", str(tmp_path / "some.file")]) == 70
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(r"a defect of \S+theirs\.py, line 9, which another package brings \(ZeroDivisionError", message)
+    assert "vislam itself" not in message
+
+
+def test_a_defect_that_comes_back_from_another_process_keeps_its_place(announce: Announce, tmp_path: Path) -> None:
+    announce("toolkit.datasets", {"theirs.py": DATASET})
+    file = tmp_path / "their_datasets" / "theirs.py"
+    error = ValueError("boom")
+    error.__cause__ = RuntimeError(f'\n"""\nTraceback (most recent call last):\n  File "{file}", line 7, in load\n"""')
+    assert discovery.line_of_another_package(error) == f"{file}, line 7"
+    assert discovery.line_of_another_package(ValueError("boom")) == ""
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        ("replace(drawn, name=3)", "a recording: its name is of type int, expected str"),
+        ("replace(drawn, observations=None)", "drive: its observations is of type NoneType, expected Observations"),
+        ("replace(drawn, provenance='x')", "drive: its provenance is of type str"),
+        (
+            "replace(drawn, rig=replace(drawn.rig, fx_px=None))",
+            "drive: its rig.fx_px is of type NoneType",
+        ),
+        ("replace(drawn, motion=replace(drawn.motion, v_mps=drawn.motion.v_mps[1:]))", "motion.v_mps has 10 rows, and"),
+        ("replace(drawn, frames_t_ns=drawn.frames_t_ns[:3])", "is of frame 3, there are 3"),
+    ],
+)
+def test_a_part_of_a_sequence_that_is_none_is_named(announce: Announce, tmp_path: Path, answer: str, why: str) -> None:
+    drawn = "drawn = simulate(replace(DRIVE, duration_s=1.0), 0)\n    return "
+    text = DATASET[: DATASET.index("return replace(")] + drawn + answer + "\n"
+    announce("toolkit.datasets", {"theirs.py": text})
+    (tmp_path / "some.file").write_text("theirs")
+    with pytest.raises(DataError, match=re.escape(why)):
+        datasets.load_sequence(str(tmp_path / "some.file"))

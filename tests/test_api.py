@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,6 +133,44 @@ def test_an_unknown_column_is_refused(result: Result) -> None:
         result.table("ate_se3")
 
 
+@pytest.mark.parametrize("column", [3, ["ATE SE(3)"], None])
+def test_a_column_is_a_name(result: Result, column: Any) -> None:
+    with pytest.raises(SettingsError, match=r"a column is .*; give names, as in table\('ATE SE\(3\)', 'nis_mean'\)"):
+        result.table(column)
+
+
+def test_mappings_of_a_result_are_looked_into_and_shown_like_any(result: Result) -> None:
+    assert ("batch", "final") not in result.metrics
+    assert result.metrics["ekf", "final"].get("ate_se3") is None
+    assert result.figures.get("top_batch") is None
+    assert repr(result.metrics["ekf", "final"]) == repr(dict(result.metrics["ekf", "final"]))
+    assert repr(result.figures).startswith("<figures: top_all, ")
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"), [({"figures": "some"}, "few, all, none"), ({"figure_format": "jpg"}, "png, pdf")]
+)
+def test_figures_that_there_are_not_are_refused_before_anything_is_written(
+    result: Result, tmp_path: Path, asked: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(SettingsError, match=rf"{next(iter(asked))} is '.*'; there are {why}"):
+        result.save(tmp_path / "run", **asked)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("source", "seed", "why"),
+    [
+        (3, 0, "a SEQUENCE is a path or a built-in name, not 3"),
+        ("drive", "a", "seed is 'a', expected a whole number"),
+        ("drive", -1, "seed is -1, expected a whole number"),
+    ],
+)
+def test_a_sequence_is_loaded_by_a_name_and_a_whole_number(source: Any, seed: Any, why: str) -> None:
+    with pytest.raises(DataError, match=why):
+        toolkit.load_sequence(source, seed=seed)
+
+
 def test_a_table_is_text_and_markdown(result: Result) -> None:
     shown = result.table("ATE SE(3)")
     assert " ATE SE(3) [m] |" in shown._repr_markdown_()
@@ -153,6 +192,12 @@ def test_figures_come_by_name(result: Result, over: Result) -> None:
     assert result.figures["top_all"] is result.figures["top_all"]
     with pytest.raises(VislamError, match=r"there is no figure 'top_batch'; there are top_all, .*top_ekf"):
         result.figures["top_batch"]
+
+
+def test_the_band_of_errors_over_seeds_is_named(over: Result) -> None:
+    figure = over.figures["errors_over_seeds"]
+    legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes if axes.get_legend())]
+    assert "quartiles (lines: medians)" in [text.get_text() for legend in legends for text in legend.get_texts()]
 
 
 def test_a_figure_is_drawn_without_those_that_come_after_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,8 +283,8 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"to_s": float("nan")}, "from 0 s to nan s"),
         ({"settings": "window"}, "settings is a str"),
         ({"estimators": []}, "nothing is to be compared"),
-        ({"estimators": [3]}, "estimators has a int, expected names"),
-        ({"estimators": 3}, "estimators has a int, expected names"),
+        ({"estimators": [3]}, "estimators has an int, expected names"),
+        ({"estimators": 3}, "estimators has an int, expected names"),
         ({"estimators": {"mine": find("ekf").load()}}, "functions build\\(setup\\) go by name into own"),
         ({"own": [find("ekf").load()]}, "own is a list; give a dict, by name"),
         ({"trajectories": "est.tum"}, "trajectories is a str; give a dict, by name"),
@@ -249,7 +294,19 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
         ({"from_s": "1"}, "from_s is '1', expected a number"),
         ({"to_s": None, "resume": "somewhere"}, "there is one seed: give seeds"),
         ({"own": {"ekf": print}}, "own has a function called ekf, and so has estimators"),
-        ({"source": None}, "source is a NoneType; give one recording"),
+        ({"source": None}, "source is None; give one recording"),
+        ({"workers": 10**9}, "workers is 1000000000; it is a number of processes, 1 to 1024"),
+        ({"max_frames": True}, "max_frames is True, expected a whole number"),
+        ({"seed": 1.0}, "seed is 1.0, expected a whole number"),
+        ({"truth": 3}, "truth is an int; give a path"),
+        ({"trajectories": {"theirs": 3}}, r"trajectories\['theirs'\] is an int; give a path"),
+        ({"trajectories": {3: "est.tum"}}, "trajectories has an int for a name, 3; give a text"),
+        ({"seeds": 2, "resume": 3}, "resume is an int; give a path"),
+        ({"own": {"mine": 3}}, "own has 'mine': an int; give functions"),
+        ({"own": {"": print}}, "own has '': a builtin_function_or_method; give functions build"),
+        ({"settings": {3: 4}}, "settings has an int for a key, 3; settings have names"),
+        ({"settings": {"window.lag_s": 3.0}}, r"write \{'window': \{'lag_s': ...\}\}, or in TOML window.lag_s without"),
+        ({"estimators": "dead-reckoning,ekf"}, r"several names as a list: \['dead-reckoning', 'ekf'\]"),
         ({"source": ["drive", "flight"]}, "source is a list; give one recording"),
     ],
 )

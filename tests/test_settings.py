@@ -37,7 +37,7 @@ def test_what_is_written_reads_back_as_the_same_settings() -> None:
         ({"nois": {}}, "there is no setting nois; did you mean noise?"),
         ({"window": {"lag_s": -1}}, "window.lag_s: expected number >= 0.001"),
         ({"window": {"lag_s": math.nan}}, "window.lag_s"),
-        ({"window": 3}, "window: expected object, got integer"),
+        ({"window": 3}, "window: expected a section of keys, got integer"),
         ({"start": "nowhere"}, "start: cannot be 'nowhere', only measurements, truth"),
         ({"noise": {"pixel_sigma_px": 1e-300}}, "noise.pixel_sigma_px: expected number >= 1e-06"),
         ({"noise": {"pixel_sigma_px": "much"}}, "noise.pixel_sigma_px: expected number or none, got string"),
@@ -101,3 +101,26 @@ def test_the_page_documents_every_setting_as_it_is() -> None:
     page = (Path(__file__).parents[1] / "docs/settings.md").read_text(encoding="utf-8")
     for one in describe():
         assert f"| `{one.key}` | {one.unit} | {one.default} | {one.range} | {one.meaning} |" in page
+
+
+@pytest.mark.parametrize(
+    ("assignment", "why"),
+    [
+        ("window.lag_s=3s", "window.lag_s: expected number or none, got string '3s'; it is a number, in s"),
+        ("tracks.budget=all", "tracks.budget: expected integer or none, got string 'all'"),
+        ("noise.bridge_gaps=yes", "noise.bridge_gaps: expected true or false, got string 'yes'"),
+        ("window=3", "window: expected a section of keys, got integer"),
+        ("start=thruth", "start: cannot be 'thruth', only measurements, truth"),
+    ],
+)
+def test_a_value_of_another_type_is_shown_with_the_unit_it_should_be_in(assignment: str, why: str) -> None:
+    with pytest.raises(SettingsError) as told:
+        settings_of(with_assignments({}, [assignment]), "the command line")
+    assert str(told.value) == f"the command line: {why}"
+
+
+def test_a_default_is_shown_as_it_can_be_written() -> None:
+    switches = {one.key: one.default for one in describe() if one.default in ("true", "false")}
+    assert {"noise.bridge_gaps", "metrics.bound"} <= switches.keys()
+    for key, default in switches.items():
+        assert settings_of(with_assignments({}, [f"{key}={default}"]), "here") == Settings()

@@ -3,8 +3,8 @@
 ``toolkit.compare("drive", ["ekf", "batch"])`` is the whole of it; what the package offers is imported when first used.
 
 Reading order: sequence (what comes in; its parts are measured_motion, resampling, track_noise, track_budget) ->
-estimator, estimate (what comes out) -> models -> filters/ekf -> filters/batch -> runner (one over the other, with
-divergence) -> metrics -> experiment -> report. docs/architecture.md has the picture.
+estimator, estimate, answers (what comes out) -> models -> filters/ekf -> filters/batch -> runner (one over the other,
+with divergence) -> metrics -> experiment -> report. docs/architecture.md has the picture.
 Before a run: datasets, frontend and simulation make a sequence, audit looks for its faults, track_errors for its noise,
 initialization for a first state. Beside it: gate, evaluation and verify judge; cli and api are what users call. Below
 all: settings, files, progress, discovery, compilation, arrays, jackknife, geometry, threads, errors.

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import numpy as np
 
@@ -80,9 +80,9 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
         sources=(_source(source),),
         estimators=named,
         own=_own_beside(named, own),
-        settings=_with_seeds(settings, seed, seeds),
-        truth=None if truth is None else Path(truth),
-        trajectories={name: Path(file) for name, file in _by_name("trajectories", trajectories).items()},
+        settings=_with_seeds(settings, None if seed is None else _whole("seed", seed), seeds),
+        truth=None if truth is None else _path("truth", truth),
+        trajectories=_paths("trajectories", trajectories),
         keep=frozenset(_names("keep", keep)),
         max_frames=None if max_frames is None else _whole("max_frames", max_frames),
         part=Part(_number("from_s", from_s), None if to_s is None else _number("to_s", to_s), _whole("every", every)),
@@ -91,11 +91,14 @@ def compare(  # noqa: PLR0913 - keyword arguments that all have a default
     )
     if resume is not None and plan.settings.seeds == 1:
         raise SettingsError("resume keeps the runs of a comparison over seeds, and there is one seed: give seeds")
-    return Result(run_plan(plan, silent, () if resume is None else (Path(resume),))[0])
+    return Result(run_plan(plan, silent, () if resume is None else (_path("resume", resume),))[0])
 
 
 def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapping[str, Build]:
     own = _by_name("own", given)
+    for name, build in own.items():
+        if not name or not callable(build):
+            raise SettingsError(f"own has {name!r}: {_kind(build)}; give functions build(setup), each by a name")
     both = sorted(set(named) & set(own))
     if both:
         raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
@@ -104,7 +107,7 @@ def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapp
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
     if not isinstance(settings, Settings | Mapping):
-        raise SettingsError(f"settings is a {type(settings).__name__}; give nested values, as {{'seeds': 3}}")
+        raise SettingsError(f"settings is {_kind(settings)}; give nested values, as {{'seeds': 3}}")
     values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
     given = {"first_seed": seed, "seeds": seeds}
     return settings_of(_plain(values | {key: value for key, value in given.items() if value is not None}), "settings")
@@ -112,6 +115,9 @@ def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds:
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested values with Python's numbers in the place of NumPy's."""
+    strange = [key for key in values if not isinstance(key, str)]
+    if strange:
+        raise SettingsError(f"settings has {_kind(strange[0])} for a key, {strange[0]!r}; settings have names")
     return {
         key: _plain(value) if isinstance(value, Mapping) else value.item() if isinstance(value, np.generic) else value
         for key, value in values.items()
@@ -121,26 +127,49 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 def _source(given: Source) -> str | Sequence:
     if isinstance(given, str | Path | Sequence):
         return given if isinstance(given, Sequence) else str(given)
-    raise SettingsError(f"source is a {type(given).__name__}; give one recording: a path, a built-in name, a Sequence")
+    raise SettingsError(f"source is {_kind(given)}; give one recording: a path, a built-in name, a Sequence")
 
 
 def _names(what: str, given: Names) -> tuple[str, ...]:
     if isinstance(given, str):
+        if "," in given:
+            raise SettingsError(f"{what} is {given!r}; give several names as a list: {given.split(',')}")
         return (given,)
     functions = isinstance(given, Mapping) and any(map(callable, given.values()))
     listed = isinstance(given, Iterable) and not functions
     names: tuple[Any, ...] = tuple(given) if listed else (given,)
-    strange = [type(one).__name__ for one in names if not isinstance(one, str)]
+    strange = [one for one in names if not isinstance(one, str)]
     if strange:
         otherwise = "; functions build(setup) go by name into own" if what == "estimators" else ""
-        raise SettingsError(f"{what} has a {strange[0]}, expected names{otherwise}")
+        raise SettingsError(f"{what} has {_kind(strange[0])}, expected names{otherwise}")
     return names
 
 
 def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named]:
-    if given is None or isinstance(given, Mapping):
-        return given or {}
-    raise SettingsError(f"{what} is a {type(given).__name__}; give a dict, by name")
+    if given is not None and not isinstance(given, Mapping):
+        raise SettingsError(f"{what} is {_kind(given)}; give a dict, by name")
+    strange = [name for name in given or {} if not isinstance(name, str)]
+    if strange:
+        raise SettingsError(f"{what} has {_kind(strange[0])} for a name, {strange[0]!r}; give a text")
+    return given or {}
+
+
+def _path(what: str, given: str | Path) -> Path:
+    if isinstance(given, str | Path):
+        return Path(given)
+    raise SettingsError(f"{what} is {_kind(given)}; give a path")
+
+
+def _paths(what: str, given: Mapping[str, str | Path] | None) -> dict[str, Path]:
+    return {name: _path(f"{what}[{name!r}]", file) for name, file in _by_name(what, given).items()}
+
+
+def _kind(value: object) -> str:
+    """Say of which type a value is, as in "an int" and "a list"."""
+    if value is None:
+        return "None"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeioAEIO' else 'a'} {name}"
 
 
 def _number(what: str, given: float) -> float:
@@ -151,10 +180,9 @@ def _number(what: str, given: float) -> float:
 
 
 def _whole(what: str, given: int) -> int:
-    try:
-        return operator.index(given)
-    except TypeError as error:
-        raise SettingsError(f"{what} is {given!r}, expected a whole number") from error
+    if isinstance(given, bool) or not hasattr(given, "__index__"):
+        raise SettingsError(f"{what} is {given!r}, expected a whole number")
+    return operator.index(given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -165,6 +193,9 @@ class Result:
 
     def table(self, *columns: str) -> "ShownTable":
         """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
+        strange = [column for column in columns if not isinstance(column, str)]
+        if strange:
+            raise SettingsError(f"a column is {_kind(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
         return ShownTable(comparison_table(self.comparison, requested_columns(columns)))
 
     @cached_property
@@ -194,11 +225,15 @@ class Result:
     ) -> Path:
         """Write the run directory that ``vislam compare`` writes, with "few", "all" or no ("none") figures.
 
-        Raises OutputError where it cannot be written.
+        Raises OutputError where it cannot be written, SettingsError where there are no such figures.
         """
+        from toolkit.report.figures import FigureChoice, FigureFormat
         from toolkit.report.run_directory import MadeBy, write_run
 
-        target = Path(directory)
+        for what, value, known in (("figures", figures, FigureChoice), ("figure_format", figure_format, FigureFormat)):
+            if value not in get_args(known):
+                raise SettingsError(f"{what} is {value!r}; there are {', '.join(get_args(known))}")
+        target = _path("directory", directory)
         requested = Configuration(Request(), self.comparison.settings)
         write_run(self.comparison, target, MadeBy("toolkit.compare", requested, figure_format, figures))
         return target
@@ -227,6 +262,12 @@ class ShownTable:
         return as_markdown(self.table)
 
 
+class _NotThereError(VislamError, KeyError):
+    """What a mapping of a result does not hold, with what it holds."""
+
+    __str__ = Exception.__str__  # a KeyError's would put it in quotes
+
+
 class _Values(Mapping[str, float | None]):
     """The metrics of one line by key."""
 
@@ -237,7 +278,7 @@ class _Values(Mapping[str, float | None]):
 
     def __getitem__(self, key: str) -> float | None:
         if key not in self._keys:
-            raise KeyError(f"no metric is called {key}{did_you_mean(key, list(self._keys))}")
+            raise _NotThereError(f"no metric is called {key}{did_you_mean(str(key), list(self._keys))}")
         return self._value_of(key)
 
     def __iter__(self) -> Iterator[str]:
@@ -245,6 +286,9 @@ class _Values(Mapping[str, float | None]):
 
     def __len__(self) -> int:
         return len(self._keys)
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
 
 
 class _Figures(Mapping[str, "Figure"]):
@@ -260,7 +304,7 @@ class _Figures(Mapping[str, "Figure"]):
         while name not in self._drawn and self._draw_next():
             pass
         if name not in self._drawn:
-            raise VislamError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
+            raise _NotThereError(f"there is no figure {name!r}; there are {', '.join(self._drawn)}")
         return self._drawn[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -273,6 +317,9 @@ class _Figures(Mapping[str, "Figure"]):
 
     def __contains__(self, name: object) -> bool:
         return name in list(iter(self))
+
+    def __repr__(self) -> str:
+        return f"<figures: {', '.join(self)}>"
 
     def _draw_next(self) -> bool:
         """Draw one more; return False where there is none."""
@@ -287,4 +334,4 @@ class _Metrics(dict[tuple[str, Output], Mapping[str, float | None]]):
     """Metrics by estimator and output; a line that is not there is answered with those that are."""
 
     def __missing__(self, key: object) -> Mapping[str, float | None]:
-        raise VislamError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")
+        raise _NotThereError(f"there is no {key!r}; there are {', '.join(map(repr, self))}")

@@ -9,7 +9,9 @@ import importlib
 import importlib.machinery
 import importlib.util
 import pkgutil
+import re
 import sys
+import traceback
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +21,10 @@ from pathlib import Path
 from types import ModuleType
 
 from toolkit.errors import VislamError
+
+GROUPS = ("toolkit.datasets", "toolkit.estimators", "toolkit.metrics")
+_OURS = ("toolkit", "filters")
+_PLACE = re.compile(r'^\W*File "(.+?)", line (\d+)', re.MULTILINE)
 
 
 def shown_name(module: str) -> str:
@@ -114,6 +120,21 @@ def announced(group: str, error: type[VislamError] = VislamError) -> list[FoundM
             raise error(f"the entry point {group} names {package}, which is not a package here")
         found += modules_in(package, spec.submodule_search_locations)
     return found
+
+
+def line_of_another_package(error: BaseException) -> str:
+    """Return file and line of the innermost code that an error came through in a package announced by others.
+
+    Errors of other processes are looked at by the traceback that they bring. It is empty where ours alone is in it.
+    """
+    announced_packages = {point.value for group in GROUPS for point in entry_points(group=group)}
+    folders: list[str] = []
+    for package in sorted(one for one in announced_packages if one.partition(".")[0] not in _OURS):
+        with suppress(Exception):  # one that cannot be found is told elsewhere
+            folders += ((spec := _spec(package)) and spec.submodule_search_locations) or ()
+    places = _PLACE.findall("".join(traceback.format_exception(error)))
+    inside = [f"{file}, line {line}" for file, line in places if any(Path(file).is_relative_to(one) for one in folders)]
+    return inside[-1] if inside else ""
 
 
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:

@@ -35,6 +35,12 @@ class EstimatorError(VislamError):
     exit_status = 5
 
 
+class ExtensionError(VislamError):
+    """A metric file, of another package or dropped in, that does not define or answer what such a file must."""
+
+    exit_status = 70
+
+
 class SystemLimitError(VislamError):
     """Something the system does not give: processes, open files, room for what they share."""
 

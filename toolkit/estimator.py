@@ -129,6 +129,10 @@ class EstimatorEntry:
         check_possible(settings.arithmetic)
         self._rules()
         self.load()
+        self.check_options(settings)
+
+    def check_options(self, settings: Settings) -> None:
+        """Raise EstimatorError unless the estimator names every option that is set for it."""
         for option in settings.options_of(self.name):
             if option not in self.options():
                 known = ", ".join(sorted(self.options())) or "none"
@@ -168,11 +172,15 @@ def defaults() -> tuple[str, ...]:
 
 
 def check_options(settings: Settings, own: Collection[str] = ()) -> None:
-    """Raise EstimatorError where an option is set for an estimator that there is not: none found, nor one's ``own``."""
-    known = {*discover(), *own} if settings.estimators else set()
+    """Raise EstimatorError where an option is set that no estimator has, be it found or one's ``own``, run or not."""
+    found = discover() if settings.estimators else {}
     for name in settings.estimators:
-        if name not in known:
-            raise EstimatorError(f"an option is set for {name}, and {no_such('estimator', name, sorted(known))}")
+        if name not in {*found, *own}:
+            raise EstimatorError(
+                f"an option is set for {name}, and {no_such('estimator', name, sorted({*found, *own}))}"
+            )
+        if name not in own:
+            found[name].check_options(settings)
 
 
 def find_all(names: Iterable[str]) -> dict[str, EstimatorEntry]:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from toolkit.answers import checked_estimate, checked_finish
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError
@@ -109,16 +110,17 @@ def _run(name: str, build: Build, sequence: Sequence, prior: Prior, progress: Pr
         estimator = build(setup)
         clock.leave_out(compilation)
         for packet in packets:
-            estimate = _timed_step(estimator, packet, clock)
+            estimate = checked_estimate(_timed_step(estimator, packet, clock), packet, online[-1] if online else None)
             if estimate is not None:
                 online.append(estimate)
             progress.advance(packet.index + 1, len(packets))
         began = time.perf_counter()
         finished = estimator.finish()
         clock.finish_s = time.perf_counter() - began
+        checked_finish(finished, sequence.frames_t_ns, bool(online))
     except (DataError, KeyboardInterrupt, MemoryError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if (interrupt := _interrupt_behind(error)) is not None:
             raise interrupt from None
         return replace(_failed(name, online, clock.timings(), error), arithmetic=compilation.ran)
@@ -140,7 +142,7 @@ def _timed_step(estimator: Estimator, packet: Packet, clock: _Clock) -> Estimate
     return estimate
 
 
-def _failed(name: str, online: list[Estimate], timings: Timings, error: Exception) -> Run:
+def _failed(name: str, online: list[Estimate], timings: Timings, error: BaseException) -> Run:
     why = str(error) if isinstance(error, EstimatorError) else f"{type(error).__name__}: {error}"
     log = [f"failed after {len(online)} estimates: {why}"]
     if not isinstance(error, EstimatorError):

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from toolkit import runner
+from toolkit.cli import parser
 from toolkit.cli.compare import SEQUENCES
 from toolkit.datasets import built_in_names
 from toolkit.estimator import defaults
@@ -209,3 +210,27 @@ def test_piped_output_is_never_wrapped_or_cut(
     assert columns == len(line.split())
     assert 3 + 10 < columns <= 3 + len(with_value) <= 3 + len(known_metrics())
     assert max(map(len, heads)) <= len(rule)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("3", 3.0), ("3s", 3.0), (" 500ms ", 0.5), ("2min", 120.0), ("1e-1s", 0.1)]
+)
+def test_every_option_in_seconds_reads_the_same_words(text: str, seconds: float) -> None:
+    options = parser().parse_args(["compare", "drive", "--window", text, "--from", text, "--to", text])
+    assert [options.window, options.from_s, options.to_s] == pytest.approx([seconds] * 3)
+    assert parser().parse_args(["simulate", "drive", "--out", "s", "--duration", text]).duration == pytest.approx(
+        seconds
+    )
+
+
+@pytest.mark.parametrize("text", ["3m", "s", "3 s s", "nan", "inf", "-1s", "0"])
+def test_what_is_no_duration_is_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parser().parse_args(["simulate", "drive", "--out", "s", f"--duration={text}"])
+    assert "argument --duration: expected seconds" in capsys.readouterr().err
+
+
+def test_a_second_file_of_settings_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parser().parse_args(["compare", "drive", "--config", "a.toml", "--config", "b.toml"])
+    assert "--config is there twice; it takes one file, and --set changes" in capsys.readouterr().err

@@ -229,7 +229,11 @@ def test_values_given_in_python_are_named_too(tmp_path: Path) -> None:
     for wrong, pattern in (
         ({"tracks": shorter}, "tracks: its columns differ in length: t_ns"),
         ({"tracks": np.zeros((3, 4))}, "tracks: is no mapping of column names to values"),
-        ({"motion": {"t_ns": [1]}}, "motion: missing column ax, ay"),
+        ({"motion": {"t_ns": [1]}}, "motion: missing column ax, ay, az, gx, gy, gz of an IMU, or vx, .* of a twist"),
+        (
+            {"motion": {"t_ns": [1], **{name: [0.0] for name in ("vx", "vy", "vz", "gx", "gy", "gz")}}},
+            "motion: missing column ax, .* of an IMU, or vx, .* of a twist; it has t_ns, vx",
+        ),
         ({"rig": {}}, "rig: missing fx_px, fy_px"),
         ({"truth": {"t": [1.0]}}, "truth: missing column x, y"),
     ):

@@ -79,10 +79,12 @@ def test_a_place_where_no_file_can_be_is_told_before_there_is_anything_to_write(
     file.write_text("kept")
     for place, why in ((tmp_path, "is a directory"), (pipe, "a device or a pipe"), (file / "below", "is a file")):
         with pytest.raises(OutputError, match=why):
-            check_writable(place)
-    check_writable(file)
+            check_writable(place, "new")
+    check_writable(file, "new")
+    with pytest.raises(OutputError, match="is a file of another kind, which would be lost"):
+        check_writable(file, "{")
     assert file.read_text() == "kept"
-    check_writable(tmp_path / "new" / "file")
+    check_writable(tmp_path / "new" / "file", "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -7,9 +7,10 @@ from xml.etree import ElementTree
 
 import pytest
 
+from toolkit.cli import main
 from toolkit.errors import OutputError
 from toolkit.gate.verdict import check_document
-from toolkit.report.gate import gate_markdown, gate_text, write_check
+from toolkit.report.gate import BEGINNINGS, WRITERS, gate_markdown, gate_text, write_check
 from toolkit.report.records import read_check
 
 
@@ -117,3 +118,27 @@ def test_a_file_is_replaced_at_once_or_not_at_all(passed, tmp_path, monkeypatch)
 def _full(self, *_given, **_named):
     self.touch()
     raise OSError(28, "No space left on device")
+
+
+def test_every_kind_of_file_begins_as_it_is_told_to(check):
+    assert BEGINNINGS.keys() == WRITERS.keys()
+    for kind, write in WRITERS.items():
+        assert write(check).startswith(BEGINNINGS[kind])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["baseline", "drive:1", "--estimators", "dead-reckoning", "--seeds", "5", "--out", "notes"],
+        ["check", "--baseline", "base.json", "--junit", "notes"],
+        ["check", "--baseline", "base.json", "--junit", "new.xml", "--json", "notes"],
+    ],
+)
+def test_a_file_of_another_kind_is_in_the_way_before_anything_runs(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("toolkit.gate.checking.new_baseline", None)
+    monkeypatch.setattr("toolkit.cli.gate._check_of_estimators", None)
+    Path("notes").write_text("mine")
+    assert main(words) == 4
+    assert "notes is a file of another kind, which would be lost" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes"]

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.inset import InsetIndicator
 
 from toolkit.estimate import Trajectory
 from toolkit.experiment.comparison import Comparison
@@ -140,6 +142,28 @@ def test_the_closer_look_is_where_lines_that_look_like_one_differ_most() -> None
     assert closer.low[0] < 100.0 < closer.high[0]
     assert closer.low[1] < 0.0
     assert 0.51 < closer.high[1] < 2.0
+
+
+@pytest.mark.parametrize("turn_rad", [-0.5, 1.0])
+def test_lines_to_the_closer_look_end_at_the_corners_that_face_the_map(
+    sequence: Sequence, comparison: Comparison, comparison_of: ComparisonOf, turn_rad: float
+) -> None:
+    truth = sequence.truth
+    assert truth is not None
+    turned = replace(truth, T_world_imu=se3(about_z(turn_rad), np.zeros(3)) @ truth.T_world_imu)
+    (one,) = top_view.draw_all(comparison_of(replace(sequence, truth=turned), comparison.runs))
+    FigureCanvasAgg(one.figure).draw()
+    _, the_map, panel = one.figure.axes
+    (square,) = (artist for artist in the_map.get_children() if isinstance(artist, InsetIndicator))
+    lines = [line for line in square.connectors or () if line.get_visible()]
+    ends = np.array([line.get_path().vertices[0] for line in lines])
+    box = panel.get_window_extent()
+    beside = box.y1 > the_map.get_window_extent().y0
+    assert beside == (turn_rad > 0.0)
+    facing = [(box.x0, box.y0), (box.x0, box.y1)] if beside else [(box.x0, box.y1), (box.x1, box.y1)]
+    np.testing.assert_allclose(ends, facing, atol=0.5)
+    # A panel takes the place that its equal scale leaves it when it is drawn: before the lines to it.
+    assert panel.get_zorder() < the_map.get_zorder()
 
 
 def test_a_run_without_poses_is_no_line_and_widens_no_view() -> None:

@@ -1,5 +1,6 @@
 """The table says everything a reader needs, in 100 characters, in text and in Markdown."""
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,6 +13,7 @@ from toolkit.errors import VislamError
 from toolkit.estimator import discover
 from toolkit.experiment.comparison import Comparison, Row
 from toolkit.metrics import Scores, known_metrics
+from toolkit.report import prose
 from toolkit.report.comparison_table import change_lines, comparison_table, explained_metrics, shown_metrics
 from toolkit.report.comparison_text import comparison_text, report_text
 from toolkit.report.table import Table, as_markdown, as_text, heading
@@ -236,3 +238,15 @@ def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(
     report = report_text(told, {})
     assert "- reproj_median_px, reproj_rmse_px: half of them" in report
     assert report.count("tilted") == 1
+
+
+@pytest.mark.parametrize(("columns", "width"), [(80, 80), (200, prose.WIDTH), (7, 40)])
+def test_prose_is_as_wide_as_the_terminal_and_no_wider_than_tables(
+    columns: int, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prose, "get_terminal_size", lambda _: os.terminal_size((columns, 24)))
+    assert prose.width_of_output() is None  # read by a program: not wrapped
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    assert prose.width_of_output() == width
+    lines = prose.filled("word " * 100, prose.width_of_output(), "notes: ", "       ").splitlines()
+    assert max(map(len, lines)) <= width

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toolkit.answers import COV_SIZES
 from toolkit.cli import main
 from toolkit.estimate import Estimate
 from toolkit.verify import verification
-from toolkit.verify.promises import COV_SIZES, covariance_fault, inconsistency
+from toolkit.verify.promises import covariance_fault, inconsistency
 
 # An estimator of some thirty lines, as somebody writes who has read docs/extending.md and nothing else.
 NEWCOMER = '''
@@ -67,6 +68,8 @@ PLANTS = {
     "a scaled rotation": "T[:3, :3] *= 1.001",
     "no answer now and then": "return None if k % 5 == 4 else Estimate(packet.frame.t_ns, T)",
     "it raises": "1 / (k - 9)",
+    "no estimate": "return packet.frame.t_ns, T",
+    "no pose": "T = T[:3]",
 }
 # By plant: the promise that it breaks, and what is told of that.
 TOLD = {
@@ -88,6 +91,8 @@ TOLD = {
     "the same array every time": (LATER, "its answer to frame 0 changed after it was given"),
     "a scaled rotation": (ROTATIONS, "rotations are none"),
     "no answer now and then": (STAMPS, "answers at"),
+    "no estimate": (RUNS, "its answer to frame 0 is a value of type tuple; step returns an Estimate or None"),
+    "no pose": (RUNS, "T_world_imu of its answer to frame 0 has shape (3, 4); expected (4, 4)"),
     "it raises": (RUNS, "drive: ZeroDivisionError in line 27 of step: division by zero"),
 }
 

@@ -169,6 +169,12 @@ def _unexpected(error: Exception) -> int:
         return _ended_with(f"a name or a text is in no known encoding ({error}); rename it, or use UTF-8", _SYSTEM)
     kind = type(error).__name__
     how = f"set {_WITH_TRACEBACK}=1 to see where, and report it"
+    from toolkit.discovery import line_of_another_package  # slow for a help text
+
+    if theirs := line_of_another_package(error):
+        return _ended_with(
+            f"a defect of {theirs}, which another package brings ({kind}: {error}); {how} there", _DEFECT
+        )
     return _ended_with(f"a defect of vislam itself, not of your data ({kind}: {error}); {how}", _DEFECT)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
 from toolkit.errors import VislamError, did_you_mean, no_such, one_line
+from toolkit.threads import MOST_WORKERS
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from toolkit.experiment.recording import Recording
     from toolkit.settings import Settings
 
-# Each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
-MOST_WORKERS = 1024
+# "s" last, which the others end with.
+_TIMES = {"min": 60.0, "ms": 1e-3, "s": 1.0}
 
 _EXIT_STATUSES = """\
 exit status:
@@ -34,7 +35,8 @@ exit status:
   3    a recording, a truth, trajectory or baseline file cannot be used
   4    the results cannot be written
   5    an estimator is unknown or cannot be used here
-  70   a defect of vislam itself; VISLAM_TRACEBACK=1 shows where
+  70   a defect of vislam itself, or of a package that adds to it, which the
+       message names; VISLAM_TRACEBACK=1 shows where
   71   the system's means do not suffice: memory, processes, a cluster, an
        encoding
   130  interrupted (Ctrl-C, SIGTERM or SIGHUP); nothing is left half-written,
@@ -181,33 +183,43 @@ def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
 
 
 def positive_seconds(text: str) -> float:
-    """Parse a finite duration greater than zero."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected seconds, not {text!r}") from None
+    """Parse a finite duration greater than zero, as in 10s, 500ms, 2min or 10."""
+    value = _seconds(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected seconds greater than zero, not {text}")
     return value
 
 
 def seconds_from_start(text: str) -> float:
-    """Parse a time since a recording's start, as in 10s, 500ms, 2min or 10."""
-    number = text.strip()
-    for unit, factor in (("min", 60.0), ("ms", 1e-3), ("s", 1.0)):
-        if number.endswith(unit):
-            return factor * _seconds_at_least_zero(number.removesuffix(unit), text)
-    return _seconds_at_least_zero(number, text)
-
-
-def _seconds_at_least_zero(number: str, text: str) -> float:
-    try:
-        value = float(number)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
+    """Parse a time since a recording's start, written like a duration."""
+    value = _seconds(text)
     if not 0.0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a time since the start, not {text}")
     return value
+
+
+def _seconds(text: str) -> float:
+    number = text.strip()
+    unit, factor = next(((unit, factor) for unit, factor in _TIMES.items() if number.endswith(unit)), ("", 1.0))
+    try:
+        return factor * float(number.removesuffix(unit))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected seconds, as in 10s, not {text!r}") from None
+
+
+class _Once(argparse.Action):
+    """Stores the value of an option that is given once: a second one would pass over the first."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if getattr(namespace, self.dest) is not None:
+            parser.error(f"{option_string} is there twice; it takes one file, and --set changes single settings")
+        setattr(namespace, self.dest, values)
 
 
 def add_option(
@@ -241,7 +253,11 @@ def add_estimators_argument(parser: argparse.ArgumentParser, what: str) -> None:
 def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the file and the single assignments that change settings."""
     parser.add_argument(
-        "--config", metavar="FILE", type=Path, help="settings in TOML, or the manifest.json of a run to repeat"
+        "--config",
+        metavar="FILE",
+        type=Path,
+        action=_Once,
+        help="settings in TOML, or the manifest.json of a run to repeat",
     )
     parser.add_argument(
         "--outliers",

@@ -109,7 +109,7 @@ def baseline(options: argparse.Namespace) -> int:
 
     cases = _cases(options)
     out = options.out or Path(f"baseline_{releases_in_a_name()}.json")
-    check_writable(out)
+    check_writable(out, "{")
     workers = options.workers or usable_cpus()
     made_by = made_here(command_to_keep(options.command_line))
     made = new_baseline(cases, workers, made_by, of_this_process(), requested_settings(options))
@@ -129,7 +129,7 @@ def _baseline_of_trajectories(options: argparse.Namespace) -> int:
     if options.sequences or options.estimators or options.duration or options.set or options.config:
         raise UsageError("--trajectories takes no SEQUENCE, estimators or settings: it runs nothing")
     out = options.out or Path("trajectory-baseline.json")
-    check_writable(out)
+    check_writable(out, "{")
     scoring = Scoring(options.align or Scoring.align, options.gap or Scoring.gap_s)
     made_by = made_here(command_to_keep(options.command_line))
     made = new_trajectory_baseline(_runs_given(options.trajectories, options.truth), scoring, made_by)
@@ -261,14 +261,14 @@ def check(options: argparse.Namespace) -> int:
     another system in the same way. See docs/gate.md.
     """
     from toolkit.files.writing import check_writable
-    from toolkit.report.gate import gate_text, write_check
+    from toolkit.report.gate import BEGINNINGS, gate_text, write_check
     from toolkit.report.prose import width_of_output
 
     files = {name: path for name in _FILES if (path := getattr(options, name)) is not None}
     if len({path.resolve() for path in files.values()}) < len(files):
         raise UsageError(f"{' and '.join(f'--{name}' for name in files)} are files of their own; give each its name")
-    for path in files.values():
-        check_writable(path)
+    for name, path in files.items():
+        check_writable(path, BEGINNINGS[name])
     checked = _check_of_estimators(options) if options.trajectories is None else _check_of_trajectories(options)
     write_check(checked, files)
     print(gate_text(checked, width_of_output()))

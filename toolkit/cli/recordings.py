@@ -82,7 +82,7 @@ def card(options: argparse.Namespace) -> int:
     from toolkit.report.prose import width_of_output
 
     if options.json is not None:
-        check_writable(options.json)
+        check_writable(options.json, "{")
     recording = replace(requested_recording(options), max_frames=options.max_frames)
     with of_this_process()(options.sequence) as progress:
         sequence, card = recording_card(recording, progress)

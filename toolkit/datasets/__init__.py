@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
+from toolkit.datasets.io.returned import check_types
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, did_you_mean
@@ -162,7 +163,7 @@ def built_in_names() -> tuple[str, ...]:
 
 
 def load_sequence(
-    source: str, seed: int = 0, frontend: Frontend = DEFAULTS.frontend, progress: Progress = SILENT
+    source: str | Path, seed: int = 0, frontend: Frontend = DEFAULTS.frontend, progress: Progress = SILENT
 ) -> Sequence:
     """Load a built-in sequence by its name, made with the seed, or a recording by its path.
 
@@ -170,6 +171,11 @@ def load_sequence(
     says whether and how tracks are made of images. Raises DataError where the source is neither, no format recognises
     it, or it cannot be read.
     """
+    if not isinstance(source, str | Path):
+        raise DataError(f"a SEQUENCE is a path or a built-in name, not {source!r}")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise DataError(f"{source}: seed is {seed!r}, expected a whole number from 0 on")
+    source = str(source)
     if source in built_ins():
         check_built_in(source, frontend)
         return built_ins()[source](seed)
@@ -184,6 +190,10 @@ def load_sequence(
             sequence = reader.load_with_seed(path, seed)
         else:
             sequence = reader.load(path)
+        if not isinstance(sequence, Sequence):
+            file, given = getattr(reader, "__file__", reader), type(sequence).__name__
+            raise DataError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
+        check_types(sequence)
         check_stated(sequence)
     return sequence
 

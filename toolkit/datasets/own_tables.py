@@ -139,7 +139,11 @@ def _observations(table: Columns) -> tuple[IntArray, Observations]:
 
 def _motion(table: Columns, place: Path, noise: Mapping[str, Any]) -> tuple[MotionSamples, MotionNoise]:
     """Return the samples, of an IMU or of body twists, as the columns say."""
-    is_twist = len(set(TWIST) & set(table.names)) > len(set(IMU) & set(table.names))
+    of_twist, of_imu = (len(set(columns) & set(table.names)) for columns in (TWIST, IMU))
+    if of_twist == of_imu:
+        lacks = f"{', '.join(IMU)} of an IMU, or {', '.join(TWIST)} of a twist"
+        raise DataError(f"{table.what}: missing column {lacks}; it has {', '.join(table.names)}")
+    is_twist = of_twist > of_imu
     columns, known = (TWIST, _TWIST_NOISE) if is_twist else (IMU, _IMU_NOISE)
     table.require("|".join(_STAMPS), *columns)
     t_ns, values = table.stamps(), table.numbers(*columns)

@@ -24,6 +24,7 @@ from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
+from toolkit.threads import MOST_WORKERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,8 @@ class Plan:
             raise SettingsError("nothing is to be compared: name an estimator, or a trajectory of another system")
         if self.max_frames is not None and not self.max_frames >= 2:
             raise SettingsError(f"max_frames is {self.max_frames}; an estimator needs 2 frames")
-        if self.workers is not None and self.workers < 1:
-            raise SettingsError(f"workers is {self.workers}; it is a number of processes, 1 or more")
+        if self.workers is not None and not 1 <= self.workers <= MOST_WORKERS:
+            raise SettingsError(f"workers is {self.workers}; it is a number of processes, 1 to {MOST_WORKERS}")
 
     @property
     def seeds(self) -> tuple[int, ...]:

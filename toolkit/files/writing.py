@@ -152,7 +152,7 @@ def replaced_file(target: Path) -> Iterator[Path]:
         with _parents_of(place):
             try:
                 yield partial
-                _check_kind(target, place, partial)
+                _check_kind(target, place, _beginning(partial))
                 partial.replace(place)
             finally:
                 with suppress(OSError):
@@ -167,11 +167,15 @@ def write_text(target: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def check_writable(target: Path) -> None:
-    """Raise OutputError unless a file can be written at a place; what is there stays."""
+def check_writable(target: Path, beginning: str) -> None:
+    """Raise OutputError unless a file that begins with a text can be written at a place; what is there stays.
+
+    It is asked before the work whose result is to be written there, so that nothing is refused after it.
+    """
     check_file(target)
     try:
         _probe(target.parent / "probe")
+        _check_kind(target, Path(os.path.realpath(target)), beginning.encode())
     except OSError as error:
         raise _unwritable(target, error, "file") from error
 
@@ -184,20 +188,24 @@ def check_file(target: Path) -> None:
         raise OutputError(f"{target} is a device or a pipe, and files are written whole; name a regular file")
 
 
-def _check_kind(target: Path, place: Path, written: Path) -> None:
-    """Raise OutputError where a file stands at a place that what was written is no later version of."""
-    there = _kind(place) if place.exists() else ""
-    if there and there != _kind(written):
+def _check_kind(target: Path, place: Path, beginning: bytes) -> None:
+    """Raise OutputError where a file stands at a place that what begins so is no later version of."""
+    there = _kind(_beginning(place)) if place.exists() else ""
+    if there and there != _kind(beginning):
         raise OutputError(f"{target} is a file of another kind, which would be lost; name another file")
 
 
-def _kind(path: Path) -> str:
-    """Tell pages, JSON, archives, tables of numbers and other files apart by how they begin; empty ones are none."""
+def _beginning(path: Path) -> bytes:
     with path.open("rb") as file:
-        beginning = file.read(64).lstrip()
+        return file.read(64)
+
+
+def _kind(beginning: bytes) -> str:
+    """Tell pages, JSON, archives, tables of numbers and other files apart by how they begin; empty ones are none."""
+    text = beginning.lstrip()
     kinds = {b"<": "page", b"{": "JSON", b"PK": "archive", **dict.fromkeys(_OF_TABLES, "table")}
-    known = (kind for begins, kind in kinds.items() if beginning.startswith(begins))
-    return next(known, "other" if beginning else "")
+    known = (kind for begins, kind in kinds.items() if text.startswith(begins))
+    return next(known, "other" if text else "")
 
 
 class LineFile:

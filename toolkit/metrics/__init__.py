@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol, cast
 import numpy as np
 
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import VislamError, did_you_mean
+from toolkit.errors import ExtensionError, VislamError, did_you_mean
 from toolkit.estimate import Output, Run
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
@@ -68,13 +68,13 @@ class _Found(NamedTuple):
 def _found() -> _Found:
     """Import every metric file of this package and of the announced ones.
 
-    Raises VislamError where two files declare the same key.
+    Raises VislamError where two files declare the same key, ExtensionError where one is no metric file.
     """
     files: list[MetricFile] = []
     missing: dict[str, str] = {}
     for module in (*_own_modules(), *announced(ENTRY_POINT_GROUP)):
         try:
-            files.append(cast(MetricFile, module.load()))
+            files.append(_checked(module.load(), module))
         except MissingDependency as dependency:
             missing[module.name] = str(dependency)
     keys = [metric.key for file in files for metric in file.METRICS]
@@ -82,6 +82,18 @@ def _found() -> _Found:
     if twice:
         raise VislamError(f"more than one metric file declares {', '.join(twice)}; rename one of them")
     return _Found(tuple(sorted(files, key=lambda file: file.ORDER)), missing)
+
+
+def _checked(file: object, found: FoundModule) -> MetricFile:
+    """Return a module that defines what a metric file does."""
+    metrics, order, score = (getattr(file, name, None) for name in ("METRICS", "ORDER", "score"))
+    records = isinstance(metrics, tuple) and all(isinstance(metric, Metric) for metric in metrics)
+    if not (records and isinstance(order, int | float) and callable(score)):
+        raise ExtensionError(
+            f"{found.path}: a metric file defines METRICS, a tuple of Metric records, ORDER, a number, and "
+            "score(evaluation)"
+        )
+    return cast(MetricFile, file)
 
 
 def _own_modules() -> list[FoundModule]:
@@ -122,7 +134,8 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
     for name in chosen:
         if name not in by_name:
             close = did_you_mean(name, by_name)
-            raise VislamError(f"no metric is called {name}{close}; 'vislam list' names them all, by key")
+            lacking = "".join(f"; {file} is unavailable: {why}" for file, why in unavailable().items())
+            raise VislamError(f"no metric is called {name}{close}; 'vislam list' names them all, by key{lacking}")
     return tuple(metric for name in chosen for metric in by_name[name])
 
 
@@ -145,8 +158,8 @@ def score_run(
     ``requested`` names the switches of metrics that are computed on request alone; with ``only``, the keys, names or
     groups of some metrics, no other file's are computed, and the scores have the keys of these files alone. A metric
     that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where the run
-    has no output of that kind, VislamError where ``only`` names a metric that does not exist; an error inside a metric
-    is a defect and passes through.
+    has no output of that kind, VislamError where ``only`` names a metric that does not exist, ExtensionError
+    where a file scores others than it declares; an error inside a metric is a defect and passes through.
     """
     evaluation = Evaluation(run, output, sequence)
     values: dict[str, float | None] = {}
@@ -154,8 +167,10 @@ def score_run(
     with np.errstate(all="ignore"):  # a diverged run overflows; that ends as None with its reason, below
         for file in _files_of(only):
             scores = _score_file(file, evaluation, requested)
-            if list(scores.values) != _keys(file):
-                raise ValueError(f"{file} scored {list(scores.values)}, it declares {_keys(file)}")
+            if not isinstance(scores, Scores) or list(scores.values) != _keys(file):
+                given = list(scores.values) if isinstance(scores, Scores) else type(scores).__name__
+                where = getattr(file, "__file__", file)
+                raise ExtensionError(f"{where}: score answers with Scores of {_keys(file)}, here with {given}")
             values |= scores.values
             notes |= scores.notes
     return Scores(values, notes)

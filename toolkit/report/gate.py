@@ -228,6 +228,10 @@ WRITERS: Mapping[str, Callable[[Check], str]] = {
 }
 
 
+# How the file of each kind begins.
+BEGINNINGS: Mapping[str, str] = {"junit": "<", "markdown": "#", "json": "{"}
+
+
 def write_check(check: Check, files: Mapping[str, Path]) -> None:
     """Write a check in each of the kinds of WRITERS that has a file; raise OutputError where one cannot be written."""
     for kind, path in files.items():

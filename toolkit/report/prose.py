@@ -4,11 +4,12 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator
+from shutil import get_terminal_size
 
 from toolkit.errors import printable
 
-# Of tables and of prose beside them.
-WIDTH = 100
+# Of tables and of prose beside them; on a terminal prose is as wide as that is, from 40 columns on.
+WIDTH, _NARROWEST = 100, 40
 Width = int | None
 _LABEL = 7
 # An underscore inside a word is none; a minus, a plus or a number is one only at the beginning of a line.
@@ -17,7 +18,9 @@ _MARKUP = re.compile(r"[\\`*<>\[\]|&]|(?<!\w)_|_(?!\w)|^[#~+-]|^\d+(?=[.)] )")
 
 def width_of_output() -> Width:
     """Return the width of prose on standard output: None where nobody but a program may read the lines."""
-    return WIDTH if sys.stdout.isatty() else None
+    if not sys.stdout.isatty():
+        return None
+    return min(max(get_terminal_size((WIDTH, 24)).columns, _NARROWEST), WIDTH)
 
 
 def filled(text: str, width: Width, first: str = "", further: str = "  ") -> str:

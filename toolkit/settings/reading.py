@@ -32,8 +32,19 @@ def settings_of(given: Mapping[str, Any], place: str) -> Settings:
         return msgspec.convert(values, Settings)
     except msgspec.ValidationError as error:
         # In TOML and on the command line no value is called none.
-        what = readable(error, values, Settings).replace(" or null", " or none")
-        raise SettingsError(f"{place}: {what}") from error
+        what = readable(error, values, Settings).replace(" or null", " or none").replace("object", "a section of keys")
+        given_text = _given(what.partition(":")[0], values) if what.endswith("got string") else ""
+        raise SettingsError(f"{place}: {what}{given_text}") from error
+
+
+def _given(key: str, values: Mapping[str, Any]) -> str:
+    """Return a text that stands where another type is expected, and the unit in which a number is."""
+    section, _, name = key.rpartition(".")
+    text = values.get(section, {}).get(name) if section else values.get(name)
+    if not isinstance(text, str):
+        return ""
+    unit = next((described.unit for described in describe() if described.key == key), "")
+    return f" {text!r}" + (f"; it is a number, in {unit}" if unit else "")
 
 
 def _with_none(given: Mapping[str, Any], record: type[Struct]) -> dict[str, Any]:
@@ -101,6 +112,12 @@ def _check_keys(given: Mapping[str, Any], record: type[Struct], prefix: str, pla
         if key not in hints:
             keys = [described.key for described in describe()]
             known = [*keys, *{section.partition(".")[0] for section in keys}, "estimators"]
+            section, _, name = key.partition(".")
+            if f"{prefix}{key}" in keys and name:
+                raise SettingsError(
+                    f"{place}: {key!r} is one key here; write {{{section!r}: {{{name!r}: ...}}}}, or in TOML {key} "
+                    "without quotes"
+                )
             raise SettingsError(f"{place}: there is no setting {prefix}{key}{did_you_mean(prefix + key, known)}")
         if isinstance(hints[key], type) and issubclass(hints[key], Struct) and isinstance(value, Mapping):
             _check_keys(value, hints[key], f"{key}.", place)
@@ -143,6 +160,8 @@ def _one(key: str, hint: Any, default: Any) -> Described:
 
 
 def _shown(default: Any) -> str:
+    if isinstance(default, bool):  # as TOML writes it
+        return str(default).lower()
     return f"{default:.4g}" if isinstance(default, float) else str(default)
 
 

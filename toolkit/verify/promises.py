@@ -9,14 +9,13 @@ from itertools import zip_longest
 
 import numpy as np
 
+from toolkit.answers import COV_SIZES, check_state
 from toolkit.estimate import Estimate, Finished, Run
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
 from toolkit.sequence import Packet, Sequence
 
-# Of the state: the pose; with a gyro bias; with velocity and both biases; with velocity and turn rate.
-COV_SIZES = (6, 9, 12, 15)
 # Rounding of some hundred products of rotations.
 _ROTATION_TOLERANCE = 1e-12
 # How often the test of mean NEES calls a consistent estimator inconsistent.
@@ -43,12 +42,18 @@ def setup_of(sequence: Sequence) -> Setup:
 
 
 def watch(build: Build, sequence: Sequence) -> Watched:
-    """Run an estimator over a recording from its own prior; whatever the estimator raises passes through."""
+    """Run an estimator over a recording from its own prior; whatever the estimator raises passes through.
+
+    Raises EstimatorError where an answer is no Estimate, or its pose, velocity or biases have no such shape.
+    """
     setup, packets = setup_of(sequence), tuple(sequence.packets())
     given_copies = copies_of((setup, packets))
     estimator, online, online_copies = build(setup), list[Estimate | None](), list[tuple[Array, ...]]()
     for packet in packets:
-        online.append(estimator.step(packet))
+        answer = estimator.step(packet)
+        if answer is not None:
+            check_state(answer, packet.index)
+        online.append(answer)
         online_copies.append(copies_of(online[-1]))
     finished = estimator.finish()
     return Watched(sequence, setup, packets, given_copies, tuple(online), tuple(online_copies), finished)

@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
+from toolkit.metrics import known_metrics
 from toolkit.report.html import write_html
+from toolkit.report.table import cell
 
 pytest.importorskip("selenium.webdriver", reason="needs selenium, from the extra 'test'")
 
@@ -54,6 +56,21 @@ def test_all_metrics_can_be_shown(page: Page, single: Path, run_directory: Path)
     page.click(".summary .quiet")
     shown = [float(value) for value in page.column("ate_sim3_m") if value is not None]
     assert shown == metrics_of(run_directory, "ate_sim3_m")
+
+
+def test_numbers_print_as_in_the_table_of_the_command(page: Page, single: Path) -> None:
+    page.open(single)
+    page.click(".summary .quiet")
+    metrics = {metric.key: metric for metric in known_metrics()}
+    keys = [head.get_attribute("data-key") for head in page.all(".summary thead th")]
+    script = "return [...document.querySelectorAll('.summary td[data-value]')].map((td) => "
+    given = page.run(f"{script}[td.cellIndex, td.dataset.value, td.firstChild.data])")
+    shown = [(keys[column], float(value), text) for column, value, text in given if keys[column] in metrics]
+    assert {abs(value) < 0.1 for _, value, _ in shown} == {True, False}
+    for key, value, text in shown:
+        assert text.replace("\N{MINUS SIGN}", "-") == cell(value, metrics[key]).replace("e+0", "e").replace(
+            "e-0", "e-"
+        ), key
 
 
 def test_a_missing_value_is_a_dash_with_its_reason(page: Page, single: Path) -> None:

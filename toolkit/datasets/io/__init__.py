@@ -4,4 +4,5 @@ Read ``fields`` (named arrays with their checks) and ``tables`` (CSV) first; ``i
 them, ``truth`` reads ground truth, ``yaml_fields`` calibrations. ``npz_archive`` streams large arrays, with ``sparse``;
 ``plain_pickle`` reads object arrays and runs nothing. ``euroc_calibration`` and ``euroc_truth`` belong to EuRoC,
 ``bag_reader``, ``bag_topics``, ``bag_calibration`` and ``ros_values`` to bags. ``unrecognised``: what is no recording.
+``returned``: what is no sequence.
 """

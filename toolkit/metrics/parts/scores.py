@@ -3,7 +3,9 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
+
+from toolkit.errors import ExtensionError
 
 Best = Literal["least", "most", "one", ""]
 InTable = Literal["always", "where rows differ", "on request"]
@@ -35,6 +37,13 @@ class Metric:
     gate_name: str = ""
 
     def __post_init__(self) -> None:
+        for what, value, known in (("best", self.best, Best), ("table", self.table, InTable)):
+            if value not in get_args(known):
+                raise ExtensionError(f"the metric {self.key} has {what}={value!r}; it is one of {get_args(known)}")
+        if not (isinstance(self.heading, tuple) and len(self.heading) == 2):
+            raise ExtensionError(
+                f"the metric {self.key} has heading={self.heading!r}; it is two lines, as ('ATE', 'yaw')"
+            )
         object.__setattr__(self, "name", self.name or " ".join(filter(None, self.heading)))
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from matplotlib.patches import Patch
 
 from toolkit.estimate import Output
 from toolkit.experiment.comparison import Comparison, Row
@@ -16,7 +17,7 @@ from toolkit.report.figures.panels import (
     output_entries,
     panels_of,
 )
-from toolkit.report.figures.style import NamedFigure, line_of
+from toolkit.report.figures.style import Entry, NamedFigure, line_of
 
 
 def draw(over: Comparison) -> Iterator[NamedFigure]:
@@ -42,7 +43,10 @@ def _errors(over: Comparison) -> NamedFigure:
         axes.plot(t_s, median, color=colour, linestyle=line_of(kind), linewidth=1.2)
         kinds.add(kind)
     title = f"{over.name}, {len(over.seeds)} seeds: position error"
-    finish(figure, panels, "position error [m]", title, output_entries(kinds))
+    quartiles = Entry(
+        "quartiles (lines: medians)", tuple(Patch(color=COLOUR_OF[kind], alpha=0.2) for kind in sorted(kinds))
+    )
+    finish(figure, panels, "position error [m]", title, [*output_entries(kinds), quartiles])
     next(iter(panels.values())).set_ylim(bottom=0.0)
     caption = (
         f"Position error over time on {over.name}, {len(over.seeds)} seeds, not aligned: the median and, shaded, "

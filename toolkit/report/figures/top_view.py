@@ -289,7 +289,8 @@ def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
     """Show a part of the map enlarged, and in the map where it is."""
     closer.show(under)
     style_axes(under, "", "", "")
-    under.set_title("the square, enlarged", fontsize=SMALL_PT, loc="left")
+    # Below the panel, where no line to the square crosses it.
+    under.set_xlabel("the square, enlarged", fontsize=SMALL_PT)
     under.tick_params(labelsize=SMALL_PT, colors=MUTED_COLOUR)
     for axis in (under.xaxis, under.yaxis):
         axis.set_major_locator(MaxNLocator(3))
@@ -299,7 +300,24 @@ def _look_closer(axes: Axes, under: Axes, closer: View, view: View) -> None:
     half = max(float(closer.size[0]), _LEAST_SQUARE * float(view.size.max())) / 2.0
     low = (closer.low + closer.high) / 2.0 - half
     place = (float(low[0]), float(low[1]), 2.0 * half, 2.0 * half)
-    axes.indicate_inset(place, under, edgecolor=MUTED_COLOUR, alpha=1.0, linewidth=0.8, zorder=5)
+    square = axes.indicate_inset(place, under, edgecolor=MUTED_COLOUR, alpha=1.0, linewidth=0.8, zorder=5)
+    assert square.connectors is not None, "the panel is given"
+    facing = _corners_facing(axes, under)
+    for line, shown in zip(square.connectors, facing, strict=True):
+        line.set_visible(shown)
+    if facing[0]:  # the map is on the left, and so would be the numbers, under the lines
+        under.yaxis.tick_right()
+    # Drawn before the map, for its place is known then alone, and the lines end at its corners.
+    under.set_zorder(axes.get_zorder() - 1)
+
+
+def _corners_facing(axes: Axes, under: Axes) -> tuple[bool, bool, bool, bool]:
+    """Say which corners of the panel face the map (lower left, upper left, lower right, upper right)."""
+    map_place, place = (one.get_subplotspec() for one in (axes, under))
+    assert map_place is not None
+    assert place is not None
+    below = place.rowspan.start >= map_place.rowspan.stop
+    return (not below, True, False, below)
 
 
 def _trouble(run: Run) -> str:

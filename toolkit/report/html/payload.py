@@ -206,6 +206,7 @@ def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
             "name": metric.name,
             "unit": metric.unit,
             "decimals": metric.decimals,
+            "count": metric.count,
             "meaning": metric.meaning,
             "best": metric.best,
             "usual": metric in usual,
@@ -218,7 +219,7 @@ def columns_of(keys_present: set[str]) -> list[dict[str, Any]]:
 
 def _undeclared(key: str) -> dict[str, Any]:
     """Return the column of a metric that the runs have and this installation does not know."""
-    words = {"key": key, "name": key, "unit": "", "decimals": 3, "meaning": "", "best": ""}
+    words = {"key": key, "name": key, "unit": "", "decimals": 3, "count": False, "meaning": "", "best": ""}
     return {**words, "usual": False, "usual_over_seeds": False}
 
 

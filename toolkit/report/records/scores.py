@@ -17,7 +17,7 @@ PROMISED_KEYS = contract_keys()
 ALL_PROMISED = Meta(description="by metric key", extra_json_schema={"required": list(PROMISED_KEYS)})
 
 MotionKind = Literal["twist", "imu", "none"]
-Motion = Annotated[MotionKind, Meta(description="body velocities or raw IMU between the frames")]
+Motion = Annotated[MotionKind, Meta(description="body velocities, raw IMU or nothing between the frames")]
 Notes = Annotated[dict[str, str], Meta(description="by metric key, why there is no value, or a remark on the value")]
 
 

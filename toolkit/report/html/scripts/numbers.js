@@ -1,11 +1,13 @@
 const MISSING = "–";
 const MINUS = "−";
 
-/** Write a number with at most so many decimals in five characters, in powers of ten where it needs more. */
-function cellText(value, decimals) {
-  for (let d = decimals; d >= 0; d--) {
+/** Write a metric's value as the tables of `vislam compare` do: in five characters, in powers of ten where it needs more. */
+function cellText(value, column) {
+  if (column.count && Math.abs(value) < 1e9) return value.toFixed(0).replace("-", MINUS);
+  // An error of a few centimetres needs three decimals to say anything.
+  for (let d = column.decimals + (Math.abs(value) < 0.1); d >= 0; d--) {
     const text = value.toFixed(d);
-    if (text.length <= 5 || (decimals === 0 && d === 0 && Math.abs(value) < 1e9)) return text.replace("-", MINUS);
+    if (text.length <= 5) return text.replace("-", MINUS);
   }
   return value.toExponential(0).replace("-", MINUS).replace("e+", "e");
 }

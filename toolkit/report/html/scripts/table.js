@@ -60,7 +60,7 @@ function summaryTable(cases, columns, title) {
       hintOn(cell, `no value: ${why}`);
       return cell;
     }
-    const text = cellText(number, column.decimals);
+    const text = cellText(number, column);
     const isBest = best.get(`${row.case.id} ${column.key}`) === text && row.status === "ok";
     const cell = el("td", { class: isBest ? "number best" : "number", "data-value": number });
     cell.append(text);
@@ -129,9 +129,9 @@ function bestValues(rows, columns) {
     for (const id of new Set(rows.map((row) => row.case.id))) {
       const ok = rows.filter((row) => row.case.id === id && row.status === "ok");
       const values = ok.map((row) => row.metrics[column.key]).filter((v) => v !== null && v !== undefined);
-      if (new Set(values.map((v) => cellText(v, column.decimals))).size < 2) continue;
+      if (new Set(values.map((v) => cellText(v, column))).size < 2) continue;
       const least = values.reduce((a, b) => (distance[column.best](b) < distance[column.best](a) ? b : a));
-      best.set(`${id} ${column.key}`, cellText(least, column.decimals));
+      best.set(`${id} ${column.key}`, cellText(least, column));
     }
   }
   return best;
