@@ -82,12 +82,14 @@ def _of_groups(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], b
     together: Sequence[Sequence[int]] = [*states, beside] if beside else states
     tied = _tied(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
+    variances = _variances(linear, [states[k] for k in some])
     failure: RuntimeError = RoundingError("they were lost to rounding")
-    orders = (partial(_in_time, tied, together), [0]), (partial(_dissected, tied, beside), some)
+    orders = (partial(_in_time, tied, together), some[:1]), (partial(_dissected, tied, beside), some)
     for order, checked in orders:
         try:
             covs = _recovered(_eliminated(tied, order()), together)
-            if all(_is_right(covs[k], linear, states[k]) for k in checked):
+            pairs = zip(checked, variances, strict=False)
+            if all(np.allclose(np.diag(covs[k]), known, rtol=2.0 * _MOST_ROUNDED, atol=0.0) for k, known in pairs):
                 return covs
         except RuntimeError as error:  # a variable that this order finds undetermined
             failure = error
@@ -129,16 +131,19 @@ def _measured(jacobian: Array) -> Array:
     return np.asarray(directions[determined].T / per_unit[determined])
 
 
-def _is_right(cov: Array, linear: gtsam.GaussianFactorGraph, keys: list[int]) -> bool:
-    """Say whether the covariance of a state is what it is by itself, all else eliminated variable by variable.
+def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -> list[Array]:
+    """Return the variances of the variables of some states, all else eliminated variable by variable.
 
     By cliques GTSAM refuses here what has a covariance: the world behind hundreds of frames is so much looser than the
     step between two that both in one clique are beyond the condition it allows.
     """
+    keys = [key for state in states for key in state]
     last = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, keys)
     _, left = linear.eliminatePartialSequential(_ordering(_others(last, keys)))
     information, _ = left.hessian(_ordering(keys))
-    return np.allclose(np.diag(cov), np.diag(np.linalg.inv(information)), rtol=2.0 * _MOST_ROUNDED, atol=0.0)
+    size = linear.gradientAtZero()
+    ends = np.cumsum([sum(size.at(key).size for key in state) for state in states])
+    return np.split(np.diag(np.linalg.inv(information)), ends[:-1])
 
 
 def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) -> gtsam.GaussianFactorGraph:
