@@ -91,9 +91,14 @@ def test_every_state_has_gtsams_marginal_in_any_order(scenario, refused, most_ti
     assert_marginals(cov, problem.marginals)
 
 
-@pytest.mark.parametrize(("standing", "first"), [(150, "_dissected"), (10, "_in_time")])
-def test_where_landmarks_are_seen_for_long_the_order_of_time_comes_first(standing, first, smoothed, monkeypatch):
-    tried, problem = [], smoothed("flight")
+@pytest.mark.parametrize(
+    ("scenario", "standing", "first"),
+    [("drive", 150, "_dissected"), ("drive", 5, "_in_time"), ("flight", 150, "_in_time")],
+)
+def test_the_order_of_time_comes_first_with_an_imu_and_where_landmarks_are_seen_for_long(
+    scenario, standing, first, smoothed, monkeypatch
+):
+    tried, problem = [], smoothed(scenario)
     for name in ("_dissected", "_in_time"):
         order = getattr(state_covariances, name)
         monkeypatch.setattr(state_covariances, name, lambda *given, n=name, o=order: tried.append(n) or o(*given))

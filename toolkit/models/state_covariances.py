@@ -8,15 +8,16 @@ Bayes tree anew for each state, which takes a hundred times as long.
 Variables that depend on the same later ones, as pose, velocity and biases of one state do, are recovered together:
 one by one, in the second order below, all digits are lost within seconds of an IMU.
 
-Two orders are tried. Nested dissection cuts the graph in halves again and again, and what cuts it comes last (George
-1973, "Nested dissection of a regular finite element mesh"): from the root to any state it is some tens of variables.
-In the order of time every state is recovered from the next, from the last to the first: with an IMU all are right to
-1e-7 of a standard deviation, but where steps between states are known far better than the states, as where the errors
-of sightings are correlated, rounding grows on the way. On a drive of 125 frames a standard deviation of the first came
-out wrong by 5 % of itself, along the 1010 frames of Dataset 03 by fifty times; dissected, all were right to 1e-9 and
-to 1e-7, and on a minute of an IMU both agree to 2e-7. Both take as long; dissection comes first, but where landmarks
-are seen for long, as while a vehicle stands, which it does not know how to cut. An order counts where it gives states
-the covariance that each has by itself: in time the first, where rounding ends up, else some.
+Two orders are tried. In the order of time every state is recovered from the next, from the last to the first: with an
+IMU all are right to 1e-7 of a standard deviation, but where steps between states are known far better than the states,
+as where the errors of sightings are correlated, rounding grows on the way. On a drive of 125 frames a standard
+deviation of the first came out wrong by 5 % of itself, along the 1010 frames of Dataset 03, by twists, by fifty times.
+Nested dissection cuts the graph in halves again and again, and what cuts it comes last (George 1973, "Nested
+dissection of a regular finite element mesh"): from the root to any state it is some tens of variables, and on those
+drives all were right to 1e-9 and 1e-7; on a minute of an IMU both agree to 2e-7. Both take as long. Dissection comes
+first where states have no velocity, whose steps twists measure, but not where landmarks are seen for long, as while a
+vehicle stands: those it does not know how to cut. An order counts where it gives states the covariance that each has by
+itself: in time the first, where rounding ends up, else some.
 
 Where neither does, landmarks are looked at. Of one that went thousands of baselines away the measurements tell the
 depth in metres so badly that GTSAM refuses it, or that its rounding is the states', though its disparity is told as
@@ -70,31 +71,32 @@ def covs_beside(
 
     Those are of no frame, as the scale of disparities is: they are eliminated after all states.
     """
-    states = [state_keys(motion, k) for k in range(len(poses))]
+    states, has_velocity = [state_keys(motion, k) for k in range(len(poses))], "v" in motion.variable_sizes
     try:
-        covs = _of_groups(linear, states, beside)
+        covs = _of_groups(linear, states, beside, has_velocity)
     except RuntimeError:
         kept = {key for group in (*states, beside) for key in group}
-        covs = _of_groups(_others_as_measured(linear, kept), states, beside)
+        covs = _of_groups(_others_as_measured(linear, kept), states, beside, has_velocity)
     of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
     return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
 
 
-def _of_groups(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], beside: Sequence[int]) -> list[Array]:
+def _of_groups(
+    linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]], beside: Sequence[int], has_velocity: bool
+) -> list[Array]:
     """Return the joint covariance of the variables of each state, and of those beside them if there are any."""
     together: Sequence[Sequence[int]] = [*states, beside] if beside else states
     tied = _tied(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
-    variances = _variances(linear, [states[k] for k in some])
     failure: RuntimeError = RoundingError("they were lost to rounding")
     spans = _spans(tied, together)
     in_time = partial(_in_time, tied, together, spans), some[:1]
     dissected = partial(_dissected, tied, beside), some
-    stands = any(last - first > _STANDING for first, last in spans.values())
-    for order, checked in (in_time, dissected) if stands else (dissected, in_time):
+    holds_in_time = has_velocity or any(last - first > _STANDING for first, last in spans.values())
+    for order, checked in (in_time, dissected) if holds_in_time else (dissected, in_time):
         try:
             covs = _recovered(_eliminated(tied, order()), together)
-            pairs = zip(checked, variances, strict=False)
+            pairs = zip(checked, _variances(linear, [states[k] for k in checked]), strict=True)
             if all(np.allclose(np.diag(covs[k]), known, rtol=2.0 * _MOST_ROUNDED, atol=0.0) for k, known in pairs):
                 return covs
         except RuntimeError as error:  # a variable that this order finds undetermined
