@@ -17,16 +17,17 @@ from filters.kalman.linearisation import AtFirstEstimates
 from filters.kalman.sliding_window import SlidingWindowFilter
 from filters.smoothing.discounted_tracks import DiscountedTracks
 from filters.smoothing.indeterminate import with_covariances
-from filters.smoothing.robust_schedule import Smoothed, seen_ids, solve_robustly, worth_smoothing
+from filters.smoothing.robust_schedule import MotionFactors, Smoothed, seen_ids, solve_robustly, worth_smoothing
 from filters.smoothing.scale_state import ScaleState
 from filters.smoothing.track_chain import scale_in
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.estimator import Estimator, Setup
 from toolkit.geometry import IntArray
 from toolkit.models.factors import L
-from toolkit.models.gap_bridge import bridged
+from toolkit.models.gap_bridge import bridged, bridges
 from toolkit.models.motion import motion_model
-from toolkit.sequence import Packet
+from toolkit.models.stacked_factors import stacked
+from toolkit.sequence import Packet, StereoFrame
 
 CITES = ("dellaert2017factor", "gtsam")
 RUNG, CHANGE = 120, "+ all relinearised to convergence, in the end: Huber, Cauchy, cut; IMU as stated"
@@ -70,12 +71,9 @@ class Batch:
         track_ids = worth_smoothing(all_frames, known)
         frames = [frame.select(np.isin(frame.track_ids, track_ids)) for frame in all_frames]
         start = self._start(known, track_ids)
-        factors = self._motion_factors()
-        bridge = self._causal_pass.bridge
-        if bridge is not None and bridge.noise is not None:
-            factors.push_back(bridged(frames, bridge.noise))
+        factors = self._motion_factors(frames)
         if self._scale is not None:
-            self._scale.add_to(factors, start)
+            self._scale.add_to(factors.graph, start)
         smoothed = solve_robustly(factors, frames, self._rig, start, self._outliers, self._tracks, self._progress)
         trajectory, log = self._with_covariances(smoothed)
         values = smoothed.solution.values
@@ -90,15 +88,19 @@ class Batch:
             return with_covariances(trajectory, linear, self._motion)
         return self._scale.with_covariances(trajectory, linear, self._motion, scale_in(values))
 
-    def _motion_factors(self) -> gtsam.NonlinearFactorGraph:
-        """Return the prior and the steps, integrated about the last bias of the causal pass, its best."""
+    def _motion_factors(self, frames: list[StereoFrame]) -> MotionFactors:
+        """Return the prior and the steps, integrated about the last bias of the causal pass, its best; and bridges."""
         graph = self._motion.hold(self._first_belief, 0)
         best_bias = self._estimates[-1].bias
         assert best_bias is not None
-        for packet in self._packets:
-            if packet.motion is not None:
-                graph.push_back(self._motion.integrate(packet.motion, best_bias).factors(packet.index))
-        return graph
+        moved = {packet.index: packet.motion for packet in self._packets if packet.motion is not None}
+        increments = {k: self._motion.integrate(motion, best_bias) for k, motion in moved.items()}
+        for k, increment in increments.items():
+            graph.push_back(increment.factors(k))
+        bridge = self._causal_pass.bridge
+        over = {} if bridge is None or bridge.noise is None else bridges(frames, bridge.noise)
+        graph.push_back(bridged(over))
+        return MotionFactors(graph, stacked(increments, over))
 
     def _start(self, known: Landmarks, track_ids: IntArray) -> gtsam.Values:
         values = gtsam.Values()

@@ -77,7 +77,7 @@ class Isam2:
         beside, stopping = (None, Stopping()) if self._chained is None else (self._chained.whole(), CHAIN_STOPPING)
         start = self._tree.values()
         landmarks = FirstImages.in_graph(graph, self._rig) if beside is None else beside
-        values, _, _, converged = solve(graph, start, stopping, self._progress, landmarks=landmarks)
+        values, _, _, converged, _ = solve(graph, start, stopping, self._progress, landmarks=landmarks)
         if beside is not None:
             graph.push_back(beside.linearised(values))
         states = [motion.read(values, k, t_ns) for k, t_ns in enumerate(self._stamps_ns)]

@@ -121,19 +121,21 @@ class FirstImages:
 
     GTSAM steps by a pose's own axes and by a landmark's metres in the world. Where a step turns a stretch of road by
     0.01 rad and shifts it by 12 m, the two part by 6 cm, pixels at a near landmark: such a step raises the error,
-    however well the linear system is solved. Landmarks that stay in the image of a pose go along with it.
+    however well the linear system is solved. Landmarks that stay in the image of a pose go along with it. ``at_once``
+    says that they are to do so from the first step on.
     """
 
     track_ids: IntArray
     first: IntArray
     rig: StereoRig
+    at_once: bool = False
 
     @classmethod
-    def of(cls, frames: list[StereoFrame], rig: StereoRig) -> "FirstImages":
+    def of(cls, frames: list[StereoFrame], rig: StereoRig, at_once: bool = False) -> "FirstImages":
         """Return the landmarks that frames (K,) see."""
         of_frame = np.repeat(np.arange(len(frames)), [frame.track_ids.size for frame in frames])
         track_ids, begins = np.unique(np.concatenate([frame.track_ids for frame in frames]), return_index=True)
-        return cls(track_ids, of_frame[begins], rig)
+        return cls(track_ids, of_frame[begins], rig, at_once)
 
     @classmethod
     def in_graph(cls, graph: gtsam.NonlinearFactorGraph, rig: StereoRig) -> "FirstImages":

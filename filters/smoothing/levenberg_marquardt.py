@@ -2,9 +2,9 @@
 
 GTSAM's optimizer returns unchanged values without a message when an error is not a number, so the error is looked at
 first. And it hands a Python factor a copy of all values at each call, which makes a thousand twist factors take ten
-times as long as sixty thousand stereo factors: each takes part by its linearisation at the values of the iteration,
-and its own error at the end of a step says whether the step is taken. The damping is Levenberg's multiple of the
-identity: a tenth of it after a step that lowered the error, ten times as much after one that did not.
+times as long as sixty thousand stereo factors: where there are any, the steps are taken here, and those of one form
+are linearised and evaluated all at once where a stack of them is given. The damping is Levenberg's multiple of the
+identity either way: a tenth of it after a step that lowered the error, ten times as much after one that did not.
 
 A step of GTSAM's turns a pose about itself and moves a landmark straight on, and the two part where it is long: what
 is weakly determined, as the drift of a long drive, is then damped as what overshoots, and a solve creeps or stops far
@@ -25,9 +25,9 @@ from typing import NamedTuple, Protocol, TypeVar
 import gtsam
 import numpy as np
 
-from filters.smoothing.cached_linearisation import CachedLinearisation, python_factors, with_linearisations
 from filters.smoothing.indeterminate import variable_named
 from filters.smoothing.landmark_steps import FirstImages, LandmarkSteps
+from filters.smoothing.mixed_graph import MixedGraph
 from toolkit.errors import EstimatorError
 from toolkit.models.factors import kind_of
 from toolkit.progress import SILENT, Progress
@@ -39,6 +39,8 @@ _IN_IMAGES = 1e-7
 _LEAST_DECREASE = 1e-12
 # Landmarks are damped by shares of their own information. Beyond the last, which nearly holds them, so is all else.
 _FIRST_SHARE, _LEAST_SHARE, _LANDMARKS_ALONE = 1e-6, 1e-7, 1.0
+# A step that raises the error by less than this share of it stands at a minimum.
+_NEXT_TO_NOTHING = 1e-5
 # A step that keeps less than this of what the linear system promises is shortened.
 _KEPT = 0.5
 # A step that gains little is the last one only if it was damped by no more than this, and shortened to no less.
@@ -68,16 +70,20 @@ class Beside(Protocol):
 
 
 class Solution(NamedTuple):
-    """The values reached, their error (half the sum of squares), the iterations taken and whether it converged."""
+    """The values reached, their error (half the sum of squares), the iterations taken and whether it converged.
+
+    ``overshot`` says whether a step of landmarks in metres raised the error.
+    """
 
     values: gtsam.Values
     error: float
     iterations: int
     converged: bool
+    overshot: bool = False
 
 
 def solve(
-    graph: gtsam.NonlinearFactorGraph,
+    graph: gtsam.NonlinearFactorGraph | MixedGraph,
     start: gtsam.Values,
     stopping: Stopping,
     progress: Progress = SILENT,
@@ -95,16 +101,18 @@ def solve(
     start is not finite: some measurement or initial value is NaN.
     """
     beside = None if isinstance(landmarks, FirstImages) else landmarks
-    error = graph.error(start) + (0.0 if beside is None else beside.error(start))
+    mixed = graph if isinstance(graph, MixedGraph) else MixedGraph(graph)
+    error = mixed.error(start) + (0.0 if beside is None else beside.error(start))
     if not np.isfinite(error):
         raise EstimatorError("the smoother's error is not a number at its start; look for NaN in the measurements")
     advance = partial(progress.advance, total=stopping.max_iterations, stage=stage)
     if beside is not None:
-        return _solved(_LandmarkSolver(graph, start, beside), start, error, stopping, advance)
-    in_metres = _GraphSolver(graph, start, ordering)
-    if isinstance(landmarks, FirstImages):
-        return _solved(_ImageSolver(in_metres, landmarks), start, error, stopping, advance)
-    return _solved(in_metres, start, error, stopping, advance)
+        return _solved(_LandmarkSolver(mixed, start, beside), start, error, stopping, advance)
+    if ordering is None:
+        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(mixed.whole)
+    in_metres = _GraphSolver(mixed, ordering)
+    solver = _ImageSolver(in_metres, landmarks) if isinstance(landmarks, FirstImages) else in_metres
+    return _solved(solver, start, error, stopping, advance)._replace(overshot=in_metres.overshot)
 
 
 class _Reached(Protocol):
@@ -147,31 +155,6 @@ def _solved(
     return Solution(here.values(), here.error, stopping.max_iterations, converged=False)
 
 
-class _MixedGraph:
-    """A graph of GTSAM's own factors and of Python's, which are linearised and evaluated one by one."""
-
-    def __init__(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        self._graph, self._native = graph, gtsam.NonlinearFactorGraph(graph)
-        self._python = python_factors(graph)
-        for place in self._python:
-            self._native.remove(place)
-
-    @property
-    def has_python(self) -> bool:
-        """Say whether there are factors of Python's."""
-        return bool(self._python)
-
-    def linearised(self, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
-        """Return the graph, its Python factors linearised about some values."""
-        cached = {place: CachedLinearisation(f, values.extract(f.keys())) for place, f in self._python.items()}
-        return with_linearisations(self._graph, cached) if cached else self._graph
-
-    def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares, or of losses."""
-        own = sum(factor.error(values.extract(factor.keys())) for factor in self._python.values())
-        return self._native.error(values) + own
-
-
 class _OfGtsam(NamedTuple):
     """Where a solve has come to: GTSAM's optimizer, which has the values and the damping, and their error."""
 
@@ -179,73 +162,17 @@ class _OfGtsam(NamedTuple):
     error: float
     held_back: bool = False
 
+    @property
+    def damping(self) -> float:
+        """Return that of the next step."""
+        return self.optimizer.lambda_()
+
     def values(self) -> gtsam.Values:
         """Return a copy: GTSAM hands out its own, which do not outlive the next iteration."""
         return gtsam.Values(self.optimizer.values())
 
 
-class _GraphSolver:
-    """Takes the steps of a solve of factors alone, each by GTSAM's optimizer."""
-
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, ordering: gtsam.Ordering | None) -> None:
-        self._graph = _MixedGraph(graph)
-        self._ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph) if ordering is None else ordering
-        self._held: dict[float, gtsam.GaussianFactorGraph] = {}
-
-    def started(self, values: gtsam.Values, error: float) -> _OfGtsam:
-        """Return where the solve begins."""
-        return self._at(values, error, _FIRST_DAMPING)
-
-    def _at(self, values: gtsam.Values, error: float, damping: float) -> _OfGtsam:
-        """Return an optimizer that goes on from some values, the Python factors linearised there."""
-        linearised = self._graph.linearised(values)
-        return _OfGtsam(gtsam.LevenbergMarquardtOptimizer(linearised, values, self._params(damping)), error)
-
-    def linear(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """Return the graph, linear about some values."""
-        return self._graph.linearised(values).linearize(values)
-
-    def error(self, values: gtsam.Values) -> float:
-        """Return half the sum of squares, or of losses."""
-        return self._graph.error(values)
-
-    def step(
-        self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
-    ) -> gtsam.VectorValues | None:
-        """Return the damped step from some values; none where the linear system does not determine it."""
-        if damping not in self._held:
-            self._held[damping] = _held(values.dims(), damping)
-        return _eliminated(_joined(linear, self._held[damping]), self._ordering)
-
-    def _params(self, damping: float) -> gtsam.LevenbergMarquardtParams:
-        params = gtsam.LevenbergMarquardtParams()
-        params.setOrdering(self._ordering)
-        # On one thread, elimination variable by variable takes three quarters of the time of elimination by cliques.
-        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
-        params.setlambdaInitial(damping)
-        params.setlambdaUpperBound(_MOST_DAMPING)
-        params.setlambdaFactor(_DAMPING_FACTOR)
-        return params
-
-    def advanced(self, here: _OfGtsam) -> _OfGtsam:
-        """Return where the next step that lowers the error leads; the same place, where none does."""
-        if not self._graph.has_python:
-            here.optimizer.iterate()
-            return _OfGtsam(here.optimizer, here.optimizer.error())
-        values, tried = here.values(), here.optimizer.lambda_()
-        while tried < _MOST_DAMPING:
-            here.optimizer.iterate()
-            moved = here.values()
-            error = self._graph.error(moved)
-            if error <= here.error:
-                return self._at(moved, error, here.optimizer.lambda_())
-            # The linearisations promised more than their factors keep: from here again, in shorter steps.
-            tried = _DAMPING_FACTOR * max(tried, _FIRST_DAMPING)
-            here = self._at(values, here.error, tried)
-        return here
-
-
-class _InImages(NamedTuple):
+class _Damped(NamedTuple):
     """Where a solve has come to, its error, and the damping of its next step."""
 
     reached: gtsam.Values
@@ -258,8 +185,78 @@ class _InImages(NamedTuple):
         return self.reached
 
 
+class _GraphSolver:
+    """Takes the steps of a solve of factors alone: GTSAM's optimizer does, where none of them is Python's."""
+
+    def __init__(self, graph: MixedGraph, ordering: gtsam.Ordering) -> None:
+        self._graph, self._ordering = graph, ordering
+        # Whether a step raised the error.
+        self.overshot = False
+        self._held: dict[float, gtsam.GaussianFactorGraph] = {}
+
+    def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
+        """Return where the solve begins."""
+        if self._graph.has_python:
+            return _Damped(values, error, _FIRST_DAMPING)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(self._graph.native, values, self._params())
+        return _OfGtsam(optimizer, error)
+
+    def _params(self) -> gtsam.LevenbergMarquardtParams:
+        params = gtsam.LevenbergMarquardtParams()
+        params.setOrdering(self._ordering)
+        # On one thread, elimination variable by variable takes three quarters of the time of elimination by cliques.
+        params.setLinearSolverType("SEQUENTIAL_CHOLESKY")
+        params.setlambdaInitial(_FIRST_DAMPING)
+        params.setlambdaUpperBound(_MOST_DAMPING)
+        params.setlambdaFactor(_DAMPING_FACTOR)
+        return params
+
+    def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
+        """Return where the next step that lowers the error leads; the same place, where none does."""
+        tried, there = here.damping, self._stepped_in_metres(here)
+        self.overshot |= there.damping >= tried
+        return there
+
+    def _stepped_in_metres(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
+        if isinstance(here, _Damped):
+            return self.stepped(here, gtsam.Values.retract, 0.0)
+        here.optimizer.iterate()
+        return _OfGtsam(here.optimizer, here.optimizer.error())
+
+    def stepped(
+        self,
+        here: _Damped,
+        taken: Callable[[gtsam.Values, gtsam.VectorValues], gtsam.Values],
+        least_damping: float,
+    ) -> _Damped:
+        """Return where the least damped step that lowers the error leads; ``taken`` says where a step leads.
+
+        One that raises the error by next to nothing is at a minimum: more damping would gain no more (GTSAM's rule).
+        """
+        linear, damping = self._graph.linear(here.reached), here.damping
+        while damping < _MOST_DAMPING:
+            step = self._step(linear, here.reached, damping)
+            if step is not None:
+                there = taken(here.reached, step)
+                error = self._graph.error(there)
+                if error <= here.error:
+                    return _Damped(there, error, max(damping / _DAMPING_FACTOR, least_damping))
+                if error - here.error < _NEXT_TO_NOTHING * here.error:
+                    break
+            damping *= _DAMPING_FACTOR
+        return here._replace(held_back=False)
+
+    def _step(
+        self, linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
+    ) -> gtsam.VectorValues | None:
+        """Return the damped step from some values; none where the linear system does not determine it."""
+        if damping not in self._held:
+            self._held[damping] = _held(values.dims(), damping)
+        return _eliminated(_joined(linear, self._held[damping]), self._ordering)
+
+
 class _ImageSolver:
-    """Takes GTSAM's steps until one raises the error, and from there on steps whose landmarks move in images.
+    """Takes steps in metres until one raises the error, and from there on steps whose landmarks move in images.
 
     That one step was damped says nothing of how near the minimum is: it is never the last.
     """
@@ -267,31 +264,21 @@ class _ImageSolver:
     def __init__(self, in_metres: _GraphSolver, images: FirstImages) -> None:
         self._in_metres, self._images = in_metres, images
 
-    def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _InImages:
+    def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
         """Return where the solve begins."""
+        if self._images.at_once:
+            return _Damped(values, error, _IN_IMAGES)
         return self._in_metres.started(values, error)
 
-    def advanced(self, here: _OfGtsam | _InImages) -> _OfGtsam | _InImages:
+    def advanced(self, here: _OfGtsam | _Damped) -> _OfGtsam | _Damped:
         """Return where the next step that lowers the error leads; the same place, where none does."""
-        if isinstance(here, _InImages):
-            return self._advanced(here)
-        tried = here.optimizer.lambda_()
+        if self._images.at_once or self._in_metres.overshot:
+            assert isinstance(here, _Damped)
+            return self._in_metres.stepped(here, self._images.taken, _IN_IMAGES)
         there = self._in_metres.advanced(here)
-        if there.optimizer.lambda_() < tried:
-            return there
-        return _InImages(there.values(), there.error, _IN_IMAGES, held_back=True)
-
-    def _advanced(self, here: _InImages) -> _InImages:
-        linear, damping = self._in_metres.linear(here.reached), here.damping
-        while damping < _MOST_DAMPING:
-            step = self._in_metres.step(linear, here.reached, damping)
-            if step is not None:
-                there = self._images.taken(here.reached, step)
-                error = self._in_metres.error(there)
-                if error <= here.error:
-                    return _InImages(there, error, max(damping / _DAMPING_FACTOR, _IN_IMAGES))
-            damping *= _DAMPING_FACTOR
-        return here._replace(held_back=False)
+        if self._in_metres.overshot:
+            return _Damped(there.values(), there.error, _IN_IMAGES, held_back=True)
+        return there
 
 
 class _WithLandmarks(NamedTuple):
@@ -310,8 +297,8 @@ class _WithLandmarks(NamedTuple):
 class _LandmarkSolver:
     """Takes the steps of a solve with sightings beside the graph, of which the landmarks alone are damped."""
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, beside: Beside) -> None:
-        self._graph, self._beside = _MixedGraph(graph), beside
+    def __init__(self, graph: MixedGraph, start: gtsam.Values, beside: Beside) -> None:
+        self._graph, self._beside = graph, beside
         self._ordering = gtsam.Ordering.ColamdGaussianFactorGraph(self._linear(start, beside.landmark_steps(start)))
 
     def started(self, values: gtsam.Values, error: float) -> _WithLandmarks:
@@ -319,7 +306,7 @@ class _LandmarkSolver:
         return _WithLandmarks(values, error, _FIRST_SHARE, held_back=False)
 
     def _linear(self, values: gtsam.Values, steps: LandmarkSteps) -> gtsam.GaussianFactorGraph:
-        return _joined(self._graph.linearised(values).linearize(values), steps.sightings)
+        return _joined(self._graph.linear(values), steps.sightings)
 
     def advanced(self, here: _WithLandmarks) -> _WithLandmarks:
         """Return where the next step that lowers the error leads; the same place, where none does."""

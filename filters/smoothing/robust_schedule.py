@@ -6,7 +6,7 @@ covariance. The filters' gate would not do: to keep the 95 % that agree best wit
 measurements by their agreement, a sixth of the squared error gone, and made a simulated drive 1.7 times less accurate.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -16,6 +16,7 @@ from filters.smoothing.discounted_tracks import DiscountedTracks, discounted, se
 from filters.smoothing.elimination_order import cheaper_order
 from filters.smoothing.landmark_steps import FirstImages
 from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
+from filters.smoothing.mixed_graph import MixedGraph
 from filters.smoothing.robust_loss import Cauchy, Huber, Squares
 from filters.smoothing.track_chain import FREEDOM_OF_TRACKS, ChainedFactors, ChainedSightings, without_jumps
 from toolkit.estimate import Landmarks
@@ -23,6 +24,7 @@ from toolkit.geometry import Array, IntArray, se3_inverse, transform
 from toolkit.models import left_only, stereo
 from toolkit.models.factors import SCALE, L, StereoFactors, X, huber_loss, kind_of
 from toolkit.models.gating import FEWEST_SIGHTINGS, LEAST_DISPARITY_PX, chi2_bound, mahalanobis_squared
+from toolkit.models.stacked_factors import StackedFactors
 from toolkit.progress import Progress
 from toolkit.sequence import StereoFrame, StereoRig, is_left_only
 from toolkit.settings import Outliers
@@ -38,6 +40,19 @@ _HUBER_STOPPING, _CAUCHY_STOPPING, _LAST_STOPPING = Stopping(1e-2, 20), Stopping
 
 
 @dataclass(frozen=True, eq=False)
+class MotionFactors:
+    """The factors of motion, and stacks of those among them that are written in Python."""
+
+    graph: gtsam.NonlinearFactorGraph
+    stacks: Sequence[StackedFactors] = ()
+
+    @property
+    def mixed(self) -> MixedGraph:
+        """Return them as a solver takes them."""
+        return MixedGraph(self.graph, self.stacks)
+
+
+@dataclass(frozen=True, eq=False)
 class Smoothed:
     """The last solution, the graph it solves, and the frames (K,) with the sightings that are in it."""
 
@@ -47,7 +62,7 @@ class Smoothed:
 
 
 def solve_robustly(
-    motion: gtsam.NonlinearFactorGraph,
+    motion: MotionFactors,
     frames: list[StereoFrame],
     rig: StereoRig,
     start: gtsam.Values,
@@ -62,13 +77,15 @@ def solve_robustly(
     A scale of disparities among the values stays as it is until what is an outlier has been decided. In the last solve
     tracks count for the share that their residuals leave them by then.
     """
-    values, order_of = start, cheaper_order(motion, frames)
+    values, order_of, overshot = start, cheaper_order(motion.graph, frames), False
     for robust, stopping, stage in _stages(outliers):
-        graph = _with_sightings(motion, frames, StereoFactors(rig, robust))
+        graph = _with_sightings(motion.graph, frames, StereoFactors(rig, robust))
         values = _only_seen(values, frames)
         # Huber's solve is to bring landmarks near, not to an end: to its minimum it takes twice as long for nothing.
-        images = None if stopping is _HUBER_STOPPING else FirstImages.of(frames, rig)
-        values = solve(graph, values, stopping, progress, stage, images, order_of(graph, frames)).values
+        images = None if stopping is _HUBER_STOPPING else FirstImages.of(frames, rig, at_once=overshot)
+        order = order_of(graph, frames)
+        solved = solve(MixedGraph(graph, motion.stacks), values, stopping, progress, stage, images, order)
+        values, overshot = solved.values, overshot or solved.overshot
         frames = _without_those_behind(frames, values, rig)
     frames = [
         frame.select(distance < _cut_bound(outliers, left_only.degrees_of_freedom(frame.uvs_px)))
@@ -84,15 +101,16 @@ def solve_robustly(
         sightings = ChainedSightings.of(frames, rig)
         apart = ChainedFactors(sightings, rig, Squares() if huber is None else Huber(huber))
         return _solve_last(motion, apart, frames, values, _SCALE_STOPPING, progress)
-    graph = _with_sightings(motion, frames, StereoFactors(rig, huber_loss(huber)))
+    graph = _with_sightings(motion.graph, frames, StereoFactors(rig, huber_loss(huber)))
     values, stage = _only_seen(values, frames), "solving without outliers"
-    images = FirstImages.of(frames, rig)
-    last = solve(graph, values, _LAST_STOPPING, progress, stage, images, order_of(graph, frames))
+    images = FirstImages.of(frames, rig, at_once=overshot)
+    order = order_of(graph, frames)
+    last = solve(MixedGraph(graph, motion.stacks), values, _LAST_STOPPING, progress, stage, images, order)
     return Smoothed(last, graph, frames)
 
 
 def _solve_chained(
-    motion: gtsam.NonlinearFactorGraph,
+    motion: MotionFactors,
     frames: list[StereoFrame],
     rig: StereoRig,
     start: gtsam.Values,
@@ -111,7 +129,8 @@ def _solve_chained(
     robust = ChainedFactors(sightings, rig, Squares())
     if outliers.batch_cauchy is not None:
         robust = replace(robust, loss=Cauchy(outliers.batch_cauchy), freedom=FREEDOM_OF_TRACKS)
-    values = solve(motion, values, _JUMPS_STOPPING, progress, "solving along the tracks", robust).values
+    stage = "solving along the tracks"
+    values = solve(motion.mixed, values, _JUMPS_STOPPING, progress, stage, robust).values
     dof = left_only.degrees_of_freedom(sightings.uv_px)
     jumped = np.square(robust.innovations(values)).sum(axis=1) > _cut_bound(outliers, dof)
     sightings, frames = without_jumps(sightings, frames, jumped)
@@ -120,7 +139,7 @@ def _solve_chained(
 
 
 def _solve_last(
-    motion: gtsam.NonlinearFactorGraph,
+    motion: MotionFactors,
     sightings: ChainedFactors,
     frames: list[StereoFrame],
     start: gtsam.Values,
@@ -128,8 +147,9 @@ def _solve_last(
     progress: Progress,
 ) -> Smoothed:
     values = _only_seen(start, frames)
-    solution = solve(motion, values, stopping, progress, "solving along the tracks, without outliers", sightings)
-    graph = gtsam.NonlinearFactorGraph(motion)
+    stage = "solving along the tracks, without outliers"
+    solution = solve(motion.mixed, values, stopping, progress, stage, sightings)
+    graph = gtsam.NonlinearFactorGraph(motion.graph)
     graph.push_back(sightings.linearised(solution.values))
     return Smoothed(solution, graph, frames)
 

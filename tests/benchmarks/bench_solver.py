@@ -60,7 +60,7 @@ def measure(source: str, frames: int) -> None:
 
     def both(graph: Any, start: Any, stopping: Stopping, *rest: Any, **named: Any) -> Solution:
         solution, spent_s = timed(lambda: solve(graph, start, stopping, *rest, **named))
-        optimizer, own_s = timed(lambda: own(graph, start, stopping))
+        optimizer, own_s = timed(lambda: own(graph.whole, start, stopping))
         ours_s.append(spent_s)
         theirs_s.append(own_s)
         print(

@@ -1,10 +1,13 @@
 """The batch smoother: what it takes in, and that it is the least-squares answer of those measurements."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from filters.smoothing import robust_schedule
+from filters.smoothing.levenberg_marquardt import Solution, solve
 from filters.smoothing.robust_schedule import worth_smoothing
 from toolkit.estimate import Landmarks
 from toolkit.geometry import Array, se3_inverse
@@ -50,6 +53,22 @@ def test_it_knows_no_answer_before_the_end(run_estimator):
     run = run_estimator("batch", simulate(replace(DRIVE, duration_s=2.0), 0))
     assert run.causal is None
     assert run.final is not None
+
+
+@pytest.mark.parametrize("overshoots", [True, False])
+def test_once_a_step_has_raised_the_error_landmarks_move_in_images_from_the_start_of_later_solves(
+    overshoots, run_estimator, monkeypatch
+):
+    at_once: list[bool | None] = []
+
+    def recorded(*arguments: Any) -> Solution:
+        images = arguments[5]
+        at_once.append(None if images is None else images.at_once)
+        return solve(*arguments)._replace(overshot=overshoots and len(at_once) == 1)
+
+    monkeypatch.setattr(robust_schedule, "solve", recorded)
+    assert run_estimator("batch", simulate(replace(DRIVE, duration_s=2.0), 0)).status == "ok"
+    assert at_once == [None, overshoots, overshoots]
 
 
 def frame_of(sightings: dict[int, float]) -> StereoFrame:

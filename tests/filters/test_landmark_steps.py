@@ -185,6 +185,24 @@ def test_as_long_as_no_step_raises_the_error_all_is_gtsams_own(monkeypatch):
     assert alone.values.equals(with_images.values, 0.0)
 
 
+def test_a_solve_says_whether_a_step_in_metres_raised_the_error(monkeypatch):
+    graph, start, images = bent_drive(0)
+    assert solve(graph, start, Stopping(1e-4, 10), landmarks=images).overshot
+    # The same without images to move in, as Huber's solve is.
+    assert solve(graph, start, Stopping(1e-4, 10)).overshot
+    monkeypatch.setattr(levenberg_marquardt, "_FIRST_DAMPING", 100.0)
+    assert not solve(graph, start, Stopping(0.0, 2), landmarks=images).overshot
+
+
+def test_landmarks_that_move_in_images_at_once_take_no_step_in_metres_to_the_same_minimum():
+    graph, start, images = bent_drive(0)
+    late, early = (solve(graph, start, EXACT, landmarks=it) for it in (images, replace(images, at_once=True)))
+    assert early.converged
+    assert late.overshot
+    assert not early.overshot
+    assert early.error == pytest.approx(late.error, rel=1e-9)
+
+
 def test_landmarks_move_to_first_order_by_the_graphs_own_step():
     _, start, images = bent_drive(0)
     rng, step, length = np.random.default_rng(0), gtsam.VectorValues(), 1e-6

@@ -9,7 +9,7 @@ import pytest
 from toolkit.geometry import se3_exp
 from toolkit.measured_motion import TwistChangeNoise, TwistMotion, TwistNoise
 from toolkit.models.factors import X
-from toolkit.models.gap_bridge import GapBridge, KeptTwist, TwistChange, bridged, gaps, kept_twist
+from toolkit.models.gap_bridge import GapBridge, KeptTwist, TwistChange, bridged, bridges, gaps, kept_twist
 from toolkit.sequence import StereoFrame
 
 NOISE = TwistChangeNoise(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.5, 0.7]))
@@ -38,12 +38,12 @@ def test_a_gap_is_where_no_track_leads_on():
 
 def test_a_bridge_stands_at_a_gap_and_its_neighbours_alone():
     frames = frames_of([1], [1], [1], [1], [2], [2], [2], [2])
-    graph = bridged(frames, NOISE)
+    graph = bridged(bridges(frames, NOISE))
     assert [tuple(graph.at(i).keys()) for i in range(graph.size())] == [(X(2), X(3), X(4)), (X(3), X(4), X(5))]
-    assert bridged(frames_of([1], [1], [1]), NOISE).size() == 0
+    assert bridged(bridges(frames_of([1], [1], [1]), NOISE)).size() == 0
     # At the ends there is a neighbour on one side, or none.
-    assert bridged(frames_of([1], [2]), NOISE).size() == 0
-    assert bridged(frames_of([1], [2], [2]), NOISE).size() == 1
+    assert bridged(bridges(frames_of([1], [2]), NOISE)).size() == 0
+    assert bridged(bridges(frames_of([1], [2], [2]), NOISE)).size() == 1
 
 
 def test_a_body_that_keeps_its_twist_costs_nothing():
@@ -102,7 +102,7 @@ def test_intervals_are_as_long_as_their_stamps_say():
     twist = np.array([0.0, 0.0, 0.3, 8.0, 0.0, 0.0])
     poses = [np.eye(4), se3_exp(0.1 * twist), se3_exp(0.2 * twist)]
     assert all(later.t_ns - sooner.t_ns == 100_000_000 for sooner, later in pairwise(frames))
-    assert bridged(frames, NOISE).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
+    assert bridged(bridges(frames, NOISE)).error(values_of(poses)) == pytest.approx(0.0, abs=1e-18)
 
 
 def driven(bridge, ids_of_frames, sigma, error, seed=0):

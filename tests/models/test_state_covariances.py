@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import count
 from typing import NamedTuple
 
 import gtsam
@@ -24,16 +23,8 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, simulate
 SHORT = {"drive": replace(DRIVE, duration_s=3.0), "flight": replace(FLIGHT, duration_s=5.0)}
 
 
-def _only_dissected(eliminated):
-    """Return an elimination that fails every other time, which is in the order of time."""
-    calls = count()
-
-    def eliminate(*given):
-        if next(calls) % 2 == 0:
-            raise RoundingError("not in the order of time")
-        return eliminated(*given)
-
-    return eliminate
+def _refused(*_given: object) -> gtsam.Ordering:
+    raise RoundingError("not in this order")
 
 
 class Smoothed(NamedTuple):
@@ -87,18 +78,33 @@ def test_every_state_of_a_run_has_gtsams_marginal(scenario, smoothed):
 
 
 @pytest.mark.parametrize(
-    ("scenario", "in_time", "most_tied"),
-    [("drive", True, 5), ("flight", True, 5), ("drive", False, 50), ("flight", False, 50)],
+    ("scenario", "refused", "most_tied"),
+    [("drive", "_dissected", 5), ("flight", "_dissected", 5), ("drive", "_in_time", 50), ("flight", "_in_time", 50)],
 )
-def test_every_state_has_gtsams_marginal_in_any_order(scenario, in_time, most_tied, smoothed, monkeypatch):
-    """In the order of time, landmarks among the states or before them, and by nested dissection where it is no good."""
+def test_every_state_has_gtsams_marginal_in_any_order(scenario, refused, most_tied, smoothed, monkeypatch):
+    """In the order of time, landmarks among the states or before them, and by nested dissection."""
     problem = smoothed(scenario)
     monkeypatch.setattr(state_covariances, "_MOST_TIED", most_tied)
-    if not in_time:
-        monkeypatch.setattr(state_covariances, "_eliminated", _only_dissected(state_covariances._eliminated))
+    monkeypatch.setattr(state_covariances, refused, _refused)
     cov, log = problem.covariances()
     assert log == ()
     assert_marginals(cov, problem.marginals)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "standing", "first"),
+    [("drive", 150, "_dissected"), ("drive", 5, "_in_time"), ("flight", 150, "_in_time")],
+)
+def test_the_order_of_time_comes_first_with_an_imu_and_where_landmarks_are_seen_for_long(
+    scenario, standing, first, smoothed, monkeypatch
+):
+    tried, problem = [], smoothed(scenario)
+    for name in ("_dissected", "_in_time"):
+        order = getattr(state_covariances, name)
+        monkeypatch.setattr(state_covariances, name, lambda *given, n=name, o=order: tried.append(n) or o(*given))
+    monkeypatch.setattr(state_covariances, "_STANDING", standing)
+    problem.covariances()
+    assert tried == [first]
 
 
 @pytest.mark.parametrize("scenario", [DRIVE, DRIVE_IMU, FLIGHT], ids=lambda s: s.name)

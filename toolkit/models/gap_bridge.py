@@ -7,7 +7,7 @@ the three poses of two intervals, at least one of them a gap, beside the measure
 tracks tell the motion better than such a prior, which would hold all turns and speeds back and shrink the world.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -163,11 +163,17 @@ def gap_bridge_for(measured: MotionNoise, window_s: float) -> GapBridge | None:
     return GapBridge(window_s, measured) if isinstance(measured, TwistNoise) else None
 
 
-def bridged(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> gtsam.NonlinearFactorGraph:
-    """Return the factors over the gaps of frames (K,), of which frame k has the pose X(k)."""
-    graph, places = gtsam.NonlinearFactorGraph(), gaps(frames)
-    for k in sorted({k for place in places.tolist() for k in (place, place + 1) if 2 <= k < len(frames)}):
-        graph.add(kept_twist(KeptTwist(*_durations_s(frames[k - 2 : k + 1]), noise), k))
+def bridges(frames: Sequence[StereoFrame], noise: TwistChangeNoise) -> dict[int, KeptTwist]:
+    """Return what is kept over the gaps of frames (K,), by the last of the three frames that it concerns."""
+    ends = sorted({k for place in gaps(frames).tolist() for k in (place, place + 1) if 2 <= k < len(frames)})
+    return {k: KeptTwist(*_durations_s(frames[k - 2 : k + 1]), noise) for k in ends}
+
+
+def bridged(over: Mapping[int, KeptTwist]) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of bridges, of frames that have the poses X(k)."""
+    graph = gtsam.NonlinearFactorGraph()
+    for k, kept in over.items():
+        graph.add(kept_twist(kept, k))
     return graph
 
 

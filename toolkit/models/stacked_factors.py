@@ -1,0 +1,169 @@
+"""Python factors of one form, evaluated and linearised all at once, for a solver that has many of them.
+
+GTSAM calls a factor of Python's by itself: a thousand steps along twists then take as long as the thirty thousand
+stereo factors beside them. Residuals, noise and derivatives here are those of the factors one by one
+(:func:`~toolkit.models.twist.twist_factor`, :func:`~toolkit.models.gap_bridge.kept_twist`), on arrays.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import gtsam
+import numpy as np
+
+from toolkit.geometry import Array, IntArray, se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian
+from toolkit.models.factors import B, X, linear_factor
+from toolkit.models.gap_bridge import KeptTwist
+from toolkit.models.motion import Increment
+from toolkit.models.twist import TwistIncrement
+
+Keys = tuple[int, ...]
+
+
+class Linearised(NamedTuple):
+    """Whitened residuals (N, 6) and their derivatives (N, 6, d) by each of the variables of a factor, in its order."""
+
+    residuals: Array
+    derivatives: tuple[Array, ...]
+
+
+class StackedFactors(Protocol):
+    """N factors of one form."""
+
+    @property
+    def keys(self) -> Sequence[Keys]:
+        """Return the keys of each factor, by which it is known in a graph that has it one by one."""
+
+    def residuals(self, values: gtsam.Values) -> Array:
+        """Return the whitened residuals (N, 6)."""
+
+    def linearised(self, values: gtsam.Values) -> Linearised:
+        """Return residuals and derivatives about some values."""
+
+
+def linear_factors(stack: StackedFactors, values: gtsam.Values) -> Iterator[gtsam.JacobianFactor]:
+    """Yield the factors, linear about some values."""
+    residuals, derivatives = stack.linearised(values)
+    for row, keys in enumerate(stack.keys):
+        yield linear_factor([(key, of[row]) for key, of in zip(keys, derivatives, strict=True)], -residuals[row])
+
+
+def stacked(increments: Mapping[int, Increment], over: Mapping[int, KeptTwist]) -> list[StackedFactors]:
+    """Return stacks of the motion to states by their numbers and of bridges, as far as their factors are Python's."""
+    steps = {k: increment for k, increment in increments.items() if isinstance(increment, TwistIncrement)}
+    stacks = list[StackedFactors]()
+    if steps:
+        stacks.append(StackedSteps.of(steps))
+    if over:
+        stacks.append(StackedBridges.of(over))
+    return stacks
+
+
+@dataclass(frozen=True, eq=False)
+class StackedSteps:
+    """The steps to N states ``k`` (N,), each integrated about its gyro bias (N, 3) rad/s: T_start_end (N, 4, 4).
+
+    ``d_step_d_bias`` (N, 6, 3) is as a step has it, ``whitening`` (N, 6, 6) makes its noise one of unit covariance.
+    """
+
+    k: IntArray
+    T_start_end: Array
+    d_step_d_bias: Array
+    gyro_bias: Array
+    whitening: Array
+
+    @classmethod
+    def of(cls, increments: Mapping[int, TwistIncrement]) -> "StackedSteps":
+        """Return the steps to states by their numbers."""
+        steps = [increment.step for increment in increments.values()]
+        return cls(
+            np.array(list(increments), dtype=np.int64),
+            np.array([step.T_start_end for step in steps]),
+            np.array([step.d_step_d_bias for step in steps]),
+            np.array([increment.gyro_bias for increment in increments.values()]),
+            np.linalg.inv(np.linalg.cholesky(np.array([step.cov for step in steps]))),
+        )
+
+    @property
+    def keys(self) -> Sequence[Keys]:
+        """Return the keys of the pose and the gyro bias at the start and of the pose at the end, as a factor has."""
+        return [(X(k - 1), X(k), B(k - 1)) for k in self.k.tolist()]
+
+    def residuals(self, values: gtsam.Values) -> Array:
+        """Return the whitened residuals (N, 6)."""
+        return _whitened(self.whitening, se3_log(self._errors(values)[1]))
+
+    def linearised(self, values: gtsam.Values) -> Linearised:
+        """Return residuals and derivatives about some values."""
+        step_now, error_pose = self._errors(values)
+        error = se3_log(error_pose)
+        by_end = self.whitening @ np.linalg.inv(se3_right_jacobian(error))
+        by_step = -by_end @ se3_adjoint(se3_inverse(error_pose))
+        by_start = by_step @ se3_adjoint(se3_inverse(step_now))
+        return Linearised(_whitened(self.whitening, error), (by_start, by_end, by_step @ self.d_step_d_bias))
+
+    def _errors(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """Return the steps (N, 4, 4) with the biases that the values have, and what they are off at their ends."""
+        bias = np.array([values.atVector(B(k - 1)) for k in self.k.tolist()])
+        correction = (self.d_step_d_bias @ (bias - self.gyro_bias)[..., None])[..., 0]
+        step_now = self.T_start_end @ se3_exp(correction)
+        moved = se3_inverse(_poses(values, self.k - 1)) @ _poses(values, self.k)
+        return step_now, se3_inverse(step_now) @ moved
+
+
+@dataclass(frozen=True, eq=False)
+class StackedBridges:
+    """That the twists of two intervals are the same, which last some seconds each (N, 2) and end in states ``k`` (N,).
+
+    ``sigmas`` (N, 6) are the standard deviations of the change.
+    """
+
+    k: IntArray
+    lasting_s: Array
+    sigmas: Array
+
+    @classmethod
+    def of(cls, bridges: Mapping[int, KeptTwist]) -> "StackedBridges":
+        """Return what is kept up to states by their numbers."""
+        kept = list(bridges.values())
+        return cls(
+            np.array(list(bridges), dtype=np.int64),
+            np.array([(one.before_s, one.after_s) for one in kept]),
+            np.array([one.sigmas for one in kept]),
+        )
+
+    @property
+    def keys(self) -> Sequence[Keys]:
+        """Return the keys of the three poses, as a factor has them."""
+        return [(X(k - 2), X(k - 1), X(k)) for k in self.k.tolist()]
+
+    def residuals(self, values: gtsam.Values) -> Array:
+        """Return the whitened residuals (N, 6)."""
+        return self._change(se3_log(self._steps(values)))
+
+    def linearised(self, values: gtsam.Values) -> Linearised:
+        """Return residuals and derivatives about some values."""
+        steps = self._steps(values)
+        logs = se3_log(steps)
+        ends = np.linalg.inv(se3_right_jacobian(logs)) / self.lasting_s[..., None, None] / self.sigmas[:, None, :, None]
+        starts = -ends @ se3_adjoint(se3_inverse(steps))
+        by_poses = (-starts[:, 0], starts[:, 1] - ends[:, 0], ends[:, 1])
+        return Linearised(self._change(logs), by_poses)
+
+    def _steps(self, values: gtsam.Values) -> Array:
+        """Return the motions (N, 2, 4, 4) over the two intervals."""
+        poses = np.stack([_poses(values, self.k - before) for before in (2, 1, 0)], axis=1)
+        return np.asarray(se3_inverse(poses[:, :2]) @ poses[:, 1:])
+
+    def _change(self, logs: Array) -> Array:
+        twists = logs / self.lasting_s[..., None]
+        return np.asarray((twists[:, 1] - twists[:, 0]) / self.sigmas)
+
+
+def _whitened(whitening: Array, residuals: Array) -> Array:
+    return np.asarray((whitening @ residuals[..., None])[..., 0])
+
+
+def _poses(values: gtsam.Values, frames: IntArray) -> Array:
+    return np.array([values.atPose3(X(k)).matrix() for k in frames.tolist()])
