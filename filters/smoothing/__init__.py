@@ -5,5 +5,6 @@ Incremental smoothers: ``graph_builder`` (what a packet adds) with ``outlier_che
 is linearised anew) and ``frozen_variables``. With noise of tracks ``chained_window`` and ``chained_past``. Smart
 factors: ``smart_factors``, ``smart_window``, ``smart_solver``. Batch: ``robust_schedule`` of solves by
 ``levenberg_marquardt`` of a ``mixed_graph``, in an ``elimination_order``, then ``track_chain`` with ``landmark_steps``,
-and ``scale_state``. Both: ``robust_loss``, and ``discounted_tracks``, which count for less where their residuals are correlated.
+and ``scale_state``. Both: ``robust_loss``, and ``discounted_tracks``, which count for less where their residuals are
+correlated.
 """
