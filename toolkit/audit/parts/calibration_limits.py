@@ -38,8 +38,8 @@ class Limits(NamedTuple):
 # s to whole, six leave 3.4 % of fx, 3.0 px of cx, 0.3 px of cy and 0.025 rad: tracks that creep from image to image
 # bend the view, and twists slip. Chosen with these in view, about twice that and more for cy. What hides beside an IMU
 # is said from the size on at which runs are three times as wrong: 2 % of a focal length (8 to 11 times on `flight`), 1
-# degree of a turn (3.4 times on `drive-imu`). What hides of where the
-# camera looks beside odometry, velocities from frame to frame say (`miscalibration`).
+# degree of a turn (3.4 times on `drive-imu`). What hides of where the camera looks beside odometry, velocities from
+# frame to frame say (`miscalibration`).
 LIMITS: dict[MotionKind, Limits] = {
     "imu": Limits(4.0, 0.012, (2.0, 5.0), 0.006, 0.015, 0.0008, 0.02, 10.0, 0.02),
     "twist": Limits(6.0, 0.06, (8.0, 12.0), 0.06, np.inf, np.inf, 0.16, np.inf, np.inf),
