@@ -61,9 +61,9 @@ def test_answers_of_the_documented_shapes_pass(sequence: Sequence) -> None:
     [
         (
             lambda sound, _: (sound.t_ns, sound.T_world_imu),
-            "frame 0 is a value of type tuple; step returns an",
+            "frame 0 is a tuple; step returns an",
         ),
-        (lambda sound, _: sound.T_world_imu, "frame 0 is a value of type ndarray"),
+        (lambda sound, _: sound.T_world_imu, "frame 0 is a ndarray"),
         (
             lambda sound, _: replace(sound, T_world_imu=np.eye(3)),
             r"T_world_imu .* frame 0 has shape (3, 3); expec",
@@ -71,7 +71,7 @@ def test_answers_of_the_documented_shapes_pass(sequence: Sequence) -> None:
         (lambda sound, _: replace(sound, T_world_imu=None), "T_world_imu of its answer to frame 0 is None"),
         (
             lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.tolist()),
-            "is a value of type list; it is an",
+            "is a list; it is an",
         ),
         (lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.astype(complex)), "has the type complex128"),
         (lambda sound, _: replace(sound, T_world_imu=sound.T_world_imu.astype(object)), "has the type object"),
@@ -84,7 +84,7 @@ def test_answers_of_the_documented_shapes_pass(sequence: Sequence) -> None:
         ),
         (lambda sound, _: replace(sound, v_world=np.zeros(2)), "v_world of its answer to frame 0 has shape (2,)"),
         (lambda sound, _: replace(sound, bias=np.zeros((6, 1))), "bias of its answer to frame 0 has shape (6, 1)"),
-        (lambda sound, _: replace(sound, info=[1.0]), "info of its answer to frame 0 is a value of type list"),
+        (lambda sound, _: replace(sound, info=[1.0]), "info of its answer to frame 0 is a list"),
         (lambda sound, _: replace(sound, info={"nis": "1"}), "has 'nis': '1'; it is a dict of numbers by name"),
     ],
 )
@@ -109,10 +109,10 @@ def of_trajectory(**changed: Any) -> End:
     ("end", "why"),
     [
         (lambda sound: None, "finish answered with None; it returns a Finished"),
-        (lambda sound: sound.trajectory, "finish answered with a value of type Trajectory"),
-        (lambda sound: replace(sound, trajectory=[]), "the trajectory of its finish is a value of type list"),
+        (lambda sound: sound.trajectory, "finish answered with a Trajectory"),
+        (lambda sound: replace(sound, trajectory=[]), "the trajectory of its finish is a list"),
         (lambda sound: replace(sound, landmarks=None), "the landmarks of its finish are None"),
-        (lambda sound: replace(sound, log="all is well"), "the log of its finish is a value of type str"),
+        (lambda sound: replace(sound, log="all is well"), "the log of its finish is a str"),
         (
             of_trajectory(T_world_imu=np.eye(4)),
             "T_world_imu of its final trajectory has shape (4, 4); expected",

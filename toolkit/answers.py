@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from toolkit.errors import EstimatorError
+from toolkit.errors import EstimatorError, type_of
 from toolkit.estimate import Estimate, Finished, Landmarks, Trajectory
 from toolkit.geometry import IntArray
 from toolkit.sequence import Packet
@@ -43,7 +43,7 @@ def checked_estimate(answer: Any, packet: Packet, before: Estimate | None) -> Es
 def check_state(answer: Any, frame: int) -> None:
     """Raise EstimatorError where an answer of ``step`` to a frame is no Estimate of a pose, velocity and biases."""
     if not isinstance(answer, Estimate):
-        raise EstimatorError(f"its answer to frame {frame} is {_kind(answer)}; step returns an Estimate or None")
+        raise EstimatorError(f"its answer to frame {frame} is {type_of(answer)}; step returns an Estimate or None")
     _check_arrays(answer, _STATE, f"of its answer to frame {frame}")
 
 
@@ -53,14 +53,14 @@ def checked_finish(answer: Any, frames_t_ns: IntArray, answered: bool) -> Finish
     Raises EstimatorError where it is no Finished, is about stamps that are no frames' (F,), or about nothing at all.
     """
     if not isinstance(answer, Finished):
-        raise EstimatorError(f"finish answered with {_kind(answer)}; it returns a Finished")
+        raise EstimatorError(f"finish answered with {type_of(answer)}; it returns a Finished")
     trajectory, landmarks = answer.trajectory, answer.landmarks
     if not isinstance(trajectory, Trajectory):
-        raise EstimatorError(f"the trajectory of its finish is {_kind(trajectory)}; it is a Trajectory")
+        raise EstimatorError(f"the trajectory of its finish is {type_of(trajectory)}; it is a Trajectory")
     if not isinstance(landmarks, Landmarks):
-        raise EstimatorError(f"the landmarks of its finish are {_kind(landmarks)}; they are Landmarks")
+        raise EstimatorError(f"the landmarks of its finish are {type_of(landmarks)}; they are Landmarks")
     if isinstance(answer.log, str) or not isinstance(answer.log, Sequence):
-        raise EstimatorError(f"the log of its finish is {_kind(answer.log)}; it is a tuple of texts")
+        raise EstimatorError(f"the log of its finish is {type_of(answer.log)}; it is a tuple of texts")
     count = len(trajectory)
     stacked = {name: tuple((count, *one) for one in shapes) for name, shapes in {**_STATE, **_COVARIANCE}.items()}
     _check_arrays(trajectory, stacked, "of its final trajectory")
@@ -82,7 +82,7 @@ def _check_array(what: str, value: Any, shapes: tuple[tuple[int, ...], ...], *, 
     if value is None and not required:
         return
     if not isinstance(value, np.ndarray):
-        raise EstimatorError(f"{what} is {_kind(value)}; it is an array of numbers")
+        raise EstimatorError(f"{what} is {type_of(value)}; it is an array of numbers")
     if value.dtype.kind not in "fiu":
         raise EstimatorError(f"{what} has the type {value.dtype}; it is an array of real numbers")
     if value.shape not in shapes:
@@ -91,7 +91,7 @@ def _check_array(what: str, value: Any, shapes: tuple[tuple[int, ...], ...], *, 
 
 def _check_info(info: Any, where: str) -> None:
     if not isinstance(info, Mapping):
-        raise EstimatorError(f"info {where} is {_kind(info)}; it is a dict of numbers by name")
+        raise EstimatorError(f"info {where} is {type_of(info)}; it is a dict of numbers by name")
     for name in _not_numbers(info):
         raise EstimatorError(f"info {where} has {name!r}: {info[name]!r}; it is a dict of numbers by name")
 
@@ -100,7 +100,3 @@ def _not_numbers(info: Mapping[Any, Any]) -> Iterator[Any]:
     for name, value in info.items():
         if not isinstance(name, str) or not isinstance(value, float | int | np.number):
             yield name
-
-
-def _kind(value: object) -> str:
-    return "None" if value is None else f"a value of type {type(value).__name__}"

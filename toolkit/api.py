@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import numpy as np
 
-from toolkit.errors import VislamError, did_you_mean
+from toolkit.errors import VislamError, did_you_mean, type_of
 from toolkit.estimate import Output, Run
 from toolkit.estimator import Build, defaults
 from toolkit.experiment import Comparison, Plan, Record
@@ -98,7 +98,7 @@ def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapp
     own = _by_name("own", given)
     for name, build in own.items():
         if not name or not callable(build):
-            raise SettingsError(f"own has {name!r}: {_kind(build)}; give functions build(setup), each by a name")
+            raise SettingsError(f"own has {name!r}: {type_of(build)}; give functions build(setup), each by a name")
     both = sorted(set(named) & set(own))
     if both:
         raise SettingsError(f"own has a function called {both[0]}, and so has estimators: give it another name")
@@ -107,7 +107,7 @@ def _own_beside(named: Iterable[str], given: Mapping[str, Build] | None) -> Mapp
 
 def _with_seeds(settings: Settings | Mapping[str, Any], seed: int | None, seeds: int | None) -> Settings:
     if not isinstance(settings, Settings | Mapping):
-        raise SettingsError(f"settings is {_kind(settings)}; give nested values, as {{'seeds': 3}}")
+        raise SettingsError(f"settings is {type_of(settings)}; give nested values, as {{'seeds': 3}}")
     values = as_values(settings) if isinstance(settings, Settings) else dict(settings)
     given = {"first_seed": seed, "seeds": seeds}
     return settings_of(_plain(values | {key: value for key, value in given.items() if value is not None}), "settings")
@@ -117,7 +117,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested values with Python's numbers in the place of NumPy's."""
     strange = [key for key in values if not isinstance(key, str)]
     if strange:
-        raise SettingsError(f"settings has {_kind(strange[0])} for a key, {strange[0]!r}; settings have names")
+        raise SettingsError(f"settings has {type_of(strange[0])} for a key, {strange[0]!r}; settings have names")
     return {
         key: _plain(value) if isinstance(value, Mapping) else value.item() if isinstance(value, np.generic) else value
         for key, value in values.items()
@@ -127,7 +127,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 def _source(given: Source) -> str | Sequence:
     if isinstance(given, str | Path | Sequence):
         return given if isinstance(given, Sequence) else str(given)
-    raise SettingsError(f"source is {_kind(given)}; give one recording: a path, a built-in name, a Sequence")
+    raise SettingsError(f"source is {type_of(given)}; give one recording: a path, a built-in name, a Sequence")
 
 
 def _names(what: str, given: Names) -> tuple[str, ...]:
@@ -141,35 +141,27 @@ def _names(what: str, given: Names) -> tuple[str, ...]:
     strange = [one for one in names if not isinstance(one, str)]
     if strange:
         otherwise = "; functions build(setup) go by name into own" if what == "estimators" else ""
-        raise SettingsError(f"{what} has {_kind(strange[0])}, expected names{otherwise}")
+        raise SettingsError(f"{what} has {type_of(strange[0])}, expected names{otherwise}")
     return names
 
 
 def _by_name(what: str, given: Mapping[str, Named] | None) -> Mapping[str, Named]:
     if given is not None and not isinstance(given, Mapping):
-        raise SettingsError(f"{what} is {_kind(given)}; give a dict, by name")
+        raise SettingsError(f"{what} is {type_of(given)}; give a dict, by name")
     strange = [name for name in given or {} if not isinstance(name, str)]
     if strange:
-        raise SettingsError(f"{what} has {_kind(strange[0])} for a name, {strange[0]!r}; give a text")
+        raise SettingsError(f"{what} has {type_of(strange[0])} for a name, {strange[0]!r}; give a text")
     return given or {}
 
 
 def _path(what: str, given: str | Path) -> Path:
     if isinstance(given, str | Path):
         return Path(given)
-    raise SettingsError(f"{what} is {_kind(given)}; give a path")
+    raise SettingsError(f"{what} is {type_of(given)}; give a path")
 
 
 def _paths(what: str, given: Mapping[str, str | Path] | None) -> dict[str, Path]:
     return {name: _path(f"{what}[{name!r}]", file) for name, file in _by_name(what, given).items()}
-
-
-def _kind(value: object) -> str:
-    """Say of which type a value is, as in "an int" and "a list"."""
-    if value is None:
-        return "None"
-    name = type(value).__name__
-    return f"{'an' if name[0] in 'aeioAEIO' else 'a'} {name}"
 
 
 def _number(what: str, given: float) -> float:
@@ -195,7 +187,7 @@ class Result:
         """Return the table: the usual columns, those of the metric keys or column names given, or "all"."""
         strange = [column for column in columns if not isinstance(column, str)]
         if strange:
-            raise SettingsError(f"a column is {_kind(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
+            raise SettingsError(f"a column is {type_of(strange[0])}; give names, as in table('ATE SE(3)', 'nis_mean')")
         return ShownTable(comparison_table(self.comparison, requested_columns(columns)))
 
     @cached_property

@@ -82,3 +82,11 @@ def no_such(kind: str, name: str, known: Iterable[str]) -> str:
     close = nearest(name, names)
     hint = f" (did you mean {close}?)" if close else ""
     return f"no {kind} is called {name}{hint}; there are {', '.join(names)}"
+
+
+def type_of(value: object) -> str:
+    """Say of which type a value is, as in "an int" and "a list"."""
+    if value is None:
+        return "None"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeioAEIO' else 'a'} {name}"

@@ -91,7 +91,7 @@ TOLD = {
     "the same array every time": (LATER, "its answer to frame 0 changed after it was given"),
     "a scaled rotation": (ROTATIONS, "rotations are none"),
     "no answer now and then": (STAMPS, "answers at"),
-    "no estimate": (RUNS, "its answer to frame 0 is a value of type tuple; step returns an Estimate or None"),
+    "no estimate": (RUNS, "its answer to frame 0 is a tuple; step returns an Estimate or None"),
     "no pose": (RUNS, "T_world_imu of its answer to frame 0 has shape (3, 4); expected (4, 4)"),
     "it raises": (RUNS, "drive: ZeroDivisionError in line 27 of step: division by zero"),
 }
