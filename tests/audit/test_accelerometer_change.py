@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from toolkit.audit import accelerometer_change
 from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.samples import accelerometer_change
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, clock_jump
+from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.parts.subsets import keep_frames, keep_samples
+from toolkit.audit.timing import clock_jump
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import coarse_samples
 from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.samples import coarse_samples
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -26,7 +26,7 @@ def told(sequence: Sequence) -> list[str]:
 def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk(
     flight: Sequence, walk_px: float
 ) -> None:
-    from toolkit.audit.correlated_tracks import _correlation, _neighbouring_residuals
+    from toolkit.audit.tracks.correlated_tracks import _correlation, _neighbouring_residuals
 
     # No walk of the disparity: what that does to the depth, and so to later steps, theory leaves out.
     walk = TrackNoise(np.zeros(3), walk_px * np.array([1.0, 0.0, 1.0]), np.zeros(3))

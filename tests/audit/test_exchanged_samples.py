@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, exchanged_samples
+from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
+from toolkit.audit.samples import exchanged_samples
 from toolkit.measured_motion import TwistNoise
 from toolkit.models.noise import white_sigma
 from toolkit.sequence import Sequence

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import gyro_scale
 from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.samples import gyro_scale
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

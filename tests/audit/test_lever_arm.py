@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, lever_arm
+from toolkit.audit import audit
+from toolkit.audit.calibration import lever_arm
 from toolkit.audit.fault import Evidence, Symptom, Undecided
 from toolkit.audit.parts.bundle import COMMON, LEVER
 from toolkit.audit.parts.self_calibration import SelfCalibration

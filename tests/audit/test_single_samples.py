@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import implausible, stuck_samples
 from toolkit.audit.fault import Evidence, Symptom
+from toolkit.audit.samples import implausible, stuck_samples
 from toolkit.geometry import Array
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from toolkit.audit import audit, steady_difference
+from toolkit.audit import audit
+from toolkit.audit.agreement import steady_difference
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate

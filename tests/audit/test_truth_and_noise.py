@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import overstated_noise, truth_mismatch
 from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.samples import overstated_noise
+from toolkit.audit.truth import truth_mismatch
 from toolkit.datasets.trajectories.exchanged_axes import exchanges
 from toolkit.measured_motion import ImuNoise
 from toolkit.resampling import NS_PER_S

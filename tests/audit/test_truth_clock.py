@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import audit, truth_clock, truth_mismatch
+from toolkit.audit import audit
 from toolkit.audit.fault import Evidence, Symptom, Undecided
+from toolkit.audit.truth import truth_clock, truth_mismatch
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import uneven_stamps
 from toolkit.audit.fault import Evidence, Symptom
 from toolkit.audit.parts.subsets import keep_frames
+from toolkit.audit.timing import uneven_stamps
 from toolkit.sequence import Sequence
 from toolkit.simulation import SCENARIOS, faults, simulate
 

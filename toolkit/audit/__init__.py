@@ -1,7 +1,9 @@
 """The audit: faults of a recording, found from its data alone, reported and (by default) repaired.
 
-A file in this folder that holds a ``FAULT`` is a fault, found by being here; ``parts`` is what several of them share.
-Read ``fault``, then ``no_disparity`` for the smallest fault, ``stale_frames`` and ``mixed_axes`` for the others' kinds.
+A file with a ``FAULT`` is a fault, found by being in one of the folders: ``timing``, ``tracks``, ``samples``,
+``calibration``, ``agreement`` (of vision with the motion) or ``truth``; ``parts`` is what several of them share.
+Read ``fault``, then ``tracks.no_disparity`` for the smallest fault, ``tracks.stale_frames`` and
+``calibration.mixed_axes`` for the others' kinds.
 """
 
 import importlib
@@ -94,9 +96,10 @@ def _share_lost(before: Sequence, after: Sequence) -> float:
 
 @cache
 def _ordered() -> tuple[Fault, ...]:
-    """Load the faults of this folder, each after the ones it names; equals by name."""
-    modules = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg)
-    loaded = (importlib.import_module(f"{__name__}.{name}") for name in modules)
+    """Load the faults of the folders here, each after the ones it names; equals by the name of their file."""
+    files = [m.name for m in pkgutil.walk_packages(__path__, f"{__name__}.") if not m.ispkg]
+    by_file = sorted(files, key=lambda name: name.rpartition(".")[2])
+    loaded = map(importlib.import_module, by_file)
     known = {module.FAULT.name: module.FAULT for module in loaded if hasattr(module, "FAULT")}
     order = TopologicalSorter({name: fault.after for name, fault in known.items()}).static_order()
     return tuple(known[name] for name in order)

@@ -12,7 +12,7 @@ from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
-from toolkit.audit.units import FORCES, RATES, SPEEDS
+from toolkit.audit.samples.units import FORCES, RATES, SPEEDS
 
 # Ratios of the samples' speed, rate of rotation and specific force to what the camera and gravity say. Sound recordings
 # have speeds of 0.96 to 1.02; the noise of the camera's rotation lowers that of rotations, so only a larger one counts.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from toolkit.audit.disagreement import MOST_FORCE_RATIO, MOST_RATIO
+from toolkit.audit.agreement.disagreement import MOST_FORCE_RATIO, MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.calibration_limits import BESIDE, Wrong, doubtful, hidden, wrong
 from toolkit.audit.parts.intervals import Intervals

@@ -7,9 +7,9 @@ a gyro's drift turns its direction alone.
 
 import numpy as np
 
-from toolkit.audit.correlated_tracks import err_by_themselves
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.robust import CAUCHY_SIGMAS, ITERATIONS, MAD_TO_SIGMA, Scalar
+from toolkit.audit.tracks.correlated_tracks import err_by_themselves
 from toolkit.geometry import Array, BoolArray
 from toolkit.resampling import NS_PER_S
 

@@ -7,11 +7,11 @@ all the same, and no estimator's covariance holds it.
 
 import numpy as np
 
-from toolkit.audit.correlated_tracks import err_by_themselves
+from toolkit.audit.agreement.vision_scale import LARGEST_ERROR, SYSTEMATIC
+from toolkit.audit.calibration.miscalibration import SYSTEMATIC_RAD
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.miscalibration import SYSTEMATIC_RAD
 from toolkit.audit.parts.turn import angle_of, turn_by_velocities
-from toolkit.audit.vision_scale import LARGEST_ERROR, SYSTEMATIC
+from toolkit.audit.tracks.correlated_tracks import err_by_themselves
 
 # Tracks that creep from image to image make so much more of both (a share, rad) in simulations, where nothing slips.
 SCALE_BY_CREEP, TURN_BY_CREEP_RAD = 0.005, 0.003

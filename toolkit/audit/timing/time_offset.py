@@ -18,7 +18,7 @@ from toolkit.audit.parts.intervals import Intervals
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.rotation_offset import camera_offset, is_stamped_at_frames
 from toolkit.audit.parts.subsets import keep_frames
-from toolkit.audit.twist_lag import LAG
+from toolkit.audit.timing.twist_lag import LAG
 from toolkit.measured_motion import TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.audit.calibration.mixed_axes import MIRRORED, axes_named, cauchy, sigmas, signed_axes
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.mixed_axes import MIRRORED, axes_named, cauchy, sigmas, signed_axes
 from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means

@@ -5,7 +5,7 @@ A share of the depths scales every step of the camera. Odometry shows it in velo
 
 import numpy as np
 
-from toolkit.audit.disagreement import MOST_RATIO
+from toolkit.audit.agreement.disagreement import MOST_RATIO
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.bundle import BASELINE
 from toolkit.audit.parts.calibration_limits import hidden_baseline

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from toolkit.audit.correlated_tracks import MOST_CORRELATION, step_correlation
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
+from toolkit.audit.tracks.correlated_tracks import MOST_CORRELATION, step_correlation
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
