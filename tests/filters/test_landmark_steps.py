@@ -215,6 +215,39 @@ def test_landmarks_move_to_first_order_by_the_graphs_own_step():
         np.testing.assert_allclose(moved.at(key) / length, step.at(key), atol=1e-3)
 
 
+def test_a_landmark_whose_disparity_is_below_a_pixel_moves_in_its_image_all_the_same():
+    _, start, images = bent_drive(0)
+    far, first = L(int(images.track_ids[0])), X(int(images.first[0]))
+    in_camera = np.array([[1.0, 1.0, DRIVE.rig.fx_px * DRIVE.rig.baseline_m / 0.5]])
+    start.update(far, transform(start.atPose3(first).matrix() @ RIG.T_imu_cam, in_camera)[0])
+    step, turn = start.zeroVectors(), gtsam.VectorValues()
+    turn.insert(first, np.array([0.01, 0.02, 0.2, 0.0, 0.0, 0.0]))
+    step.update(turn)
+    there = images.taken(start, step)
+    before, after = (
+        stereo.predict(it.atPoint3(far)[None], it.atPose3(first).matrix(), DRIVE.rig) for it in (start, there)
+    )
+    np.testing.assert_allclose(after.uv_px[0], before.uv_px[0] + before.d_uv_d_pose[0] @ step.at(first), rtol=1e-9)
+
+
+def test_a_landmark_of_which_sightings_say_nothing_is_held_all_the_same():
+    _, start, sightings = drive(2)
+    steps = sightings.landmark_steps(start)
+    unknown = replace(steps, information=np.zeros_like(steps.information))
+    for factor in map(unknown.damping(1.0).at, range(TRACKS)):
+        information = np.diag(factor.information())[:3]
+        assert (information > 0.0).all()
+        assert np.isfinite(information).all()
+
+
+def test_a_step_damped_by_far_more_than_it_should_be_is_not_the_last(monkeypatch):
+    graph, start, sightings = drive(2)
+    any_gain_is_little = Stopping(1e9, 12)
+    assert solve(graph, start, any_gain_is_little, landmarks=sightings).iterations == 1
+    monkeypatch.setattr(levenberg_marquardt, "_FIRST_SHARE", 1e-2)
+    assert solve(graph, start, any_gain_is_little, landmarks=sightings).iterations > 1
+
+
 def test_a_landmark_behind_its_camera_takes_its_metres():
     _, start, images = bent_drive(0)
     behind = L(int(images.track_ids[0]))

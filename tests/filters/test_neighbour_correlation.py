@@ -78,6 +78,18 @@ def test_what_repeats_from_frame_to_frame_proves_no_more_than_once() -> None:
     assert max(found.erring_as_one(0.98) for found in repeated) == 1.0
 
 
+def test_chance_is_that_of_products_whose_factors_are_both_correlated_along_tracks() -> None:
+    """A product of two autoregressions of rho is one of rho squared: its mean has (1 + rho^2) / (1 - rho^2)."""
+    frames, uvs_px, errors = clusters(8, alike=0.12, width_px=1.0)
+    found, pairs = learnt(frames, uvs_px, errors), 3 * FRAMES * CLUSTERS * SIZE * (SIZE - 1) // 2
+    shared = found.erring_as_one() - 1.0
+    beyond = shared / (neighbour_correlation._STANDARD_ERRORS * 2.0 * np.sqrt(pairs) / errors.size)
+    assert beyond > 1.1
+    just = np.sqrt((beyond**2 - 1.0) / (beyond**2 + 1.0))
+    assert found.erring_as_one(0.9999 * just) == 1.0 + shared
+    assert found.erring_as_one(1.0001 * just) == 1.0
+
+
 def test_tracks_that_are_correlated_count_for_less_by_as_many_neighbours_as_err_as_one() -> None:
     rig = simulate(DRIVE, 0).rig
     rng = np.random.default_rng(0)
