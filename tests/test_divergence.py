@@ -136,6 +136,29 @@ def test_a_filter_on_a_rough_recording_has_not_diverged():
     assert gate_collapse(gated(0.65, 0.5)) is None
 
 
+def test_tracks_tested_as_a_whole_may_fail_more_often_than_sightings_for_outliers_spoil_all_of_one():
+    """One sighting in ten of tracks of 12 sightings: 0.9^12 = 28 % of them are without an outlier."""
+    few = gated(0.23, 0.23)
+    of_sightings, of_tracks = ({**few, "nis_dof": dof * few["gate_accepted"]} for dof in (3.0, 33.0))
+    assert gate_collapse(of_sightings).endswith("(at least 30 % pass in a run that works)")
+    assert gate_collapse(of_tracks) is None
+    collapsed = gated(0.23, 0.05)
+    assert "at least 17 % pass" in gate_collapse({**collapsed, "nis_dof": 33.0 * collapsed["gate_accepted"]})
+
+
+def test_a_filter_of_tracks_with_outliers_that_is_millimetres_off_has_not_diverged(run_estimator):
+    """Its tracks last, and one sighting in ten is an outlier: most tracks have one."""
+    camera = replace(FLIGHT.camera, max_tracks=40, loss_per_frame=0.0, outlier_rate=0.1)
+    sequence = simulate(replace(FLIGHT, camera=camera, duration_s=6.0), 0)
+    run = run_estimator("msckf-fej", sequence)
+    accepted, tested = run.info["gate_accepted"].sum(), run.info["gate_tested"].sum()
+    assert tested > 200
+    assert accepted < 0.3 * tested
+    assert gate_collapse(run.info) is None
+    off_m = run.causal.T_world_imu[:, :3, 3] - sequence.truth.T_world_imu[:, :3, 3]
+    assert np.abs(off_m).max() < 0.05
+
+
 def test_a_few_rejections_are_no_sign():
     assert gate_collapse(gated(0.0, 0.0, tested=1)) is None
     assert gate_collapse({}) is None
