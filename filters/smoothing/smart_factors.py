@@ -114,10 +114,19 @@ class Vision:
     @property
     def loss(self) -> float:
         """The sum of Huber's losses of the whitened residuals, half a square each where small."""
+        return float(self._losses.sum())
+
+    @property
+    def loss_of_points(self) -> Array:
+        """The part (M,) of the loss that the sightings of each point have."""
+        return np.asarray(np.bincount(self.sightings.point, self._losses, minlength=self.counts[1]), dtype=np.float64)
+
+    @property
+    def _losses(self) -> Array:
         norm = np.where(self.seen.in_front, self._norm, _BEHIND_NORM)
         huber = self.camera.huber
         beyond = huber * (norm - huber / 2)
-        return float(np.where(norm <= huber, 0.5 * norm**2, beyond).sum())
+        return np.where(norm <= huber, 0.5 * norm**2, beyond)
 
     def reduced(self) -> ReducedVision:
         """Linearise and eliminate the points; the poses' errors are GTSAM's: [rotation, position] in the body."""

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from filters.smoothing.smart_factors import RobustCamera, Sightings
+from filters.smoothing.smart_factors import RobustCamera, Sightings, Vision
 from filters.smoothing.smart_window import Evaluated, MarginalPrior, SmartWindow, System
 from toolkit.errors import EstimatorError
 from toolkit.geometry import Array, IntArray
@@ -23,6 +23,8 @@ LAST_STEP_SIGMAS, RELATIVE_DECREASE = 2.0, 1e-3
 # Only for a step that fails: a millionth of the sightings' information on one pose, given the rest, is more than there
 # is on position and heading in the world, and would hold them where they were.
 _FIRST_DAMPING, _MOST_DAMPING = 1e-6, 1e6
+# How far along its step a landmark may go where the window's would cost more. No damping of the poses shortens it.
+_SHARES = (1.0, 0.5, 0.25, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +107,27 @@ def _descent(here: Evaluated, system: System, damping: float, camera: RobustCame
     while damping <= _MOST_DAMPING:
         try:
             step = cho_solve((system.damped_root(damping), True), system.vector, check_finite=False)
-            there = Evaluated.of(_moved(here.window, system, step), camera)
+            moved = _moved(here.window, system, step)
+            there = Evaluated.of(moved, camera)
+            if not there.error <= here.error:
+                there = Evaluated.of(_each_landmark_by_itself(moved, here.window.points, camera), camera)
             if there.error <= here.error:
                 return _DescentStep(there, float(np.sqrt(step @ system.vector)), damping)
         except np.linalg.LinAlgError:
             pass
         damping = max(10.0 * damping, _FIRST_DAMPING)
     return _DescentStep(here, 0.0, damping)
+
+
+def _each_landmark_by_itself(moved: SmartWindow, before: Array, camera: RobustCamera) -> SmartWindow:
+    """Return the window with each landmark (M,) only so far on from where it was before as its sightings cost least.
+
+    A landmark that comes nearer by metres may overshoot to behind a camera: it alone would refuse every step.
+    """
+    places = np.array([before + share * (moved.points - before) for share in _SHARES])
+    costs = [Vision.at(moved.poses, points, moved.sightings, camera).loss_of_points for points in places]
+    cheapest = np.nan_to_num(costs, nan=np.inf).argmin(axis=0)
+    return replace(moved, points=places[cheapest, np.arange(len(before))])
 
 
 def _moved(window: SmartWindow, system: System, step: Array) -> SmartWindow:
