@@ -149,7 +149,7 @@ def stamps(drive: Path, line: Callable[[int], str]) -> None:
 
 
 BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: cannot be read"),
+    ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: is missing; put the calib.txt of this sequence"),
     ("no P1", lambda d: edit(d / "calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
     ("words", lambda d: edit(d / "calib.txt", "250.0 0 160", "250.0 o 160"), "line 1: could not convert"),
     ("swapped rows", lambda d: edit(d / "calib.txt", "-100.0", "100.0"), "the right camera is not to the right"),

@@ -169,6 +169,8 @@ def _layout(path: Path) -> _Layout | None:
 def _projections(layout: _Layout) -> tuple[Array, Array]:
     """Return the projections (3, 4) of both cameras from calib.txt, whose rows may or may not be named P0, P1, ..."""
     file = layout.root / "calib.txt"
+    if not file.exists():
+        raise DataError(f"{file}: is missing; put the calib.txt of this sequence there, with the rows P0: to P3:")
     rows: dict[str, Array] = {}
     for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
         name, colon, rest = line.partition(":")
