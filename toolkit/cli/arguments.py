@@ -321,10 +321,14 @@ TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "accel", "twis
 
 def topics(text: str) -> str:
     """Parse ROLE=TOPIC,..., the topics of a bag."""
+    given = set()
     for part in text.split(","):
         role, equals, name = (word.strip() for word in part.partition("="))
         if not (equals and name):
             raise argparse.ArgumentTypeError(f"expected ROLE=TOPIC,..., as in imu=/imu0, not {part.strip()!r}")
+        if role in given:
+            raise argparse.ArgumentTypeError(f"{role} is named twice; leave one out")
+        given.add(role)
         if role not in TOPIC_ROLES:
             raise argparse.ArgumentTypeError(no_such("role", role, TOPIC_ROLES))
     return text

@@ -248,7 +248,7 @@ def _mounting(day: _Day, sides: tuple[str, str], size_px: tuple[int, int]) -> _P
         )
     cameras = [_camera(day.cameras, side) for side in sides]
     T_left_cam0, T_right_cam0 = (_rigid_motion(day.cameras, f"_{side}") for side in sides)
-    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0))
+    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0), str(day.cameras.path))
     return _PairMounting(
         pair, se3_inverse(T_left_cam0 @ T_cam0_imu), "raw images, rectified with the day's calibration"
     )
