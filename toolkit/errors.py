@@ -38,7 +38,7 @@ class EstimatorError(VislamError):
 
 
 class ExtensionError(VislamError):
-    """A metric file, of another package or dropped in, that does not define or answer what such a file must."""
+    """What another package announces, or a file dropped in, that is not there or not what such a file must be."""
 
     exit_status = 70
 
