@@ -74,8 +74,8 @@ result = toolkit.compare("kitti00", ["dead-reckoning", "ekf", "batch"], truth=tr
 result.figures["top_all"]
 
 # %% [markdown]
-# Grey dots are the landmarks that the smoother found: house fronts, parked cars, trees. Dead reckoning turns too
-# early; the other two agree with each other.
+# Grey dots are the landmarks that the smoother found: house fronts, parked cars, trees. The road is straight here, and
+# the three lines lie on each other. What tells them apart is in the numbers.
 #
 # ## How good are they?
 

@@ -119,19 +119,21 @@ def test_an_entry_point_to_nowhere_is_refused(monkeypatch: pytest.MonkeyPatch, a
     point = EntryPoint("gone", "gone_package.parts", "any")
     monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
     for found in (metrics.describe, datasets.formats):
-        with pytest.raises(VislamError, match=r"names gone_package.parts, which is not a package"):
+        with pytest.raises(ExtensionError, match=r"names gone_package.parts, which is not a package"):
             found()
 
 
 def test_a_module_that_is_no_dataset_says_what_it_lacks(announce: Announce) -> None:
     announce(datasets.ENTRY_POINT_GROUP, {"empty.py": ""})
-    with pytest.raises(DataError, match=r"empty.py: defines neither recognises\(path\) and load\(path\) nor BUILT_IN"):
+    with pytest.raises(
+        ExtensionError, match=r"empty.py: defines neither recognises\(path\) and load\(path\) nor BUILT_IN"
+    ):
         datasets.formats()
 
 
 def test_two_datasets_cannot_share_a_name(announce: Announce) -> None:
     announce(datasets.ENTRY_POINT_GROUP, {"course_npz.py": DATASET})
-    with pytest.raises(DataError, match="two dataset modules are called course-npz"):
+    with pytest.raises(ExtensionError, match="two dataset modules are called course-npz"):
         datasets.formats()
 
 
@@ -141,14 +143,23 @@ def test_two_datasets_cannot_share_a_name(announce: Announce) -> None:
         (METRIC.replace("ORDER", "ORDR"), "answer.py: a metric file defines METRICS, a tuple of Metric records, ORDER"),
         (METRIC.replace("True),)", "True))"), "a metric file defines METRICS, a tuple"),
         (METRIC.replace("def score", "def scored"), "a metric file defines METRICS"),
-        (METRIC.replace("in_contract=True", 'best="bigger"'), "the metric answer has best='bigger'; it is one of"),
+        (
+            METRIC.replace("in_contract=True", 'best="bigger"'),
+            "answer.py: the metric answer has best='bigger'; it is one of",
+        ),
         (METRIC.replace('("the", "answer")', '"answer"'), "the metric answer has heading='answer'; it is two lines"),
     ],
 )
-def test_a_metric_file_that_is_none_is_named(announce: Announce, text: str, why: str) -> None:
+def test_a_metric_file_that_is_none_is_named(
+    announce: Announce, text: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is a defect of that file (70), whatever the command line asks for, and no wrong command line (2)."""
     announce("toolkit.metrics", {"answer.py": text})
     with pytest.raises(ExtensionError, match=re.escape(why)):
         metrics.known_metrics()
+    for words in (("compare", "drive", "--columns", "answer"), ("diff", "one", "two", "--columns", "all"), ("list",)):
+        assert main(words) == 70
+        assert why in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("answer", ['Scores({"other": 1.0})', '{"answer": 1.0}', "None"])
@@ -173,7 +184,7 @@ def test_a_loader_that_answers_with_no_sequence_is_named(announce: Announce, tmp
         {"theirs.py": DATASET.replace("return replace(", "return str(").replace(", name=", ") or (")},
     )
     (tmp_path / "some.file").write_text("theirs")
-    with pytest.raises(DataError, match=r"theirs\.py answered with a str; it returns a Sequence"):
+    with pytest.raises(ExtensionError, match=r"theirs\.py answered with a str; it returns a Sequence"):
         datasets.load_sequence(str(tmp_path / "some.file"))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from toolkit import discovery
-from toolkit.errors import EstimatorError
+from toolkit.errors import EstimatorError, ExtensionError
 from toolkit.estimator import ENTRY_POINT_GROUP, LADDER, RULES, discover, find, find_all, ladder
 from toolkit.settings import DEFAULTS
 
@@ -149,5 +149,5 @@ def test_an_unknown_name_lists_the_known_ones(package):
 def test_an_entry_point_to_nowhere_is_told(monkeypatch):
     point = EntryPoint("gone", "gone_package", ENTRY_POINT_GROUP)
     monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
-    with pytest.raises(EstimatorError, match="names gone_package, which is not a package"):
+    with pytest.raises(ExtensionError, match="names gone_package, which is not a package"):
         discover()

@@ -20,7 +20,7 @@ from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
-from toolkit.errors import VislamError
+from toolkit.errors import ExtensionError
 
 GROUPS = ("toolkit.datasets", "toolkit.estimators", "toolkit.metrics")
 _OURS = ("toolkit", "filters")
@@ -108,16 +108,18 @@ def modules_in(package: str, folders: Iterable[str]) -> list[FoundModule]:
     ]
 
 
-def announced(group: str, error: type[VislamError] = VislamError) -> list[FoundModule]:
+def announced(group: str) -> list[FoundModule]:
     """Return the modules of every package announced under an entry-point group, importing none of them.
 
-    Raises ``error`` where an entry point does not name a package.
+    Raises ExtensionError where an entry point does not name a package.
     """
     found: list[FoundModule] = []
     for package in sorted({point.value for point in entry_points(group=group)}):
         spec = _spec(package)
         if spec is None or spec.submodule_search_locations is None:
-            raise error(f"the entry point {group} names {package}, which is not a package here")
+            raise ExtensionError(
+                f"the entry point {group} names {package}, which is not a package here; install what announces it again"
+            )
         found += modules_in(package, spec.submodule_search_locations)
     return found
 

@@ -9,6 +9,8 @@ from difflib import get_close_matches
 from typing import ClassVar
 
 _LONG_WORD, _SHOWN = re.compile(r"\S{300,}"), 60
+# The beginning of a name is one from so many letters on, and of no more names than these.
+_FEWEST_LETTERS, _MOST_BEGUN = 3, 4
 
 
 class VislamError(Exception):
@@ -36,7 +38,7 @@ class EstimatorError(VislamError):
 
 
 class ExtensionError(VislamError):
-    """A metric file, of another package or dropped in, that does not define or answer what such a file must."""
+    """What another package announces, or a file dropped in, that is not there or not what such a file must be."""
 
     exit_status = 70
 
@@ -70,16 +72,24 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return by_folded[close[0]] if close else ""
 
 
+def _meant(name: str, known: Iterable[str]) -> str:
+    """Return the nearest known name or, where none is close, those that begin with what was given, if they are few."""
+    names = list(known)
+    begun = [one for one in names if len(name) >= _FEWEST_LETTERS and one.casefold().startswith(name.casefold())]
+    *others, last = begun if 0 < len(begun) <= _MOST_BEGUN else [""]
+    return nearest(name, names) or (f"{', '.join(others)} or {last}" if others else last)
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return the end of a message about a name nobody knows: the nearest known one, or nothing where none is close."""
-    close = nearest(name, known)
+    """Return the end of a message about a name nobody knows: the known ones like it, or nothing where none is."""
+    close = _meant(name, known)
     return f"; did you mean {close}?" if close else ""
 
 
 def no_such(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the message for a name nobody knows: the nearest known one, then all of them."""
+    """Return the message for a name nobody knows: the known ones like it, then all of them."""
     names = list(known)
-    close = nearest(name, names)
+    close = _meant(name, names)
     hint = f" (did you mean {close}?)" if close else ""
     return f"no {kind} is called {name}{hint}; there are {', '.join(names)}"
 

@@ -155,7 +155,7 @@ class EstimatorEntry:
 
 def discover() -> dict[str, EstimatorEntry]:
     """Find every estimator of every announced package, by name, importing none of them."""
-    found = {one.name: EstimatorEntry(one.name, one) for one in announced(ENTRY_POINT_GROUP, EstimatorError)}
+    found = {one.name: EstimatorEntry(one.name, one) for one in announced(ENTRY_POINT_GROUP)}
     return dict(sorted(found.items()))
 
 

@@ -102,6 +102,8 @@ def test_names_too_long_are_refused_before_anything_runs(
         (("compair",), "did you mean compare?"),
         (("compare", "drive", "--start", "Truth"), "did you mean truth?"),
         (("compare", "drive", "--keep", "time_gap"), "did you mean time-gap?"),
+        (("compare", "drive", "--keep", "stale"), "did you mean stale-frames?"),
+        (("compare", "drive", "--keep", "tim"), "did you mean time-order, time-gap or time-offset?"),
         (("compare", "drive", "--columns", "ATE SE3"), "did you mean ATE SE(3)?"),
         (("check-data", "flihgt"), "did you mean flight?"),
         (("simulate", "drive_imu", "--out", "d"), "did you mean drive-imu?"),

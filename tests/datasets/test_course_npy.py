@@ -235,6 +235,9 @@ def test_the_reader_agrees_with_pickle_on_plain_data(tmp_path: Path) -> None:
 # Images beside it ------------------------------------------------------------------------------------------------
 
 
+SPECKLED = np.random.default_rng(0).integers(0, 255, (200, 320), dtype=np.uint8)
+
+
 @pytest.fixture
 def with_images(kitti_drive: Path, tmp_path: Path, shared_cache: None) -> Path:
     """Return a recording without features, and the images of a drive towards a wall beside it."""
@@ -283,6 +286,7 @@ def test_features_are_taken_before_images_unless_asked(with_images: Path) -> Non
         ([np.zeros((4, 4), np.uint8)] * 3, "cam_imgs_L has 3 images and dataset02.npy 8 timestamps"),
         ([np.zeros((4, 4))] * 8, r"cam_imgs_L\[0\] is no array \(height, width\) of uint8"),
         (None, "cam_imgs_L is missing or no list of images"),
+        ([SPECKLED] * 8, "dataset02_imgs.npy/left and .*dataset02_imgs.npy/right: left and right images are the same"),
     ],
 )
 def test_images_that_do_not_belong_are_refused(with_images: Path, images: Any, pattern: str) -> None:

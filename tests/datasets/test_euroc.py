@@ -312,6 +312,15 @@ def shift_truth(recording: Path) -> None:
     write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
 
 
+def scale_truth(recording: Path, factor: float) -> None:
+    """Write positions in another unit."""
+    path = recording / "mav0/state_groundtruth_estimate0/data.csv"
+    heading, *lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    scaled = [[row[0], *(f"{factor * float(x):.12g}" for x in row[1:4]), *row[4:]] for row in rows]
+    write(path, "\n".join([heading, *map(",".join, scaled)]) + "\n")
+
+
 TRUTH = "state_groundtruth_estimate0"
 # Nine lists of ten, each of the one before it: 600 characters that stand for a billion values.
 BOMB = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]\n" for i in range(1, 10))
@@ -340,6 +349,11 @@ MALFORMED: list[tuple[str, Callable[[Path], object], str]] = [
     ("not rigid", lambda d: replace_in(d, "cam0/sensor.yaml", "-1,", "-2,"), "T_BS is not a rotation"),
     ("exchanged", lambda d: replace_in(d, "cam1/sensor.yaml", "-0.06", "0.2"), "cam1 is not to the right of cam0"),
     ("quaternion", lambda d: replace_in(d, f"{TRUTH}/data.csv", ",1,0.9", ",1,3.9"), "not of unit length"),
+    (
+        "another unit",
+        lambda d: scale_truth(d, 1e6),
+        r"swing: the truth spans \S+ m, and tracks are simulated in a room; check its unit",
+    ),
     ("no header", lambda d: replace_in(d, f"{TRUTH}/data.csv", "q_RS_w", "q_w"), "missing column q_RS_w"),
 ]
 

@@ -76,11 +76,19 @@ def test_poses_of_the_download_are_found_beside_the_sequences(drive: Path, tmp_p
     assert load_sequence(str(root)).truth is not None
 
 
-@pytest.mark.parametrize("stamps", [FRAMES - 3, FRAMES + 4])
-def test_poses_of_all_images_serve_where_there_are_fewer_or_more_stamps(drive: Path, stamps: int) -> None:
-    (drive / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(stamps)))
+def test_poses_follow_images_whose_stamps_are_out_of_order(drive: Path) -> None:
+    stamps(drive, lambda k: f"{1.0 - 0.1 * k:.6f}")
     sequence = load_sequence(str(drive))
-    used = min(stamps, FRAMES)
+    assert sequence.truth is not None
+    np.testing.assert_array_equal(sequence.truth.t_ns, sequence.frames_t_ns)
+    np.testing.assert_allclose(sequence.truth.T_world_imu[:, 0, 3], STEP_M * np.arange(FRAMES)[::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [FRAMES - 3, FRAMES + 4])
+def test_poses_of_all_images_serve_where_there_are_fewer_or_more_stamps(drive: Path, count: int) -> None:
+    (drive / "times.txt").write_text("".join(f"{0.1 * k:.6e}\n" for k in range(count)))
+    sequence = load_sequence(str(drive))
+    used = min(count, FRAMES)
     assert sequence.frame_count == used
     assert sequence.truth is not None
     np.testing.assert_array_equal(sequence.truth.t_ns, sequence.frames_t_ns)
@@ -136,8 +144,12 @@ def halve(drive: Path) -> None:
         cv2.imwrite(str(path), image[::2, ::2])
 
 
+def stamps(drive: Path, line: Callable[[int], str]) -> None:
+    (drive / "times.txt").write_text("".join(f"{line(k)}\n" for k in range(FRAMES)))
+
+
 BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: cannot be read"),
+    ("no calib", lambda d: (d / "calib.txt").unlink(), "calib.txt: is missing; put the calib.txt of this sequence"),
     ("no P1", lambda d: edit(d / "calib.txt", "P1", "P7"), "missing P1, twelve numbers each; it has P0, P7, Tr"),
     ("words", lambda d: edit(d / "calib.txt", "250.0 0 160", "250.0 o 160"), "line 1: could not convert"),
     ("swapped rows", lambda d: edit(d / "calib.txt", "-100.0", "100.0"), "the right camera is not to the right"),
@@ -145,7 +157,20 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("no focal", lambda d: edit(d / "calib.txt", "P0: 250.0", "P0: 0"), "P0 is no projection"),
     ("few poses", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n"), "1 poses for 8 images"),
     ("poses cut", lambda d: (d / "poses.txt").write_text("1 0 0 0 0 1"), "poses.txt"),
-    ("times", lambda d: (d / "times.txt").write_text("0 0.1 x"), "times.txt: could not convert"),
+    ("times", lambda d: (d / "times.txt").write_text("0\n0.1\nx\n"), "times.txt: line 3 is 'x'; expected one number"),
+    ("times of two columns", lambda d: stamps(d, lambda k: f"{k} {0.1 * k}"), "line 1 is '0 0.0'; expected one number"),
+    ("times in ns", lambda d: stamps(d, lambda k: f"{k}00000000"), "look like nanoseconds: divide by 1e9"),
+    ("times in ms", lambda d: stamps(d, lambda k: f"{100 * k}"), "look like milliseconds: divide by 1e3"),
+    (
+        "poses with stamps",
+        lambda d: (d / "poses.txt").write_text("".join(f"{0.1 * k} {k} 0 0 0 0 0 1\n" for k in range(FRAMES))),
+        r"poses.txt: is a trajectory with stamps \(TUM\), .*--truth",
+    ),
+    (
+        "calibration of raw drives",
+        lambda d: (d / "calib.txt").write_text("calib_time: 09-Jan-2012 13:57:47\nS_00: 1.392e+03 5.12e+02\n"),
+        "line 1: could not convert.*KITTI odometry's calib.txt has P0: to P3:",
+    ),
     ("no times", lambda d: (d / "times.txt").write_text(""), "numbered 0 to 7, and times.txt has 0"),
     ("numbered from 50", lambda d: renumber(d, 50), "numbered 50 to 57, and times.txt has 8"),
     ("images halved", halve, "principal point, 160 100, is not that of images of 160x100 px"),

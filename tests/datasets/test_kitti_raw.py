@@ -167,6 +167,14 @@ def test_images_of_a_camera_that_dropped_one_are_paired_by_their_stamps(drive: P
     assert any("1 left images have no right one" in fact for fact in sequence.provenance.facts)
 
 
+def test_packets_without_a_stamp_and_stamps_without_a_packet_are_counted(drive: Path) -> None:
+    (drive / "oxts/data/0000000003.txt").unlink()
+    (drive / "oxts/data/0000000099.txt").write_text(packet(9.9))
+    sequence = load_sequence(str(drive))
+    assert sequence.motion.t_ns.size == FRAMES
+    assert "2 oxts packets lack their file or their stamp and are left out" in sequence.provenance.facts
+
+
 def test_images_need_not_be_in_a_folder_called_data(drive: Path) -> None:
     before = load_sequence(str(drive))
     for side in (0, 1):
@@ -186,10 +194,26 @@ def another_day(stamps: Path) -> None:
     stamps.write_text(stamps.read_text().replace("2011-09-26", "2011-09-30"))
 
 
-CAMS = "calib_cam_to_cam.txt"
+CAMS, IMU = "calib_cam_to_cam.txt", "calib_imu_to_velo.txt"
 BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
-    ("no calibration", lambda d: (d.parent / CAMS).unlink(), "calib_cam_to_cam.txt: cannot be read"),
-    ("no velo", lambda d: (d.parent / "calib_velo_to_cam.txt").unlink(), "calib_velo_to_cam.txt: cannot be read"),
+    (
+        "no calibration",
+        lambda d: (d.parent / CAMS).unlink(),
+        "calib_cam_to_cam.txt: is missing; the day's calibration is",
+    ),
+    (
+        "no velo",
+        lambda d: (d.parent / "calib_velo_to_cam.txt").unlink(),
+        "calib_velo_to_cam.txt: is missing; the day's",
+    ),
+    ("imu cut", lambda d: edit(d.parent / IMU, "T: 0 0 0", "T: 0 O 0"), f"{IMU}: missing T; it has R"),
+    ("no focal", lambda d: edit(d.parent / CAMS, "P_rect_00: 2", "P_rect_00: -2"), "P_rect_00 has no positive focal"),
+    ("no baseline", lambda d: edit(d.parent / CAMS, "-1.000000000e+02", "1.0e+02"), "is not to the right of the left"),
+    (
+        "degrees",
+        lambda d: (d / "oxts/data/0000000003.txt").write_text(packet(0.3, yaw=30.0)),
+        "0000000003.txt: roll, pitch and yaw are .0.0, 0.0, 30.0., and no radians; convert degrees",
+    ),
     ("no P", lambda d: edit(d.parent / CAMS, "P_rect_01", "Q_rect_01"), "missing P_rect_01"),
     ("no stamps", lambda d: (d / "image_00/timestamps.txt").unlink(), "timestamps.txt: cannot be read"),
     ("blank stamps", lambda d: (d / "image_00/timestamps.txt").write_text("\n\n"), "holds no stamps"),
@@ -197,7 +221,11 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ("packet cut", lambda d: (d / "oxts/data/0000000003.txt").write_text("1 2 3"), "0000000003.txt: 3 numbers"),
     ("packet nan", lambda d: edit(d / "oxts/data/0000000003.txt", "1.1", "nan"), "could not convert|finite"),
     ("no packets", lambda d: shutil.rmtree(d / "oxts/data"), "0 packets with a stamp"),
-    ("other size", lambda d: edit(d.parent / CAMS, f"S_rect_00: {numbers([320, 200])}", "S_rect_00: 9 9"), "neither"),
+    (
+        "other size",
+        lambda d: edit(d.parent / CAMS, f"S_rect_00: {numbers([320, 200])}", "S_rect_00: 9 9"),
+        "images of 320x200 px are neither",
+    ),
     ("one camera", lambda d: shutil.rmtree(d / "image_01"), "image_00/data has images and image_01/data has none"),
     (
         "two pairs' halves",

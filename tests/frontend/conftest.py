@@ -163,7 +163,7 @@ def filmed(request: pytest.FixtureRequest, plain: Filmed, raw: dict[str, list[Pa
     if request.param == "none":
         return plain
     camera = {"radtan": RADTAN, "equidistant": EQUIDISTANT}[request.param]
-    rig = rectified(camera, camera, T_RIGHT_LEFT)
+    rig = rectified(camera, camera, T_RIGHT_LEFT, "rig")
     return Filmed(rig, [(rig.apply(left, 0), rig.apply(right, 1)) for left, right in raw[request.param][:6]])
 
 

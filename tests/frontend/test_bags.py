@@ -280,6 +280,11 @@ def test_topics_are_those_said(asl: Path, tmp_path: Path) -> None:
         ("left=/prot/image_raw", r"no topic is called /prot/image_raw \(did you mean /port/image_raw"),
         ("imu=/chatter", r"/chatter \(std_msgs/String\) cannot be imu, which is sensor_msgs/Imu"),
         ("ears=/imu0", "no role is called ears; there are left, right"),
+        ("imu=/imu0,imu=/imu0", "--topics names imu twice; leave one out"),
+        (
+            "left=/port/image_raw,right=/port/image_raw",
+            "names /port/image_raw as left and right; a pair has a topic each",
+        ),
     ):
         with pytest.raises(DataError, match=pattern):
             load_sequence(str(path), 0, Frontend(topics=wrong))
@@ -300,9 +305,10 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
 @pytest.mark.parametrize(
     ("left_out", "pattern"),
     [
-        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry"),
+        ("/imu0", "no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; record one beside"),
         ("/cam1/image_raw", "holds images of one camera, /cam0/image_raw"),
-        ("image_raw", "holds no images that can be read"),
+        ("image_raw", "holds no images that can be read.*; there are /cam0/camera_info"),
+        ("", "holds no images that can be read.*; there are no topics"),
         ("/cam0/camera_info", "there is no sensor_msgs/CameraInfo beside /cam0/image_raw"),
         (
             "/tf_static",
@@ -531,6 +537,60 @@ def test_a_damaged_bag_is_read_or_refused_in_one_line(asl: Path, tmp_path: Path,
                 load_sequence(str(file))
             assert "\n" not in str(told.value)
             assert str(file) in str(told.value)
+
+
+def test_an_odometer_of_a_truths_name_is_offered_and_not_taken_unasked(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("sqlite")
+    film = [item for item in bare(ros, asl) if item.topic not in ("/imu0", "/ground_truth/pose")]
+    odometry = ros.odometry(film[0].t_ns, [0.0] * 6 + [1.0], [1.0, 0.0, 0.0], [0.0] * 3)
+    path = ros.write(tmp_path / "odom", [*film, odometry._replace(topic="/vicon/odom")])
+    with pytest.raises(
+        DataError, match=r"nothing measures the motion; name one with --topics twist=TOPIC \(/vicon/odom"
+    ):
+        load_sequence(str(path))
+
+
+@pytest.mark.parametrize(("kept", "pattern"), [(0.5, "damaged or truncated"), (0.0, "it is empty")])
+def test_images_that_cannot_be_used_are_told_with_their_topic(
+    asl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: float, pattern: str
+) -> None:
+    """In every command: they are unpacked into a folder that nobody knows."""
+    ros = Ros.of("ros1")
+    film = [item for item in bare(ros, asl) if not item.topic.endswith("image_raw")]
+
+    def cut(t_ns: int, camera: str, path: Path) -> Item:
+        content = path.read_bytes()
+        return ros.compressed(t_ns, camera, content[: int(kept * len(content))])
+
+    path = ros.write(tmp_path / "film.bag", [*film, *images_of(asl, cut)])
+    for words in (("check-data", str(path)), ("tracks", str(path), "--out", str(tmp_path / "stills"))):
+        assert main(words) == 3
+        told = capsys.readouterr().err
+        assert f"{path}: /cam0/image_raw/compressed: 10 of 10 image pairs cannot be used" in told
+        assert pattern in told
+        assert str(tmp_path) not in told.replace(str(path), "")
+
+
+def test_an_empty_image_is_left_out_and_named(asl: Path, tmp_path: Path) -> None:
+    ros = Ros.of("ros1")
+    film = [item for item in bare(ros, asl) if not item.topic.endswith("image_raw")]
+    images = list(images_of(asl, lambda t_ns, camera, path: ros.compressed(t_ns, camera, path.read_bytes())))
+    images[3].value.data = images[3].value.data[:0]
+    bag = load_sequence(str(ros.write(tmp_path / "film.bag", [*film, *images])))
+    assert bag.frame_count == 9
+    assert any(
+        "1 of 10 image pairs could not be used" in fact and "it is empty" in fact for fact in bag.provenance.facts
+    )
+
+
+def test_a_compression_that_the_library_does_not_know_is_no_damage(asl: Path, tmp_path: Path) -> None:
+    path = Ros.of("ros1").write(tmp_path / "film.bag", bare(Ros.of("ros1"), asl))
+    path.write_bytes(path.read_bytes().replace(b"compression=none", b"compression=lzma"))
+    with pytest.raises(
+        DataError, match=r"rosbags does not read such a bag \(Compression 'lzma' is not supported"
+    ) as told:
+        load_sequence(str(path))
+    assert "copy it again" not in str(told.value)
 
 
 def test_a_bag_that_breaks_off_leaves_nothing_behind(

@@ -26,7 +26,7 @@ def pixels(camera: Camera, points: Array) -> Array:
 
 @pytest.mark.parametrize("camera", [RADTAN, EQUIDISTANT], ids=["radtan", "equidistant"])
 def test_the_maps_lead_where_the_lens_puts_a_point_and_rows_agree(camera: Camera) -> None:
-    rig = rectified(camera, camera, T_RIGHT_LEFT)
+    rig = rectified(camera, camera, T_RIGHT_LEFT, "rig")
     assert rig.baseline_m == pytest.approx(np.linalg.norm(T_RIGHT_LEFT[:3, 3]), rel=1e-9)
     points = POINTS @ rig.R_rect_cam.T
     u = rig.fx_px * points[:, 0] / points[:, 2] + rig.cx_px
@@ -44,8 +44,8 @@ def test_the_maps_lead_where_the_lens_puts_a_point_and_rows_agree(camera: Camera
 
 
 def test_pixels_beyond_the_lens_are_known_as_such() -> None:
-    rig = rectified(EQUIDISTANT, EQUIDISTANT, T_RIGHT_LEFT)
-    wide = rectified(*2 * [replace(EQUIDISTANT, pinhole_px=(75.0, 75.0, 160.0, 121.0))], T_RIGHT_LEFT)
+    rig = rectified(EQUIDISTANT, EQUIDISTANT, T_RIGHT_LEFT, "rig")
+    wide = rectified(*2 * [replace(EQUIDISTANT, pinhole_px=(75.0, 75.0, 160.0, 121.0))], T_RIGHT_LEFT, "rig")
     for one in (rig, wide):
         assert 0.5 < one.seen(0).mean() < 1.0
         assert not one.seen(0)[0].any()
@@ -56,14 +56,15 @@ def test_pixels_beyond_the_lens_are_known_as_such() -> None:
     [
         (se3(np.eye(3), np.array([0.12, 0.0, 0.0])), "stands left of the left one"),
         (se3(np.eye(3), np.array([0.0, 0.12, 0.0])), "above, below or behind"),
+        (np.eye(4), "both cameras stand in the same place"),
         (se3(so3_exp(np.array([0.0, 1.0, 0.0])), np.array([-0.12, 0.0, 0.0])), "57 deg apart"),
     ],
 )
 def test_cameras_that_are_no_stereo_pair_are_refused(T: Array, complaint: str) -> None:
-    with pytest.raises(DataError, match=complaint):
-        rectified(RADTAN, RADTAN, T)
+    with pytest.raises(DataError, match=f"^cam.yaml: .*{complaint}.*; "):
+        rectified(RADTAN, RADTAN, T, "cam.yaml")
 
 
 def test_cameras_of_different_sizes_are_refused() -> None:
-    with pytest.raises(DataError, match="a pair needs one size"):
-        rectified(RADTAN, replace(RADTAN, size_px=(640, 480)), T_RIGHT_LEFT)
+    with pytest.raises(DataError, match=r"^cam.yaml: .* of 320x240 and 640x480 px, and a pair needs one size; "):
+        rectified(RADTAN, replace(RADTAN, size_px=(640, 480)), T_RIGHT_LEFT, "cam.yaml")

@@ -485,7 +485,7 @@ def test_the_first_seconds_of_a_real_flight_have_tracks_enough(real: Callable[[s
     root = real("euroc/MH_01_easy_8s")
     calibration = read_calibration(root, root / "mav0")
     assert calibration.cameras is not None
-    rig = rectified(*calibration.cameras, calibration.T_right_left)
+    rig = rectified(*calibration.cameras, calibration.T_right_left, "rig")
     tracks = track_images(pairs_of_asl(root / "mav0").pairs[:12], rig, Frontend())
     a_frame = np.bincount(tracks.frame)
     assert tracks.skipped == ()

@@ -149,9 +149,10 @@ def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("version", "told"),
     [
-        ("v9", "it is not known here; name a revision"),
-        ("--help", "it is not known here; name a revision"),
-        ("no.whl", "no.whl: it is no wheel that can be read"),
+        ("v9", "--speed-against 'v9' is no revision of this checkout; name one that git log shows, or name a wheel"),
+        ("--help", "'--help' is no revision of this checkout"),
+        ("", "'' is no revision of this checkout"),
+        ("no.whl", "no.whl: it is no wheel that can be read (No such file or directory); build one"),
         ("empty.whl", "empty.whl brings no code of what runs here"),
     ],
 )
@@ -164,6 +165,26 @@ def test_a_version_that_cannot_be_had_is_told(tmp_path, monkeypatch, capsys, ver
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert told in said
+
+
+def test_a_revision_that_a_shallow_clone_lacks_is_to_be_fetched(tmp_path, monkeypatch):
+    git = ("git", "-c", "user.name=nobody", "-c", "user.email=nobody@nowhere.invalid")
+    for words in (("init", "-q", "deep"), *2 * [("-C", "deep", "commit", "-q", "--allow-empty", "-m", "x")]):
+        subprocess.run([*git, *words], check=True, cwd=tmp_path)
+    subprocess.run([*git, "clone", "-q", "--depth", "1", f"file://{tmp_path}/deep", "clone"], check=True, cwd=tmp_path)
+    monkeypatch.chdir(tmp_path / "clone")
+    with pytest.raises(BaselineError, match=r"'HEAD~1' is no revision .*; fetch it, .* \(git fetch --unshallow\)"):
+        unpacked("HEAD~1").__enter__()
+
+
+def test_outside_of_a_checkout_and_without_git_a_wheel_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    with pytest.raises(BaselineError, match=r"HEAD: no checkout; stand in one, or name a wheel \(fatal: not a git"):
+        unpacked("HEAD").__enter__()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(BaselineError, match=r"git cannot be run \(No such file or directory\); name a wheel"):
+        unpacked("HEAD").__enter__()
 
 
 @pytest.mark.parametrize("words", [("--skip-speed",), ("--trajectories", os.curdir)])

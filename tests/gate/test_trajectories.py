@@ -119,7 +119,7 @@ def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_judged(vislam, capsy
     assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
     told = " ".join(capsys.readouterr().out.split())
     assert "lap: sequence is missing: results/lap.tum: 3 columns" in told
-    assert "maze: sequence is missing: no trajectory is there; the baseline has maze/0.txt" in told
+    assert "maze: sequence is missing: no trajectory of it is in results; the baseline has maze/0.txt" in told
     assert "not in the baseline, and not judged: new" in told
 
 
@@ -134,6 +134,13 @@ def test_another_clock_is_told_with_both_ranges(vislam, capsys):
     write(Path("results/lap.tum"), stamps(10.0, 3600.0, 3660.0))
     assert failures(vislam) == [("lap", "sequence", "missing")]
     assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
+
+
+def test_one_pose_is_told_as_that_and_no_clock_is_blamed(vislam, capsys):
+    write(Path("results/lap.tum"), stamps(10.0)[:1])
+    assert failures(vislam) == [("lap", "sequence", "missing")]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "lap.tum: it has one pose, and errors are of two and more; write the whole trajectory" in told
 
 
 def test_exchanged_axes_are_named_where_a_baseline_is_made_and_held(vislam, capsys):
@@ -185,6 +192,16 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
             ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "lop=truth/lap.tum"),
             3,
             "--truth names the truth of lop: no sequence is called lop (did you mean lap?)",
+        ),
+        (
+            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "lap=truth/lop.tum"),
+            3,
+            "--truth lap=truth/lop.tum: there is no such file; check the path",
+        ),
+        (
+            ("check", "--trajectories", "results", "--baseline", "base.json", "--truth", "nowhere"),
+            3,
+            "--truth nowhere: it is no folder; name one that has SEQUENCE.tum, or SEQUENCE=FILE",
         ),
         (
             ("check", "--trajectories", "results", "--baseline", "base.json", "--junit", "same", "--json", "./same"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from toolkit import metrics
-from toolkit.errors import VislamError
+from toolkit.errors import ExtensionError, VislamError
 from toolkit.metrics import Scores, score_run
 from toolkit.metrics.parts.scores import Unavailable, evaluate
 from toolkit.models.gating import chi2_bound, mean_below_bound
@@ -176,7 +176,9 @@ def test_a_dropped_in_file_is_a_metric(tmp_path, monkeypatch, case, found_anew):
 def test_two_files_cannot_declare_the_same_key(tmp_path, monkeypatch, found_anew):
     (tmp_path / "again.py").write_text(DROPPED_IN.replace('"answer"', '"pairs"'))
     monkeypatch.setattr(metrics, "__path__", [*metrics.__path__, str(tmp_path)])
-    with pytest.raises(VislamError, match="more than one metric file declares pairs"):
+    with pytest.raises(
+        ExtensionError, match=r"(and \S+again\.py|again\.py and \S+): both declare pairs; rename it in one"
+    ):
         metrics.describe()
 
 

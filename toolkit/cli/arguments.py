@@ -4,13 +4,14 @@ import argparse
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
-from toolkit.errors import VislamError, did_you_mean, no_such, one_line
+from toolkit.errors import ExtensionError, VislamError, did_you_mean, no_such, one_line
 from toolkit.threads import MOST_WORKERS
 
 if TYPE_CHECKING:
@@ -48,6 +49,17 @@ class UsageError(VislamError):
     """A command line that asks for something that does not exist."""
 
     exit_status: ClassVar[int] = 2
+
+
+@contextmanager
+def names_checked() -> Iterator[None]:
+    """Have a name that nobody knows end as a wrong command line; a defect of what was looked through stays one."""
+    try:
+        yield
+    except ExtensionError:
+        raise
+    except VislamError as error:
+        raise UsageError(str(error)) from error
 
 
 class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
@@ -321,10 +333,14 @@ TOPIC_ROLES = ("left", "right", "left_info", "right_info", "imu", "accel", "twis
 
 def topics(text: str) -> str:
     """Parse ROLE=TOPIC,..., the topics of a bag."""
+    given = set()
     for part in text.split(","):
         role, equals, name = (word.strip() for word in part.partition("="))
         if not (equals and name):
             raise argparse.ArgumentTypeError(f"expected ROLE=TOPIC,..., as in imu=/imu0, not {part.strip()!r}")
+        if role in given:
+            raise argparse.ArgumentTypeError(f"{role} is named twice; leave one out")
+        given.add(role)
         if role not in TOPIC_ROLES:
             raise argparse.ArgumentTypeError(no_such("role", role, TOPIC_ROLES))
     return text

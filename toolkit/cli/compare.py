@@ -26,10 +26,11 @@ from toolkit.cli.arguments import (
     kept_faults,
     named_file,
     names,
+    names_checked,
     requested_assignments,
     with_tracks,
 )
-from toolkit.errors import VislamError, printable
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -211,10 +212,8 @@ def _columns(names: tuple[str, ...]) -> Columns:
     """Return the columns asked for; a name that is no metric's is a UsageError."""
     from toolkit.report.comparison_table import requested_columns
 
-    try:
+    with names_checked():
         return requested_columns(names)
-    except VislamError as error:
-        raise UsageError(str(error)) from error
 
 
 def _configuration(options: argparse.Namespace) -> Configuration:

@@ -312,13 +312,13 @@ def _runs_given(place: Path, truths: Iterable[str], known: Iterable[str] = ()) -
     """Return the runs in a folder, with the truths of --truth, or those of an evaluation.json, which has its own.
 
     Raises UsageError where --truth names two folders or goes with an evaluation, DataError for a file that is none, or
-    a truth of a sequence that neither the folder has nor is ``known``.
+    a truth that is not there, or of a sequence that neither the folder has nor is ``known``.
     """
     from toolkit.gate.trajectory_check import FolderOfRuns
 
     if place.is_dir() or place.suffix != ".json":
         folder = FolderOfRuns(place, _truths_given(truths))
-        folder.truths.check_known({*folder.sequences, *known})
+        folder.truths.check({*folder.sequences, *known})
         return folder
     from toolkit.evaluation.document import EvaluatedRuns, read_evaluation
 

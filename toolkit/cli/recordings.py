@@ -116,7 +116,6 @@ def tracks(options: argparse.Namespace) -> int:
 
     from toolkit.datasets import load_images
     from toolkit.files.writing import check_parent
-    from toolkit.frontend import track_images
     from toolkit.frontend.stills import write_stills, write_video
     from toolkit.progress import of_this_process
 
@@ -126,7 +125,7 @@ def tracks(options: argparse.Namespace) -> int:
     check_parent(options.out.parent)
     recording = load_images(options.images, frontend)
     with of_this_process()(options.images) as progress:
-        tracks = track_images(recording.pairs, recording.rig, frontend, progress)
+        tracks = recording.tracks(frontend, progress)
         if options.video:
             names = write_video(recording, tracks, options.out, progress)
         else:

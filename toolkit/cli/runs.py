@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names
-from toolkit.errors import VislamError, printable
+from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names, names_checked
+from toolkit.errors import printable
 
 if TYPE_CHECKING:
     from toolkit.report.differences import Differences
@@ -128,10 +128,8 @@ def diff(options: argparse.Namespace) -> int:
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_files import read_run
 
-    try:
+    with names_checked():
         columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
-    except VislamError as error:
-        raise UsageError(str(error)) from error
     found = differences(read_run(options.before), read_run(options.after))
     if options.json:
         print(to_text(diff_document(found)), end="")

@@ -23,7 +23,7 @@ import numpy as np
 from toolkit.datasets.io.returned import check_types
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import DataError, did_you_mean
+from toolkit.errors import DataError, ExtensionError, did_you_mean
 from toolkit.estimate import Trajectory
 from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
@@ -112,27 +112,27 @@ class _Found(NamedTuple):
 
 def modules() -> dict[str, FoundModule]:
     """Return every module of this package and of the announced ones by name, importing none of them."""
-    return {one.name: one for one in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP, DataError))}
+    return {one.name: one for one in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP))}
 
 
 @cache
 def _found() -> _Found:
     """Import every module of this package and of the announced ones.
 
-    Raises DataError where two have the same name, or one is neither a format nor has built-in sequences.
+    Raises ExtensionError where two have the same name, or one is neither a format nor has built-in sequences.
     """
     modules: dict[str, ModuleType] = {}
     missing: dict[str, str] = {}
-    for found in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP, DataError)):
+    for found in (*modules_in(__name__, __path__), *announced(ENTRY_POINT_GROUP)):
         if found.name in modules:
-            raise DataError(f"two dataset modules are called {found.name}, the second is {found.path}; rename one")
+            raise ExtensionError(f"two dataset modules are called {found.name}, the second is {found.path}; rename one")
         try:
             module = found.load()
         except MissingDependency as dependency:
             missing[found.name] = str(dependency)
             continue
         if not isinstance(module, RecordingFormat | BuiltIns):
-            raise DataError(f"{found.path}: defines neither recognises(path) and load(path) nor BUILT_IN")
+            raise ExtensionError(f"{found.path}: defines neither recognises(path) and load(path) nor BUILT_IN")
         modules[found.name] = module
     return _Found(modules, missing)
 
@@ -192,7 +192,7 @@ def load_sequence(
             sequence = reader.load(path)
         if not isinstance(sequence, Sequence):
             file, given = getattr(reader, "__file__", reader), type(sequence).__name__
-            raise DataError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
+            raise ExtensionError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
         check_types(sequence)
         check_stated(sequence)
     return sequence

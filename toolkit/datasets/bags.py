@@ -55,8 +55,9 @@ def load(path: Path) -> Recording:
 
 def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs within the motion's time and their cameras; raises as :func:`load_from_images`."""
-    spool = ImageSpool()
-    filmed = _read(path, frontend, spool, SILENT)
+    spool = ImageSpool(str(path))
+    with spool.errors_named():
+        filmed = _read(path, frontend, spool, SILENT)
     return ImageRecording(filmed.pairs, filmed.mounted.pair, spool)
 
 
@@ -65,13 +66,11 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
 
     Raises DataError where the bag is damaged, rosbags is not installed, or something an estimator needs is missing.
     """
-    spool = ImageSpool()
+    spool = ImageSpool(str(path))
     try:
-        read = _read(path, frontend, spool, progress)
-        tracks = track_images(read.pairs, read.mounted.pair, frontend, progress)
-    except DataError as error:
-        # The images are in a folder that nobody knows.
-        raise DataError(str(error).replace(str(spool.folder), str(path))) from error
+        with spool.errors_named():
+            read = _read(path, frontend, spool, progress)
+            tracks = track_images(read.pairs, read.mounted.pair, frontend, progress)
     finally:
         spool.close()
     check_frame_count(path, tracks.t_ns.size)
@@ -186,6 +185,8 @@ def _truth(source: Source) -> tuple[Truth | None, tuple[str, ...]]:
 def _spool_images(bag: Bag, chosen: Chosen, spool: ImageSpool, progress: Progress) -> tuple[str, ...]:
     """Write the images of both cameras as an ASL folder has them, the stamp the name; return what to know of stamps."""
     sides = {chosen.left.name: "cam0", chosen.right.name: "cam1"}
+    for topic, camera in sides.items():
+        spool.call(f"{camera}/data", f"{bag.path}: {topic}")
     total = chosen.left.count + chosen.right.count
     unstamped = 0
     for done, message in enumerate(bag.messages(sides.keys())):
@@ -227,7 +228,11 @@ def _motion_of(path: Path, chosen: Chosen, held: Held, tree: ros_values.Tree) ->
         _check_measured(path, chosen.imu, accel, stated, "acceleration")
         return ImuSamples(t_ns, accel, gyro), ()
     if chosen.twist is None:
-        raise DataError(f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion")
+        others = ", ".join(chosen.other_twists)
+        remedy = f"name one with --topics twist=TOPIC ({others})" if others else "record one beside the images"
+        raise DataError(
+            f"{path}: no sensor_msgs/Imu and no nav_msgs/Odometry, so nothing measures the motion; {remedy}"
+        )
     messages = _messages_of(path, chosen.twist, held)
     # A twist is wrapped once more where it has a covariance.
     twists = [getattr(message.value.twist, "twist", message.value.twist) for message in messages]

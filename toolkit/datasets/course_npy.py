@@ -92,7 +92,7 @@ def uses_images(path: Path, tracks: Tracks) -> bool:
 def images_of(path: Path, frontend: Frontend) -> ImageRecording:
     """Return the image pairs and their cameras; raises DataError where there are none or not one a stamp."""
     parts = _parts(path)
-    spool = ImageSpool()
+    spool = ImageSpool(str(_beside(path)))
     pairs, size_px = _spooled(parts, spool, SILENT)
     return ImageRecording(pairs, _pair(parts, size_px), spool)
 
@@ -100,11 +100,12 @@ def images_of(path: Path, frontend: Frontend) -> ImageRecording:
 def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequence:
     """Read a recording and make its tracks of the images beside it; raises DataError as :func:`images_of`."""
     parts = _parts(path)
-    spool = ImageSpool()
+    spool = ImageSpool(str(_beside(path)))
     try:
         pairs, size_px = _spooled(parts, spool, progress)
         pair = _pair(parts, size_px)
-        tracks = track_images(pairs, pair, frontend, progress)
+        with spool.errors_named():
+            tracks = track_images(pairs, pair, frontend, progress)
     finally:
         spool.close()
     check_frame_count(path, tracks.t_ns.size)
@@ -252,4 +253,5 @@ def _pair(parts: _Parts, size_px: tuple[int, int]) -> RectifiedPair:
     baseline_m = _baseline_m(parts.fields)
     if np.array_equal(matrices[0], matrices[1]):
         return already_rectified(left.pinhole_px, baseline_m, size_px)
-    return rectified(left, right, se3(np.eye(3), np.array([-baseline_m, 0.0, 0.0])))
+    T_right_left = se3(np.eye(3), np.array([-baseline_m, 0.0, 0.0]))
+    return rectified(left, right, T_right_left, str(parts.path))

@@ -164,6 +164,7 @@ def load_with_seed(path: Path, seed: int) -> Sequence:
     frames_t_ns = stamps_within(stamps, imu.t_ns, choice.truth.t_ns)
     check_frame_count(layout.root, frames_t_ns.size)
     truth = truth_at(choice.truth, frames_t_ns)
+    _check_room(layout.root, truth.T_world_imu[:, :3, 3])
     camera = CameraLimits(_RATE_HZ, calibration.size_px, _DEPTH_M, _MAX_TRACKS, _LOSS_PER_FRAME)
     return Sequence(
         name=f"{layout.root.name} (simulated stereo)",
@@ -236,7 +237,8 @@ def _filmed(
     check_one_clock(layout.root, np.array([pair.t_ns for pair in listed.pairs]), imu.t_ns, "the samples of the IMU")
     within = listed.within(imu.t_ns)
     check_frame_count(layout.root, len(within.pairs))
-    return ImageRecording(within.pairs, rectified(*calibration.cameras, calibration.T_right_left)), within.remarks
+    rig = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
+    return ImageRecording(within.pairs, rig), within.remarks
 
 
 def _share_with_images(mav0: Path, stamps: Path) -> float:
@@ -286,8 +288,7 @@ def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, 
     """Simulate what a tracker sees from poses (K, 4, 4), with the noise of the rig's covariance.
 
     The room belongs to the trajectory; the seed draws the chance ends of tracks, what is followed, and the
-    noise, each from a stream of its own. The same arguments give the same bits. Raises DataError where the
-    trajectory is too large for a room.
+    noise, each from a stream of its own. The same arguments give the same bits.
     """
     tracks_rng, pixels_rng = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
     points = _room_around(T_world_imu[:, :3, 3])
@@ -298,11 +299,26 @@ def _tracks_in_a_room(T_world_imu: Array, rig: StereoRig, camera: CameraLimits, 
     return _RoomTracks(noisy, points)
 
 
+def _check_room(root: Path, positions: Array) -> None:
+    """Raise DataError where positions (K, 3) are spread wider than a room is."""
+    if not _surface_m2(*_corners(positions)) < _MOST_SURFACE_M2:
+        raise DataError(
+            f"{root}: the truth spans {np.ptp(positions, axis=0).max():.3g} m, and tracks are simulated in a room; "
+            "check its unit, or take the tracks of images"
+        )
+
+
 def _room_around(positions: Array) -> Array:
-    lower, upper = positions.min(axis=0) - _MARGIN_LOWER_M, positions.max(axis=0) + _MARGIN_UPPER_M
-    size = upper - lower
-    surface_m2 = 2.0 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
-    if not surface_m2 < _MOST_SURFACE_M2:
-        raise DataError(f"the truth spans {np.ptp(positions, axis=0).max():.3g} m, more than a room; check its unit")
-    count = round(_LANDMARKS_PER_M2 * surface_m2)
+    lower, upper = _corners(positions)
+    count = round(_LANDMARKS_PER_M2 * _surface_m2(lower, upper))
     return world.room(lower, upper, count, np.random.default_rng(_WORLD_SEED))
+
+
+def _corners(positions: Array) -> tuple[Array, Array]:
+    """Return the two corners (3,) m of the room around positions (K, 3)."""
+    return positions.min(axis=0) - _MARGIN_LOWER_M, positions.max(axis=0) + _MARGIN_UPPER_M
+
+
+def _surface_m2(lower: Array, upper: Array) -> float:
+    size = upper - lower
+    return 2.0 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])

@@ -169,6 +169,8 @@ def _layout(path: Path) -> _Layout | None:
 def _projections(layout: _Layout) -> tuple[Array, Array]:
     """Return the projections (3, 4) of both cameras from calib.txt, whose rows may or may not be named P0, P1, ..."""
     file = layout.root / "calib.txt"
+    if not file.exists():
+        raise DataError(f"{file}: is missing; put the calib.txt of this sequence there, with the rows P0: to P3:")
     rows: dict[str, Array] = {}
     for number, line in enumerate(read_text_input(file, "KITTI's calib.txt is text").splitlines(), start=1):
         name, colon, rest = line.partition(":")
@@ -176,7 +178,9 @@ def _projections(layout: _Layout) -> tuple[Array, Array]:
         try:
             values = np.array([float(word) for word in columns])
         except ValueError as error:
-            raise DataError(f"{file}: line {number}: {error}; expected a name and twelve numbers") from error
+            raise DataError(
+                f"{file}: line {number}: {error}; KITTI odometry's calib.txt has P0: to P3:, twelve numbers each"
+            ) from error
         if values.size == 12:
             rows[name.strip() if colon else f"P{len(rows)}"] = values.reshape(3, 4)
     wanted = [f"P{layout.row}", f"P{layout.row + 1}"]
@@ -212,11 +216,16 @@ def _stamps(layout: _Layout) -> tuple[IntArray, tuple[str, ...]]:
     if not is_regular(file):
         period_ns = round(_PERIOD_S * 1e9)
         return period_ns * np.arange(_count(layout)), (f"no times.txt: an image every {_PERIOD_S:g} s is assumed",)
+    lines = read_text_input(file, "times.txt is text").splitlines()
+    seconds = [_seconds(file, number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    return stamps_ns(file, "stamp", np.array(seconds, dtype=np.float64)), ()
+
+
+def _seconds(file: Path, number: int, line: str) -> float:
     try:
-        seconds = np.array([float(word) for word in read_text_input(file, "times.txt is text").split()])
+        return float(line)
     except ValueError as error:
-        raise DataError(f"{file}: {error}; expected seconds, one a line") from error
-    return stamps_ns(file, "stamp", seconds), ()
+        raise DataError(f"{file}: line {number} is {line.strip()!r}; expected one number a line, in seconds") from error
 
 
 def _numbers(layout: _Layout) -> list[int]:
@@ -235,12 +244,20 @@ def _truth(layout: _Layout, stamps: IntArray, t_ns: IntArray) -> Truth | None:
     file = next((path for path in (layout.root / "poses.txt", beside) if is_regular(path)), None)
     if file is None:
         return None
-    T_world_cam = read_poses(file).T_world_imu
+    poses = read_poses(file)
+    if poses.t_ns is not None:
+        raise DataError(
+            f"{file}: is a trajectory with stamps ({poses.format}), and KITTI's poses have twelve numbers a line and "
+            "none; move it away, and give poses of the body (forward, left, up) in TUM format with --truth"
+        )
+    T_world_cam = poses.T_world_imu
     if len(T_world_cam) not in (stamps.size, _count(layout)):
         raise DataError(
             f"{file}: {len(T_world_cam)} poses for {stamps.size} images; the file is of another sequence, or not cut "
             "as the images are"
         )
     T_cam_flu = np.linalg.inv(T_FLU_CAM)
-    used = np.flatnonzero(np.isin(stamps[: len(T_world_cam)], t_ns))
+    posed = stamps[: len(T_world_cam)]
+    used = np.flatnonzero(np.isin(posed, t_ns))
+    used = used[np.unique(posed[used], return_index=True)[1]]
     return Truth(stamps[used], T_FLU_CAM @ T_world_cam[used] @ T_cam_flu)

@@ -11,6 +11,7 @@ does, by Mercator's projection scaled at the first latitude.
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +49,8 @@ _IMU_FROM_HZ = 50.0
 _IMU_NOISE = ImuNoise(
     accel_noise_density=0.01, gyro_noise_density=1.75e-4, accel_random_walk=1.67e-4, gyro_random_walk=2.91e-6
 )
-_FILES = {"calib_cam_to_cam.txt": "", "calib_velo_to_cam.txt": "velo_to_cam.", "calib_imu_to_velo.txt": "imu_to_velo."}
+_CAMERAS, _VELO, _IMU = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
+_LARGEST_ANGLE_RAD = 2.0 * np.pi
 _VALUES = 30
 # Where in a packet stand: latitude, longitude (deg), altitude (m); roll, pitch, yaw (rad); north, east, up (m/s).
 _PLACE, _ANGLES, _NORTH_EAST_UP = slice(0, 3), slice(3, 6), [6, 7, 10]
@@ -104,7 +106,7 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
     if packets is not None:
         check_one_clock(layout.root, tracks.t_ns, packets.t_ns, "the oxts packets")
     motion, noise, how = _motion(packets, tracks.t_ns)
-    facts = (how, *facts_of(tracks, len(listed.pairs)), *listed.remarks, mounted.source)
+    facts = (how, *_incomplete(packets), *facts_of(tracks, len(listed.pairs)), *listed.remarks, mounted.source)
     return Sequence(
         name=layout.root.name,
         rig=rig_of(mounted.pair, mounted.T_imu_left),
@@ -144,8 +146,7 @@ def _listed(layout: _Layout) -> Listed:
 def _mounted(layout: _Layout) -> _PairMounting:
     found = images_in(layout.images(0)) or images_in(layout.images(1))
     size_px = next((size for size in map(_size_or_none, found[:10]) if size is not None), None)
-    day: Fields = _day_of(layout.root)
-    return _mounting(day, layout.sides, size_of(found[0]) if size_px is None else size_px)
+    return _mounting(_day_of(layout.root), layout.sides, size_of(found[0]) if size_px is None else size_px)
 
 
 def _size_or_none(path: Path) -> tuple[int, int] | None:
@@ -169,6 +170,12 @@ def _motion(packets: _Packets | None, frames_t_ns: np.ndarray) -> tuple[MotionSa
     return TwistSamples(packets.t_ns, v_mps, packets.w_radps), twist_noise(packets.t_ns, v_mps, packets.w_radps), how
 
 
+def _incomplete(packets: _Packets | None) -> tuple[str, ...]:
+    """Return a remark where packets lack their stamp, or stamps their packet."""
+    alone = 0 if packets is None else packets.alone
+    return (f"{alone} oxts packets lack their file or their stamp and are left out",) if alone else ()
+
+
 def _truth(packets: _Packets) -> Truth:
     """Return the poses of the same instrument, in order of time."""
     t_ns, first = np.unique(packets.t_ns, return_index=True)
@@ -184,86 +191,110 @@ class _PairMounting:
     source: str
 
 
-def _day_of(root: Path) -> Fields:
+@dataclass(frozen=True, eq=False)
+class _Day:
+    """The three files of a drive's day: all cameras, the laser scanner in camera 0, and the IMU in the scanner."""
+
+    cameras: Fields
+    velo: Fields
+    imu: Fields
+
+
+def _day_of(root: Path) -> _Day:
     """Read the three files of a drive's day, in its folder or the one above it.
 
-    Raises DataError where one is missing or not made of names and numbers.
+    Raises DataError where one is missing or no text.
     """
-    folder = next((f for f in (root, root.parent) if is_regular(f / "calib_cam_to_cam.txt")), root.parent)
+    folder = next((f for f in (root, root.parent) if is_regular(f / _CAMERAS)), root.parent)
+    return _Day(*(_calibration(folder / name) for name in (_CAMERAS, _VELO, _IMU)))
+
+
+def _calibration(file: Path) -> Fields:
+    """Read a file of names and numbers; what is none, as a date, is left out."""
+    if not file.exists():
+        raise DataError(
+            f"{file}: is missing; the day's calibration is a download of its own: put {_CAMERAS}, {_VELO} and {_IMU} "
+            "into the folder of the day or of the drive"
+        )
     arrays: dict[str, np.ndarray] = {}
-    for name, prefix in _FILES.items():
-        text = read_text_input(folder / name, "KITTI's calibration is text")
-        for line in text.splitlines():
-            key, colon, rest = line.partition(":")
-            if not colon:
-                continue
-            try:
-                arrays[prefix + key.strip()] = np.array([float(word) for word in rest.split()])
-            except ValueError:
-                continue  # a date
-    return Fields(folder / "calib_cam_to_cam.txt", arrays)
+    for line in read_text_input(file, "KITTI's calibration is text").splitlines():
+        key, colon, rest = line.partition(":")
+        with suppress(ValueError):
+            if colon:
+                arrays[key.strip()] = np.array([float(word) for word in rest.split()])
+    return Fields(file, arrays)
 
 
-def _mounting(day: Fields, sides: tuple[str, str], size_px: tuple[int, int]) -> _PairMounting:
+def _mounting(day: _Day, sides: tuple[str, str], size_px: tuple[int, int]) -> _PairMounting:
     """Return the pair of two cameras, as "00" and "01", whose images have a size: the rectified one, or the sensor's.
 
     Raises DataError where a value is missing or impossible, or images have neither size.
     """
     names = [f"{what}_{side}" for side in sides for what in ("S", "K", "D", "R", "T", "S_rect", "P_rect")]
-    day.require(*names, "R_rect_00", *(f"{p}{key}" for p in list(_FILES.values())[1:] for key in ("R", "T")))
-    T_velo_imu, T_cam0_velo = _rigid_motion(day, "imu_to_velo."), _rigid_motion(day, "velo_to_cam.")
-    T_cam0_imu = T_cam0_velo @ T_velo_imu
-    rectified_px, raw_px = (_size(day, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
+    day.cameras.require(*names, "R_rect_00")
+    for other in (day.velo, day.imu):
+        other.require("R", "T")
+    T_cam0_imu = _rigid_motion(day.velo) @ _rigid_motion(day.imu)
+    rectified_px, raw_px = (_size(day.cameras, f"{key}_{sides[0]}") for key in ("S_rect", "S"))
     if size_px == rectified_px:
-        T_rect_cam0 = se3(day.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
-        return _already(day, sides, size_px, rigid(day.path, "R_rect_00", T_rect_cam0) @ T_cam0_imu)
+        T_rect_cam0 = se3(day.cameras.constant("R_rect_00", 9).reshape(3, 3), np.zeros(3))
+        rigid(day.cameras.path, "R_rect_00", T_rect_cam0)
+        return _already(day.cameras, sides, size_px, T_rect_cam0 @ T_cam0_imu)
     if size_px != raw_px:
-        raise DataError(f"{day.path}: images of {size_px} px are neither rectified, {rectified_px}, nor raw, {raw_px}")
-    cameras = [_camera(day, side) for side in sides]
-    T_left_cam0, T_right_cam0 = (_rigid_motion(day, "", f"_{side}") for side in sides)
-    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0))
+        size, *both = (f"{width}x{height}" for width, height in (size_px, rectified_px, raw_px))
+        raise DataError(
+            f"{day.cameras.path}: images of {size} px are neither rectified ones of that day, {both[0]}, nor raw ones, "
+            f"{both[1]}; take the calibration of the images' day, or images that were not scaled or cut"
+        )
+    cameras = [_camera(day.cameras, side) for side in sides]
+    T_left_cam0, T_right_cam0 = (_rigid_motion(day.cameras, f"_{side}") for side in sides)
+    pair = rectified(cameras[0], cameras[1], T_right_cam0 @ se3_inverse(T_left_cam0), str(day.cameras.path))
     return _PairMounting(
         pair, se3_inverse(T_left_cam0 @ T_cam0_imu), "raw images, rectified with the day's calibration"
     )
 
 
-def _already(day: Fields, sides: tuple[str, str], size_px: tuple[int, int], T_rect_imu: Array) -> _PairMounting:
-    left, right = (day.constant(f"P_rect_{side}", 12).reshape(3, 4) for side in sides)
+def _already(cameras: Fields, sides: tuple[str, str], size_px: tuple[int, int], T_rect_imu: Array) -> _PairMounting:
+    left, right = (cameras.constant(f"P_rect_{side}", 12).reshape(3, 4) for side in sides)
     fx, fy, cx, cy = (float(x) for x in (left[0, 0], left[1, 1], left[0, 2], left[1, 2]))
-    baseline_m = float((left[0, 3] - right[0, 3]) / fx) if fx > 0.0 else 0.0
-    if not (fy > 0.0 and baseline_m > 0.0):
+    if not (fx > 0.0 and fy > 0.0):
+        raise DataError(f"{cameras.path}: P_rect_{sides[0]} has no positive focal lengths; copy the file again")
+    baseline_m = float((left[0, 3] - right[0, 3]) / fx)
+    if not baseline_m > 0.0:
         raise DataError(
-            f"{day.path}: P_rect_{sides[0]} and P_rect_{sides[1]} are not those of a left and a right camera"
+            f"{cameras.path}: by P_rect_{sides[0]} and P_rect_{sides[1]} the right camera is not to the right of the "
+            "left one; copy the file again"
         )
     T_left_rect = se3(np.eye(3), np.linalg.inv(left[:, :3]) @ left[:, 3])
     pair = already_rectified((fx, fy, cx, cy), baseline_m, size_px)
     return _PairMounting(pair, se3_inverse(T_left_rect @ T_rect_imu), "images rectified as the data set has them")
 
 
-def _camera(day: Fields, side: str) -> Camera:
-    K = day.constant(f"K_{side}", 9).reshape(3, 3)
+def _camera(cameras: Fields, side: str) -> Camera:
+    K = cameras.constant(f"K_{side}", 9).reshape(3, 3)
     pinhole = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     if not (pinhole[0] > 0.0 and pinhole[1] > 0.0):
-        raise DataError(f"{day.path}: K_{side} has no positive focal lengths")
-    return Camera(pinhole, "radtan", day.constant(f"D_{side}", 5), _size(day, f"S_{side}"))
+        raise DataError(f"{cameras.path}: K_{side} has no positive focal lengths; copy the file again")
+    return Camera(pinhole, "radtan", cameras.constant(f"D_{side}", 5), _size(cameras, f"S_{side}"))
 
 
-def _size(day: Fields, key: str) -> tuple[int, int]:
-    width, height = day.constant(key, 2)
+def _size(cameras: Fields, key: str) -> tuple[int, int]:
+    width, height = cameras.constant(key, 2)
     return int(width), int(height)
 
 
-def _rigid_motion(day: Fields, prefix: str, suffix: str = "") -> Array:
+def _rigid_motion(fields: Fields, suffix: str = "") -> Array:
     """Return the rigid motion (4, 4) of an R and a T."""
-    rotation = day.constant(f"{prefix}R{suffix}", 9).reshape(3, 3)
-    return rigid(day.path, f"{prefix}R{suffix}", se3(rotation, day.constant(f"{prefix}T{suffix}", 3)))
+    rotation = fields.constant(f"R{suffix}", 9).reshape(3, 3)
+    return rigid(fields.path, f"R{suffix}", se3(rotation, fields.constant(f"T{suffix}", 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Packets:
     """Packets (S,) in the order of their files: poses (S, 4, 4), velocities, specific force and rates (S, 3).
 
-    The world is east, north, up from the first place; the body forward, left, up.
+    The world is east, north, up from the first place; the body forward, left, up. ``alone`` is how many packets have a
+    file and no stamp, or a stamp and no file.
     """
 
     t_ns: IntArray
@@ -271,6 +302,7 @@ class _Packets:
     v_world: Array
     accel_mps2: Array
     w_radps: Array
+    alone: int
 
     @property
     def v_body_mps(self) -> Array:
@@ -287,7 +319,7 @@ def _read_packets(folder: Path) -> _Packets | None:
         return None
     stamps = _read_stamps(folder / "timestamps.txt")
     files = {int(path.stem): path for path in (folder / "data").glob("*.txt") if path.stem.isdecimal()}
-    numbers = [number for number in sorted(files) if number in stamps]
+    numbers = sorted(files.keys() & stamps.keys())
     if len(numbers) < 2:
         raise DataError(f"{folder}: {len(numbers)} packets with a stamp; copy oxts/data and oxts/timestamps.txt again")
     rows = np.stack([_packet(files[number]) for number in numbers])
@@ -298,6 +330,7 @@ def _read_packets(folder: Path) -> _Packets | None:
         np.stack([east, north, up], axis=1),
         rows[:, _ACCEL],
         rows[:, _RATES],
+        len(files.keys() ^ stamps.keys()),
     )
 
 
@@ -335,6 +368,8 @@ def _packet(file: Path) -> Array:
         raise DataError(f"{file}: {error}; expected {_VALUES} numbers") from error
     if values.size != _VALUES or not np.isfinite(values).all():
         raise DataError(f"{file}: {values.size} numbers, expected {_VALUES} finite ones; copy it again")
+    if np.abs(values[_ANGLES]).max() > _LARGEST_ANGLE_RAD:
+        raise DataError(f"{file}: roll, pitch and yaw are {values[_ANGLES].tolist()}, and no radians; convert degrees")
     return values
 
 

@@ -11,9 +11,9 @@ import shutil
 import tempfile
 import weakref
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -91,15 +91,34 @@ def _digest(path: Path) -> str:
 
 
 class ImageSpool:
-    """A folder of images that is there as long as the spool is."""
+    """A folder of unpacked images that is there as long as the spool is.
 
-    def __init__(self) -> None:
+    ``source`` is what they were unpacked of, and what messages call the folder, which nobody knows.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._names = {"": source}
         try:
             folder().mkdir(parents=True, exist_ok=True)
             self.folder = Path(tempfile.mkdtemp(prefix="images-", dir=folder()))
         except OSError as error:
             raise _unwritable(error) from error
         self.close = weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def call(self, name: str, source: str) -> None:
+        """Have messages call a folder of the spool by what its images were unpacked of."""
+        self._names[name] = source
+
+    @contextmanager
+    def errors_named(self) -> Iterator[None]:
+        """Have the messages of a DataError name what the images were unpacked of."""
+        try:
+            yield
+        except DataError as error:
+            message = str(error)
+            for name in sorted(self._names, reverse=True):
+                message = message.replace(str(self.folder / name), self._names[name])
+            raise DataError(message) from error
 
     def add_grey(self, name: str, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> Path:
         """Write grey values (height, width) of 8 or 16 bits as PGM and return the path; raises OutputError."""

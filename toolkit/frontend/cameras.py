@@ -90,15 +90,15 @@ def already_rectified(pinhole_px: Pinhole, baseline_m: float, size: tuple[int, i
     return RectifiedPair(*pinhole_px, baseline_m, raw_size_px=size, size_px=size, R_rect_cam=np.eye(3))
 
 
-def rectified(left: Camera, right: Camera, T_right_left: Array) -> RectifiedPair:
+def rectified(left: Camera, right: Camera, T_right_left: Array, where: str) -> RectifiedPair:
     """Rectify two cameras; ``T_right_left`` (4, 4) takes left-camera coordinates to the right camera's.
 
     Both are turned by half of what they differ by, then together until the baseline is their x-axis (Bouguet, as
-    cv2.stereoRectify). Raises DataError where they are no stereo pair.
+    cv2.stereoRectify). Raises DataError where they are no stereo pair, naming ``where`` the calibration is written.
     """
     import cv2
 
-    _check_pair(left, right, T_right_left)
+    _check_pair(left, right, T_right_left, where)
     # OpenCV wants contiguous arrays, and the translation as a column.
     turn, shift = np.ascontiguousarray(T_right_left[:3, :3]), np.ascontiguousarray(T_right_left[:3, 3:4])
     coefficients = [c.coefficients if c.distortion == "radtan" else np.zeros(4) for c in (left, right)]
@@ -114,16 +114,27 @@ def rectified(left: Camera, right: Camera, T_right_left: Array) -> RectifiedPair
     return RectifiedPair(fx, fy, cx, cy, baseline_m, left.size_px, left.size_px, np.array(R_rect_left), maps)
 
 
-def _check_pair(left: Camera, right: Camera, T_right_left: Array) -> None:
+def _check_pair(left: Camera, right: Camera, T_right_left: Array, where: str) -> None:
     if left.size_px != right.size_px:
-        raise DataError(f"the cameras have images of {left.size_px} and {right.size_px} px; a pair needs one size")
+        sizes = " and ".join(f"{width}x{height}" for width, height in (left.size_px, right.size_px))
+        raise DataError(f"{where}: the cameras have images of {sizes} px, and a pair needs one size; record both alike")
     turned = float(np.arccos(np.clip(0.5 * (np.trace(T_right_left[:3, :3]) - 1.0), -1.0, 1.0)))
     if turned > _MOST_TURNED_RAD:
-        raise DataError(f"the cameras look {np.rad2deg(turned):.0f} deg apart; a stereo pair looks the same way")
+        raise DataError(
+            f"{where}: the cameras look {np.rad2deg(turned):.0f} deg apart, and a stereo pair looks the same way; mend "
+            "the extrinsics, or name two cameras that are a pair"
+        )
     x, y, z = T_right_left[:3, 3]
+    if not np.any(T_right_left[:3, 3]):
+        raise DataError(
+            f"{where}: both cameras stand in the same place, so there is no baseline; mend the extrinsics, or name two "
+            "cameras"
+        )
     if -x < max(abs(y), abs(z)):
-        where = "left" if x > max(abs(y), abs(z)) else "above, below or behind"
-        raise DataError(f"the right camera stands {where} of the left one; exchange the two, or mend the extrinsics")
+        side = "left" if x > max(abs(y), abs(z)) else "above, below or behind"
+        raise DataError(
+            f"{where}: the right camera stands {side} of the left one; exchange them, or mend the extrinsics"
+        )
 
 
 def _keeping_resolution(left: Camera, right: Camera) -> Array:

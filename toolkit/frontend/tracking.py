@@ -5,6 +5,7 @@ left and right are what they are called, and that the calibration is theirs.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -31,12 +32,17 @@ _REPEATED = "it and its partner are those of the pair before"
 class ImageRecording:
     """The image pairs of a recording in order of time, and the pair of cameras that took them.
 
-    ``keeper`` is whatever takes the image files away when it is no longer referred to; None where they stay.
+    ``spool`` is the folder they were unpacked into, which goes with it; None where they are files of the recording.
     """
 
     pairs: tuple[StampedPair, ...]
     rig: RectifiedPair
-    keeper: object = None
+    spool: cache.ImageSpool | None = None
+
+    def tracks(self, frontend: Frontend, progress: Progress) -> "ImageTracks":
+        """Make the tracks, as :func:`track_images`; a message names what images were unpacked of."""
+        with nullcontext() if self.spool is None else self.spool.errors_named():
+            return track_images(self.pairs, self.rig, frontend, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +218,8 @@ def _check_sides(pairs: Sequence[StampedPair], rig: RectifiedPair, settings: Fro
     most = settings.max_tracks * len(places)
     if most > least and sum(_exchanged(pairs[place], rig, settings, bits) for place in places) > least:
         raise DataError(
-            f"{folders}: left and right images are exchanged; exchange the two folders, or turn the images back if all "
-            "are upside down or mirrored"
+            f"{folders}: left and right images are exchanged; exchange the two, or turn the images back if all are "
+            "upside down or mirrored"
         )
     if min(most, wanted) > least:
         before, after = (sum(_matched_with(pairs, place, k, rig, settings, bits) for place in places) for k in (-1, 1))

@@ -266,24 +266,28 @@ def _unpack_wheel(wheel: Path, folder: Path) -> None:
         with zipfile.ZipFile(wheel) as archive:
             archive.extractall(folder)
     except (OSError, zipfile.BadZipFile) as error:
-        raise BaselineError(f"{wheel}: it is no wheel that can be read ({error}); build one with pip wheel") from error
+        why = getattr(error, "strerror", None) or error
+        raise BaselineError(f"{wheel}: it is no wheel that can be read ({why}); build one with pip wheel") from error
 
 
 def _unpack_revision(revision: str, folder: Path) -> None:
-    top = _git("rev-parse", "--show-toplevel", remedy="stand in a checkout, or name a wheel")
-    remedy = "name a revision of this checkout, or a wheel"
-    commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", remedy=remedy)
-    archive = _git("archive", commit.decode().strip(), remedy=remedy, folder=top.decode().removesuffix("\n"))
+    top = _git("rev-parse", "--show-toplevel", otherwise=f"{revision}: no checkout; stand in one, or name a wheel")
+    shallow = _git("rev-parse", "--is-shallow-repository", otherwise=revision).strip() == b"true"
+    deepen = "fetch it, for this clone is shallow (git fetch --unshallow)" if shallow else "name one that git log shows"
+    unknown = f"{revision!r} is no revision of this checkout; {deepen}, or name a wheel"
+    commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", otherwise=unknown)
+    archive = _git("archive", commit.decode().strip(), otherwise=unknown, folder=top.decode().removesuffix("\n"))
     with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
         packed.extractall(folder, filter="data")
 
 
-def _git(*arguments: str, remedy: str, folder: str = ".") -> bytes:
+def _git(*arguments: str, otherwise: str, folder: str = ".") -> bytes:
+    """Return what git prints; raises BaselineError with its complaint and what stands ``otherwise`` where it fails."""
     try:
         done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, check=False)
     except OSError as error:
-        raise BaselineError(f"git cannot be run ({error}); name a wheel") from error
+        raise BaselineError(f"--speed-against: git cannot be run ({error.strerror}); name a wheel") from error
     if done.returncode:
-        error_text = printable(done.stderr.decode(errors="replace").strip()) or "it is not known here"
-        raise BaselineError(f"git {arguments[0]} {arguments[-1]}: {error_text}; {remedy}")
+        complaint = printable(done.stderr.decode(errors="replace").strip())
+        raise BaselineError(f"--speed-against {otherwise}{complaint and f' ({complaint})'}")
     return done.stdout

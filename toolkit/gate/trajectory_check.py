@@ -29,12 +29,16 @@ class Truths:
     folder: Path | None = None
     files: Mapping[str, Path] | None = None
 
-    def check_known(self, sequences: Iterable[str]) -> None:
-        """Raise DataError where a truth is named for none of the sequences, as for a misspelt one."""
+    def check(self, sequences: Iterable[str]) -> None:
+        """Raise DataError where a truth is named for none of the sequences, as for a misspelt one, or is not there."""
         known = sorted(sequences)
-        for name in self.files or {}:
+        for name, file in (self.files or {}).items():
             if name not in known:
                 raise DataError(f"--truth names the truth of {name}: {no_such('sequence', name, known)}")
+            if not file.exists():
+                raise DataError(f"--truth {name}={file}: there is no such file; check the path")
+        if self.folder is not None and not self.folder.is_dir():
+            raise DataError(f"--truth {self.folder}: it is no folder; name one that has SEQUENCE.tum, or SEQUENCE=FILE")
 
     def of(self, sequence: str) -> Path:
         """Return the truth's file; raises DataError where there is none."""
@@ -78,7 +82,8 @@ class FolderOfRuns:
         """Score the files of a sequence; the truth is where it is given, or else where the baseline had it."""
         files = self._files.get(sequence, ())
         if not files:
-            raise DataError(f"no trajectory is there; the baseline has {', '.join(before.files if before else ())}")
+            had = ", ".join(before.files if before else ())
+            raise DataError(f"no trajectory of it is in {self.folder}; the baseline has {had}")
         given = before is None or self.truths.folder is not None or sequence in (self.truths.files or {})
         path = self.truths.of(sequence) if before is None or given else place_of(before.truth) or Path(before.truth)
         if not given and not path.is_file():

@@ -119,6 +119,9 @@ def scores(estimate: Poses, truth: Poses, scoring: Scoring) -> dict[str, float |
     Raises DataError where no two of its poses meet the truth in time, or they do in exchanged axes alone.
     """
     matched = matched_poses(estimate, truth)
+    alone = next((poses.path for poses in (estimate, truth) if poses.t_ns.size < 2), None)
+    if alone is not None:
+        raise DataError(f"{alone}: it has one pose, and errors are of two and more; write the whole trajectory")
     if len(matched) < 2:
         raise DataError(
             f"{estimate.path}: {len(matched)} of its poses meet the truth in time; it covers {range_s(estimate.t_ns)}, "

@@ -68,24 +68,29 @@ class _Found(NamedTuple):
 def _found() -> _Found:
     """Import every metric file of this package and of the announced ones.
 
-    Raises VislamError where two files declare the same key, ExtensionError where one is no metric file.
+    Raises ExtensionError, naming the file, where one is no metric file or declares a key that another has.
     """
     files: list[MetricFile] = []
     missing: dict[str, str] = {}
     for module in (*_own_modules(), *announced(ENTRY_POINT_GROUP)):
         try:
-            files.append(_checked(module.load(), module))
+            files.append(_loaded(module))
         except MissingDependency as dependency:
             missing[module.name] = str(dependency)
     keys = [metric.key for file in files for metric in file.METRICS]
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
-        raise VislamError(f"more than one metric file declares {', '.join(twice)}; rename one of them")
+        here = [str(getattr(one, "__file__", one)) for one in files if any(m.key in twice for m in one.METRICS)]
+        raise ExtensionError(f"{' and '.join(here)}: both declare {', '.join(twice)}; rename it in one of them")
     return _Found(tuple(sorted(files, key=lambda file: file.ORDER)), missing)
 
 
-def _checked(file: object, found: FoundModule) -> MetricFile:
-    """Return a module that defines what a metric file does."""
+def _loaded(found: FoundModule) -> MetricFile:
+    """Import a metric file; raises ExtensionError where it does not define what one does."""
+    try:
+        file = found.load()
+    except ExtensionError as error:
+        raise ExtensionError(f"{found.path}: {error}") from error
     metrics, order, score = (getattr(file, name, None) for name in ("METRICS", "ORDER", "score"))
     records = isinstance(metrics, tuple) and all(isinstance(metric, Metric) for metric in metrics)
     if not (records and isinstance(order, int | float) and callable(score)):

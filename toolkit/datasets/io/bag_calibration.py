@@ -107,7 +107,7 @@ def mounted(source: Source, motion: MotionSamples) -> Mounted:
         calibration = read_calibration(root, mav0)
         if calibration.cameras is None:
             raise DataError(f"{mav0}: the calibration lacks distortion_model or intrinsics of a camera; add them")
-        pair = rectified(*calibration.cameras, calibration.T_right_left)
+        pair = rectified(*calibration.cameras, calibration.T_right_left, str(mav0))
         notes = (f"{calibration.source}, beside the bag", *(() if twist else (calibration.noise_source,)))
         return Mounted(pair, calibration.T_imu_left, twist or calibration.noise, notes)
     T_imu_left = source.tree.between(source.frames.body, source.frames.left)
@@ -178,7 +178,7 @@ def _pair(source: Source) -> tuple[RectifiedPair, RectifiedPair | None, str]:
         as_they_are = already_rectified(left_rect.pinhole_px, baseline_m, _size(infos[0]))
     if T_right_left is None:
         raise DataError(f"{what[1]}: P has no baseline, and /tf_static does not join the two cameras; {_PUT_BESIDE}")
-    return rectified(left, right, T_right_left), as_they_are, how
+    return rectified(left, right, T_right_left, f"{source.path}: {how}"), as_they_are, how
 
 
 def _infos(source: Source) -> tuple[list[Topic], list[Any]]:

@@ -28,6 +28,8 @@ _TF, _OLD_TF, _TF_DEFINITION = (
     "geometry_msgs/TransformStamped[] transforms",
 )
 _ENDINGS = (".mcap", ".db3", ".bag")
+# What the library says of a storage, a compression or a version of bags that it does not know.
+_NOT_SUPPORTED = "not supported"
 # What writes the missing index, by kind of bag.
 _MENDS = {
     "ros1": "copy it again, or run rosbag reindex on it",
@@ -237,6 +239,11 @@ def _guarded(path: Path, kind: Kind) -> Iterator[None]:
         raise
     except Exception as error:
         why = printable(" ".join(str(error).split()))[:200] or type(error).__name__
+        if _NOT_SUPPORTED in why:
+            raise DataError(
+                f"{path}: rosbags does not read such a bag ({why.removesuffix('; please report issue.')}); convert it "
+                "with ros2 bag convert or rosbag decompress, or install a newer rosbags"
+            ) from error
         of_folder = kind in ("mcap", "sqlite") and _of_rosbag2(path.parent / _METADATA)
         mend = f"name its folder, which has {_METADATA}, or copy it again" if of_folder else _MENDS[kind]
         raise DataError(f"{path}: damaged, cut off, or a bag that cannot be read ({why}); {mend}") from error

@@ -65,6 +65,7 @@ class Chosen:
     transforms: tuple[Topic, ...]
     moving: tuple[Topic, ...]
     other_imus: tuple[str, ...]
+    other_twists: tuple[str, ...]
     facts: tuple[str, ...] = ()
 
     @property
@@ -95,6 +96,7 @@ def choose(path: Path, topics: Sequence[Topic], requested: str | None) -> Chosen
         transforms=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.endswith(_STATIC)),
         moving=tuple(topic for topic in _of_types(usable, TRANSFORMS) if topic.name.rpartition("/")[2] == _MOVING),
         other_imus=tuple(topic.name for topic in imus if topic not in (imu, accel)),
+        other_twists=tuple(topic.name for topic in _of_types(usable, ROLES["twist"])),
     )
     return replace(chosen, facts=_facts(topics, chosen, given))
 
@@ -112,7 +114,12 @@ def _requested(path: Path, topics: Sequence[Topic], requested: str | None) -> di
         if topic.type not in ROLES[role] or topic.unreadable:
             wanted = " or ".join(kind.replace("/msg/", "/") for kind in ROLES[role])
             raise DataError(f"{path}: {topic} cannot be {role}, which is {wanted}")
+        if role in given:
+            raise DataError(f"{path}: --topics names {role} twice; leave one out")
         given[role] = topic
+    for left, right in (("left", "right"), ("left_info", "right_info")):
+        if left in given and given[left] == given.get(right):
+            raise DataError(f"{path}: --topics names {given[left].name} as {left} and {right}; a pair has a topic each")
     return given
 
 
@@ -133,7 +140,7 @@ def _pair(path: Path, topics: Sequence[Topic], usable: Sequence[Topic], given: d
 
 def _no_pair(path: Path, topics: Sequence[Topic], images: Sequence[Topic]) -> str:
     """Return what to tell of a bag in which no two topics of images are a pair by their names."""
-    there = ", ".join(map(str, topics)) or "nothing"
+    there = ", ".join(map(str, topics)) or "no topics"
     if not images:
         why = "holds no images that can be read, and the tracks are made of them"
     elif len(images) == 1:

@@ -146,34 +146,38 @@ def stamps_ns(path: Path, key: str, stamps_s: Array) -> IntArray:
         raise DataError(
             f"{path}: {key}[{beyond[0]}] is {stamps_s[beyond[0]]:g}, which no unit makes a time of; mend it"
         )
-    coarse_s = float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
-    if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s, coarse_s):
+    unit = _unit_of(stamps_s)
+    coarse_s = (1.0 if unit is None else unit[0]) * float(np.spacing(np.float32(np.abs(stamps_s).max(initial=0.0))))
+    if coarse_s > _COARSE_S and stamps_s.size > 1 and _is_single_precision(stamps_s):
         raise DataError(
             f"{path}: {key} went through single precision, whose steps are {coarse_s:g} s there: write it in double"
         )
-    unit = probable_unit(stamps_s)
     if unit is not None:
-        raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit}")
+        raise DataError(f"{path}: {key} must be in seconds, but the stamps look like {unit[1]}")
     return np.rint(stamps_s * NS_PER_S).astype(np.int64)
 
 
-def _is_single_precision(stamps_s: Array, coarse_s: float) -> bool:
-    """Say whether all stamps are numbers of single precision, and not only as whole seconds or quarters are."""
-    finest = coarse_s > 1.0 or (stamps_s / coarse_s % 2.0 == 1.0).any()
-    return bool(finest and (stamps_s == stamps_s.astype(np.float32)).all())
+def _is_single_precision(stamps: Array) -> bool:
+    """Say whether all stamps (N,) are numbers of single precision, and not only as whole seconds or quarters are."""
+    step = float(np.spacing(np.float32(np.abs(stamps).max())))
+    finest = step > 1.0 or (stamps / step % 2.0 == 1.0).any()
+    return bool(finest and (stamps == stamps.astype(np.float32)).all())
 
 
 def probable_unit(stamps_s: Array) -> str | None:
     """Return the unit, with its remedy, that stamps (N,) are probably in, or None where seconds are plausible."""
+    unit = _unit_of(stamps_s)
+    return None if unit is None else unit[1]
+
+
+def _unit_of(stamps_s: Array) -> tuple[float, str] | None:
+    """Return the unit that stamps (N,) are probably in, in seconds, and its name; None where seconds are plausible."""
     largest = float(np.abs(stamps_s).max(initial=0.0))
     step = float(np.median(np.abs(np.diff(stamps_s)))) if stamps_s.size > 1 else 0.0
     if largest < _LATEST_S and step < _LONGEST_STEP_S:
         return None
     # The size of absolute stamps shows their unit (the epoch began 1.3e9 to 1.8e9 s ago), the step of relative ones.
-    for scale, name in _UNITS:
-        if largest * scale > 1e8 or step * scale > 1e-3:
-            return name
-    return _UNITS[-1][1]
+    return next((one for one in _UNITS if largest * one[0] > 1e8 or step * one[0] > 1e-3), _UNITS[-1])
 
 
 def probable_unit_of_ns(t_ns: npt.NDArray[np.generic]) -> str | None:

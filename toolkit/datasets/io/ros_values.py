@@ -104,13 +104,19 @@ def _rows(message: Any, what: str, height: int, width: int, channels: int, dtype
 
 
 def image_file(message: Any, what: str) -> tuple[str, bytes]:
-    """Return the ending and the content of the file that a CompressedImage is; raises DataError where it is none."""
+    """Return the ending and the content of the file that a CompressedImage is; raises DataError where it is none.
+
+    One without content is returned as it is: the front end names it, and leaves it out where others are sound.
+    """
     content = bytes(message.data)
-    if content.startswith(_PNG):
+    if content.startswith(_PNG) or not content:
         return ".png", content
     if content.startswith(_JPEG):
         return ".jpg", content
-    raise DataError(f"{what}: compressed images are {printable(str(message.format))[:50]}, expected PNG or JPEG")
+    raise DataError(
+        f"{what}: compressed images are {printable(str(message.format))[:50]}, expected PNG or JPEG; republish them as "
+        "one of these, or as raw images"
+    )
 
 
 def camera(info: Any, what: str) -> Camera:
