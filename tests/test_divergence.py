@@ -80,6 +80,43 @@ def test_a_few_jumps_are_not(scenario, run_on):
     assert contradiction(jumping(run_on("ekf", scenario).causal, 0.02, JUMP_M), sequence) is None
 
 
+@every_scenario
+@pytest.mark.parametrize("leap_m", [1e5, 1e20])
+def test_a_single_leap_beyond_what_the_measured_motion_goes_is_a_contradiction(scenario, leap_m, run_on):
+    causal = run_on("dead-reckoning", scenario).causal
+    poses = causal.T_world_imu.copy()
+    poses[-5:, 1, 3] += leap_m
+    reason = contradiction(replace(causal, T_world_imu=poses), recording(scenario))
+    assert ("farther away than the Moon" if leap_m > 1e9 else "and what was measured goes") in reason
+
+
+def test_a_vehicle_that_stands_far_from_the_world_is_a_contradiction():
+    """Nothing moves: each of its steps is the measured one."""
+    sequence = recording("drive")
+    values = sequence.motion.values.copy()
+    values[:, :3] = 0.0
+    standing = replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
+    pose = sequence.truth.T_world_imu[:1].copy()
+    pose[:, :3, 3] = 1e20
+    poses = np.repeat(pose, len(sequence.truth.t_ns), axis=0)
+    reason = contradiction(Trajectory(sequence.truth.t_ns, poses), standing)
+    assert reason == "its position is farther away than the Moon from estimate 0 on"
+
+
+@pytest.mark.parametrize(("ways", "is_one"), [(1.9, False), (2.1, True)])
+def test_twice_the_way_that_odometry_measured_is_in_reach(ways, is_one):
+    """Straight ahead at 10 m/s for 10 s, ten metres beside what no correction is."""
+    sequence = recording("drive")
+    values = np.tile([10.0, 0.0, 0.0, 0.0, 0.0, 0.0], (len(sequence.motion.t_ns), 1))
+    straight = replace(sequence, motion=sequence.motion.of(sequence.motion.t_ns, values))
+    poses = np.tile(np.eye(4), (sequence.frame_count, 1, 1))
+    gone_s = sequence.frames_s - sequence.frames_s[0]
+    poses[:, 0, 3] = 10.0 * gone_s
+    poses[-1, 0, 3] = 10.0 + ways * 10.0 * gone_s[-1]
+    found = contradiction(Trajectory(sequence.frames_t_ns, poses), straight)
+    assert (found is not None) == is_one
+
+
 @pytest.mark.parametrize(("jump_m", "is_one"), [(0.1, False), (5.0, True)])
 def test_jumps_of_half_a_hundredth_of_what_the_pose_is_uncertain_by_are_no_contradiction(jump_m, is_one, run_on):
     """Twenty metres: a state far from its start, which jumps as the whole way behind it turns a little."""

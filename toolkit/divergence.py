@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from toolkit.estimate import Trajectory
-from toolkit.geometry import Array, se3_inverse, se3_log
+from toolkit.estimate import FARTHEST_M, Trajectory
+from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
+from toolkit.measured_motion import TwistSamples
 from toolkit.models.gating import mahalanobis_squared
 from toolkit.models.predicted_steps import predicted_steps
 from toolkit.models.state import POSE
+from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 from toolkit.track_noise import TrackNoise
 
@@ -41,6 +43,11 @@ _MOST_OUTLIERS = 0.2
 # rad/s of turn rate and m/s of velocity.
 _VELOCITY_SLACK = np.repeat([0.02, 0.2], 3)
 
+# No trajectory goes farther from its first pose than so many times the way that odometry measured (beyond a quarter too
+# much vision and odometry disagree already), or beside an IMU, which measures none, than so many m/s times the time
+# since; and a correction of the first poses is no travel (m).
+MOST_WAYS, MOST_MPS, _NO_TRAVEL_M = 2.0, 1000.0, 10.0
+
 # Covariances are linearised anew at every frame: what a correction takes away shows in their difference down to such a
 # share of a standard deviation. Of a position that is uncertain by 20 m that is 0.2 m: a turn of the whole way behind.
 _RESOLUTION = 0.01
@@ -51,6 +58,8 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
     if not np.isfinite(trajectory.T_world_imu).all():
         first = int(np.flatnonzero(~np.isfinite(trajectory.T_world_imu).all(axis=(1, 2)))[0])
         return f"its poses are not numbers from estimate {first} on"
+    if (reason := _out_of_reach(trajectory, sequence)) is not None:
+        return reason
     far = _step_distances(trajectory, sequence) > FAR_STEP
     if far.size == 0 or far.mean() <= MOST_FAR_STEPS:
         return None
@@ -58,6 +67,38 @@ def contradiction(trajectory: Trajectory, sequence: Sequence) -> str | None:
         f"{100.0 * far.mean():.0f} % of its steps contradict the measured motion by more than chance allows "
         f"(at most {100.0 * MOST_FAR_STEPS:.0f} % do in a run that works)"
     )
+
+
+def _out_of_reach(trajectory: Trajectory, sequence: Sequence) -> str | None:
+    """Return which pose is farther away than anything travels that moves as was measured, or None.
+
+    A single leap, after which all steps are again the measured ones, is seen by nothing else.
+    """
+    position, t_ns = trajectory.T_world_imu[:, :3, 3], trajectory.t_ns
+    if t_ns.size == 0:
+        return None
+    beyond = np.abs(position).max(axis=1) > FARTHEST_M
+    if beyond.any():
+        return f"its position is farther away than the Moon from estimate {int(np.argmax(beyond))} on"
+    gone_m, reach_m = np.linalg.norm(position - position[0], axis=1), _reach_m(t_ns, sequence)
+    beyond = gone_m > reach_m
+    if not beyond.any():
+        return None
+    k = int(np.argmax(beyond))
+    return (
+        f"at estimate {k} it is {gone_m[k]:.3g} m from its first, and what was measured goes {reach_m[k]:.3g} m at most"
+    )
+
+
+def _reach_m(t_ns: IntArray, sequence: Sequence) -> Array:
+    """Return how far away the stamps' poses (N,) can be from the first."""
+    motion, since_s = sequence.motion, (t_ns - t_ns[0]) / NS_PER_S
+    if not isinstance(motion, TwistSamples):
+        return np.asarray(_NO_TRAVEL_M + MOST_MPS * since_s)
+    speed_mps = np.linalg.norm(motion.values[:, :3], axis=1)
+    pieces_m = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(motion.t_ns) / NS_PER_S
+    way_m = np.interp(t_ns, motion.t_ns, np.append(0.0, np.cumsum(pieces_m)))
+    return np.asarray(_NO_TRAVEL_M + MOST_WAYS * (way_m - way_m[0]))
 
 
 def gate_collapse(info: Mapping[str, Array], track_noise: TrackNoise | None = None) -> str | None:

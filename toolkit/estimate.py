@@ -13,6 +13,8 @@ Output = Literal["causal", "final"]
 Arithmetic = Literal["compiled", "numpy"]
 # What several runs of an estimator computed with: "both" where they differ.
 ArithmeticOfRuns = Literal["compiled", "numpy", "both"]
+# Farther than the Moon: no position. Squares of 1e200 m overflow, and a metric would have no value without saying why.
+FARTHEST_M = 1e9
 
 
 @dataclass(frozen=True, eq=False)

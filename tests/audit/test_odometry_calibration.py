@@ -62,7 +62,7 @@ def test_standard_errors_are_honest() -> None:
     assert 0.4 < np.mean(sigmas**2) < 1.8
 
 
-LIMITS = [(0, 0.06), (1, 0.06), (2, 8.0), (3, 12.0), (5, 0.06), (6, 0.06), (7, 0.06)]
+LIMITS = [(0, 0.06), (1, 0.06), (2, 8.0), (3, 12.0), (5, 0.06), (6, 0.06), (7, 0.06), (19, 0.3), (20, 0.003)]
 
 
 @pytest.mark.parametrize("unknown, limit", LIMITS)

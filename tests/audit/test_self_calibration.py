@@ -10,8 +10,17 @@ import pytest
 
 from toolkit.audit import audit
 from toolkit.audit.fault import Evidence
-from toolkit.audit.parts.bundle import CHANGE, COMMON, Calibration, Window, predicted, stride_equations
-from toolkit.audit.parts.calibration_limits import hidden, wrong
+from toolkit.audit.parts.bundle import (
+    CHANGE,
+    COMMON,
+    RIGHT_ROLL,
+    RIGHT_SHIFT,
+    Calibration,
+    Window,
+    predicted,
+    stride_equations,
+)
+from toolkit.audit.parts.calibration_limits import doubtful, hidden, wrong
 from toolkit.audit.parts.self_calibration import OFF_BY, SelfCalibration, _windows, self_calibration
 from toolkit.audit.parts.strides import imu_strides
 from toolkit.geometry import Array, so3_exp, so3_log
@@ -72,7 +81,7 @@ def window_and_calibration(scenario: Scenario = FLIGHT) -> tuple[Window, Calibra
     """A window of noisy measurements, and a calibration that is off: no residual is zero."""
     sequence = recorded(scenario, 0)
     (window,) = _windows(sequence, Evidence(sequence).camera_motion, np.zeros(3))
-    step = np.concatenate([OFF[:12], [0.007, 0.01, -0.02, 0.03, 0.1, -0.2, 0.3]])
+    step = np.concatenate([OFF[:12], [0.007, 0.01, -0.02, 0.03, 0.1, -0.2, 0.3], np.zeros(2)])
     return window._replace(later=0.5), Calibration(sequence.rig, 0.0, np.zeros(6)).moved(step)
 
 
@@ -81,12 +90,12 @@ def difference(residual: Callable[[float], Array], step: float = 1e-6) -> Array:
     return (residual(step) - residual(-step)) / (2.0 * step)
 
 
-@pytest.mark.parametrize("unknown", range(13))
-def test_sightings_change_with_the_calibration_as_their_jacobian_says(unknown: int) -> None:
+@pytest.mark.parametrize("column, unknown", list(enumerate([*range(13), RIGHT_SHIFT, RIGHT_ROLL])))
+def test_sightings_change_with_the_calibration_as_their_jacobian_says(column: int, unknown: int) -> None:
     window, calibration = window_and_calibration()
     one = np.eye(COMMON)[unknown]
     measured = difference(lambda step: predicted(window, calibration.moved(step * one)).uv_px)
-    np.testing.assert_allclose(predicted(window, calibration).d_camera[:, :, unknown], measured, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(predicted(window, calibration).d_seen[:, :, 6 + column], measured, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("unknown", range(6))
@@ -100,7 +109,7 @@ def test_sightings_change_with_the_pose_and_the_point_as_their_jacobians_say(unk
         own[unknown : -window.strides.gravity_size : window.strides.state_size] = step
         return predicted(window.moved(own, none), calibration).uv_px
 
-    np.testing.assert_allclose(here.d_pose[:, :, unknown], difference(posed), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(here.d_seen[:, :, unknown], difference(posed), rtol=1e-5, atol=1e-4)
     if unknown < 3:
         along = difference(
             lambda step: predicted(window._replace(points=window.points + step * np.eye(3)[unknown]), calibration).uv_px
@@ -136,13 +145,62 @@ def test_what_strides_lack_changes_as_their_jacobian_says(unknown: int, scenario
 
 def test_the_calibration_of_exact_measurements_is_found() -> None:
     sound = recorded(noise_free(FLIGHT), 0)
-    rig = Calibration(sound.rig, 0.0, np.zeros(6)).moved(np.concatenate([OFF, np.zeros(6)])).rig
+    rig = Calibration(sound.rig, 0.0, np.zeros(6)).moved(np.concatenate([OFF, np.zeros(COMMON - OFF.size)])).rig
     found = fitted(replace(faults.camera_clock(sound, -OFF[11]), rig=rig))
     expected = -OFF.copy()
     expected[5:8] = so3_exp(OFF[5:8]) @ expected[5:8]  # about the axes of the camera that is turned
     expected[11] = OFF[11]
     # Within a third of what noise of a pixel leaves; late by milliseconds counts to first order alone.
     np.testing.assert_array_less(np.abs(found.value[:13] - expected), 0.34 * found.error[:13] + 1e-4)
+
+
+def test_what_the_right_image_is_off_by_is_found_in_exact_measurements() -> None:
+    exact = recorded(noise_free(FLIGHT), 0)
+    found = fitted(faults.rolled_right(faults.shifted_right(exact, 0.9), 0.01))
+    right = [RIGHT_SHIFT, RIGHT_ROLL]
+    # A tenth of what noise of a pixel leaves: 0.24 px and 0.0003 rad.
+    np.testing.assert_array_less(np.abs(found.value[right] - [0.9, 0.01]), [0.024, 3e-5])
+    assert (fitted(exact).value[right] == 0.0).all()  # held there
+
+
+SOUND_UNTIL = {RIGHT_SHIFT: 0.05, RIGHT_ROLL: 0.002}
+
+
+@pytest.mark.parametrize("unknown", SOUND_UNTIL)
+def test_the_right_image_counts_beyond_what_sound_recordings_have_and_is_doubted_before(unknown: int) -> None:
+    rig, limit = recorded(FLIGHT, 0).rig, SOUND_UNTIL[unknown]
+    (told,) = wrong(sure(unknown, 1.01 * limit), rig, "imu")
+    assert told.check == "the rectification of the pair"
+    assert wrong(sure(unknown, 0.98 * limit), rig, "imu") == []
+    assert "right" in (doubtful(sure(unknown, 0.98 * limit), rig, "imu") or "")
+
+
+def test_a_right_image_that_hardly_any_parallax_shows_is_not_decidable() -> None:
+    known = np.full(COMMON, 1e-6)
+    for unknown, error, said in ((RIGHT_SHIFT, 0.12, "shifted by 0.5 px"), (RIGHT_ROLL, 0.0021, "rolled by 0.010 rad")):
+        cov = np.diag(np.where(np.arange(COMMON) == unknown, error, known) ** 2)
+        assert said in (hidden(SelfCalibration(np.zeros(COMMON), cov, 1), "imu") or "")
+
+
+TOLD = [
+    (faults.rolled_right, 0.01, FLIGHT, 8.0, "rolled about its optical axis by +0.01"),
+    (faults.rolled_right, -0.01, DRIVE_IMU, 12.0, "rolled about its optical axis by -0.0"),
+    (faults.rolled_right, 0.01, DRIVE, 12.0, "rolled about its optical axis by +0.0"),
+    (faults.shifted_right, 0.6, DRIVE_IMU, 12.0, "the right image's columns are +0."),
+    (faults.shifted_right, -1.0, FLIGHT_REALISTIC, 8.0, "the right image's columns are -0.98"),
+    (faults.shifted_right, 1.0, DRIVE, 12.0, "the right image's columns are +"),
+]
+
+
+@pytest.mark.parametrize("plant, dose, scenario, duration_s, said", TOLD)
+def test_a_right_image_that_is_not_rectified_is_told(
+    plant: faults.Fault, dose: float, scenario: Scenario, duration_s: float, said: str
+) -> None:
+    for seed in (31, 32):
+        sound = recorded(scenario, seed, duration_s)
+        assert "miscalibration" not in {finding.fault for finding in audit(sound).findings}
+        found = {finding.fault: finding.detail for finding in audit(plant(sound, dose, seed)).findings}
+        assert said in found["miscalibration"]
 
 
 @pytest.mark.parametrize("scenario", [FLIGHT, FLIGHT_REALISTIC, DRIVE_IMU], ids=lambda scenario: scenario.name)

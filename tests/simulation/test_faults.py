@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from toolkit.errors import DataError
-from toolkit.geometry import se3_inverse
+from toolkit.geometry import se3_inverse, so3_exp
+from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.simulation import SCENARIOS, clock_faults, faults, simulate, standstill, track_faults
@@ -60,6 +61,22 @@ def test_faults_are_composed_by_calling_one_after_the_other(drive: Sequence) -> 
 def test_a_tenth_of_the_sightings_goes(drive: Sequence) -> None:
     kept = len(faults.dropped_sightings(drive, 0.1, 0).observations) / len(drive.observations)
     assert kept == pytest.approx(0.9, abs=0.02)  # 3.6 standard deviations of 3000 chances
+
+
+def test_a_rolled_right_camera_sees_what_one_turned_about_its_optical_axis_sees(drive: Sequence) -> None:
+    rig, uv_px = drive.rig, drive.observations.uv_px
+    rolled = faults.rolled_right(drive, 0.02, 0).observations.uv_px
+    points = triangulate(uv_px, rig) - [rig.baseline_m, 0.0, 0.0]
+    seen = points @ so3_exp(np.array([0.0, 0.0, 0.02]))
+    across, down = (seen[:, :2] / seen[:, 2:]).T
+    expected = np.stack([uv_px[:, 0], rig.cx_px + rig.fx_px * across, rig.cy_px + rig.fy_px * down], axis=1)
+    expected[:, 2] = 0.5 * (uv_px[:, 2] + expected[:, 2])
+    np.testing.assert_allclose(rolled, expected, atol=1e-9)
+
+
+def test_a_shifted_right_image_changes_its_columns_alone(drive: Sequence) -> None:
+    added = faults.shifted_right(drive, 0.5, 0).observations.uv_px - drive.observations.uv_px
+    np.testing.assert_allclose(added, np.tile([0.0, 0.5, 0.0], (len(added), 1)), atol=1e-12)
 
 
 def test_a_blackout_ends_every_track(drive: Sequence) -> None:

@@ -138,6 +138,24 @@ def misaligned_rows(sequence: Sequence, dose: float = 12.0, seed: int = 0) -> Se
     return _with_pixels(sequence, sequence.observations.uv_px + np.array([0.0, 0.0, 0.5 * dose]))
 
 
+def rolled_right(sequence: Sequence, dose: float = 0.01, seed: int = 0) -> Sequence:
+    """Roll the right camera by the dose (rad) about its optical axis: a mount that was bent after the calibration.
+
+    Columns and rows of the right image turn about the principal point; v, the mean of both rows, by half of it.
+    """
+    rig, uv_px = sequence.rig, sequence.observations.uv_px.copy()
+    across, down = (uv_px[:, 1] - rig.cx_px) / rig.fx_px, (uv_px[:, 2] - rig.cy_px) / rig.fy_px
+    row_px = rig.cy_px + rig.fy_px * (np.cos(dose) * down - np.sin(dose) * across)
+    uv_px[:, 1] = rig.cx_px + rig.fx_px * (np.cos(dose) * across + np.sin(dose) * down)
+    uv_px[:, 2] = np.where(np.isnan(row_px), uv_px[:, 2], 0.5 * (uv_px[:, 2] + row_px))
+    return _with_pixels(sequence, uv_px)
+
+
+def shifted_right(sequence: Sequence, dose: float = 0.5, seed: int = 0) -> Sequence:
+    """Add so many pixels to the columns of the right image: cameras that turned apart, two principal points."""
+    return _with_pixels(sequence, sequence.observations.uv_px + dose * np.array([0.0, 1.0, 0.0]))
+
+
 def stretched_disparity(sequence: Sequence, dose: float = 1.05, seed: int = 0) -> Sequence:
     """Multiply all disparities by the dose: images scaled after the matching, a matcher that is biased."""
     uv_px = sequence.observations.uv_px.copy()

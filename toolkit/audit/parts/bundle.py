@@ -1,7 +1,7 @@
 """One window of an adjustment of key frames and points beside measured motion, linearised, its calibration unknown.
 
 Unknowns are the poses of the key frames (6 each: turn on the right, position in the axes of the first), beside an IMU
-with their velocities (3) and the gravity of the window (3), and the calibration that all windows share (19). Points are
+with their velocities (3) and the gravity of the window (3), and the calibration that all windows share (21). Points are
 eliminated track by track, the window's own unknowns after that, so that it says what it knows of the calibration alone.
 Source: Triggs, McLauchlan, Hartley & Fitzgibbon, "Bundle adjustment - a modern synthesis" (2000), section 6; Forster et
 al. (2017), as in `strides`.
@@ -18,13 +18,17 @@ from toolkit.geometry import Array, IntArray, se3, skew, so3_exp
 from toolkit.models.stereo import project, projection_jacobian
 from toolkit.sequence import StereoRig
 
-POSE, COMMON = 6, 19
+POSE, COMMON = 6, 21
 # Of the common unknowns: logarithms of fx and fy, cx and cy (px), the logarithm of the baseline, the turn of the camera
 # in its own axes (rad), its position in the IMU (m), how much later than its stamps it saw (s), and by how much more so
 # in the second half of the recording than in the first (s); the biases of gyro and accelerometer, or beside odometry of
-# the gyro and the turn of the velocities (rad).
+# the gyro and the turn of the velocities (rad); by how much the columns of the right image are off (px), and the roll
+# of its camera about the optical axis (rad).
 FOCAL, CENTRE, BASELINE, TURN, LEVER, LATE, CHANGE = slice(0, 2), slice(2, 4), 4, slice(5, 8), slice(8, 11), 11, 12
-GYRO_BIAS, _CAMERA, _BIASES = slice(13, 16), 13, slice(13, 19)
+GYRO_BIAS, _BIASES, RIGHT_SHIFT, RIGHT_ROLL = slice(13, 16), slice(13, 19), 19, 20
+# Those on which sightings depend.
+_OF_CAMERA = np.r_[:13, RIGHT_SHIFT, RIGHT_ROLL]
+_CAMERA = len(_OF_CAMERA)
 CAUCHY_SIGMAS, CHI2_3_MEDIAN, LEAST_SCALE2 = 2.0, 2.366, 1e-4
 LEAST_DEPTH_M = 0.1
 # Information that holds the first pose, and ridges far below any sighting's.
@@ -34,16 +38,19 @@ _GAUGE, _RIDGE = 1e10, 1e-9
 class Calibration(NamedTuple):
     """What all windows share: the rig, how much later than its stamps the camera saw (s), the biases (6,).
 
-    ``change_s`` is by how much later in the second half of the recording than in the first.
+    ``change_s`` is by how much later in the second half of the recording than in the first; ``right_shift_px`` and
+    ``right_roll_rad`` are what the right image is off by, beside a rectified one.
     """
 
     rig: StereoRig
     late_s: float
     bias: Array
     change_s: float = 0.0
+    right_shift_px: float = 0.0
+    right_roll_rad: float = 0.0
 
     def moved(self, step: Array) -> "Calibration":
-        """Return the calibration after a step (19,) of the unknowns."""
+        """Return the calibration after a step (21,) of the unknowns."""
         rig, scale = self.rig, np.exp(step[[0, 1, BASELINE]])
         R_imu_cam = rig.T_imu_cam[:3, :3] @ so3_exp(step[TURN])
         after = replace(
@@ -56,7 +63,11 @@ class Calibration(NamedTuple):
             T_imu_cam=se3(R_imu_cam, rig.T_imu_cam[:3, 3] + step[LEVER]),
         )
         late_s, change_s = self.late_s + float(step[LATE]), self.change_s + float(step[CHANGE])
-        return Calibration(after, late_s, self.bias + step[_BIASES], change_s)
+        shift_px, roll_rad = (
+            self.right_shift_px + float(step[RIGHT_SHIFT]),
+            self.right_roll_rad + float(step[RIGHT_ROLL]),
+        )
+        return Calibration(after, late_s, self.bias + step[_BIASES], change_s, shift_px, roll_rad)
 
 
 class Window(NamedTuple):
@@ -101,7 +112,7 @@ class Window(NamedTuple):
 
 
 class Reduced(NamedTuple):
-    """What a window says of the calibration: information (19, 19), and gradients (B, 19) of parts that err alone.
+    """What a window says of the calibration: information (21, 21), and gradients (B, 21) of parts that err alone.
 
     The parts are the tracks, whose own errors may be correlated, and the strides of a second. ``back`` takes a step of
     the calibration to the window's own.
@@ -130,7 +141,7 @@ class _Back(NamedTuple):
 
 
 def moved(window: Window, reduced: Reduced, step: Array) -> Window:
-    """Return the window after a step (19,) of the calibration, and its own that belongs to it."""
+    """Return the window after a step (21,) of the calibration, and its own that belongs to it."""
     return window.moved(*reduced.back.steps(step))
 
 
@@ -158,7 +169,7 @@ def reduce(window: Window, calibration: Calibration) -> Reduced:
 def _seen(window: Window) -> IntArray:
     """Return the unknowns (E,) that sightings depend on: the poses and what is common but for the biases."""
     of_poses = window.strides.state_size * np.arange(len(window.position))[:, None] + np.arange(POSE)
-    return np.concatenate([of_poses.ravel(), window.unknowns + np.arange(_CAMERA)])
+    return np.concatenate([of_poses.ravel(), window.unknowns + _OF_CAMERA])
 
 
 class _Normal(NamedTuple):
@@ -169,7 +180,7 @@ class _Normal(NamedTuple):
 class _Tracks(NamedTuple):
     """Information (E, E) and gradients (T, E) of the tracks, and what of their points was eliminated.
 
-    Its columns are the poses, 6 each, and the 13 of the common unknowns that the camera's sightings depend on.
+    Its columns are the poses, 6 each, and the 15 of the common unknowns that the camera's sightings depend on.
     """
 
     information: Array
@@ -180,11 +191,10 @@ class _Tracks(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Predicted sightings (N, 3) px and their Jacobians by the pose (N, 3, 6), the camera (N, 3, 13), the point."""
+    """Predicted sightings (N, 3) px and their Jacobians by pose and camera (N, 3, 6 + 15), and by the point."""
 
     uv_px: Array
-    d_pose: Array
-    d_camera: Array
+    d_seen: Array
     d_point: Array
 
 
@@ -192,7 +202,8 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
     """Predict every sighting: the point in the IMU as it moves on for as long as the camera is late, and in the camera.
 
     A pose moved by [phi, rho] on its right moves a point q in its axes by [q]x phi - rho. That a camera which is late
-    sees another point for another pose or velocity is left out of the Jacobians: milliseconds do not count there.
+    sees another point for another pose or velocity is left out of the Jacobians, and that a rolled image moves
+    otherwise: milliseconds and hundredths of a radian do not count there.
     """
     rig, key, track = calibration.rig, window.key, window.track
     R_imu_first, R_cam_imu = window.R_first_imu[key].swapaxes(1, 2), rig.T_imu_cam[:3, :3].T
@@ -206,14 +217,23 @@ def predicted(window: Window, calibration: Calibration) -> Predicted:
     uv_px, d_cam = project(q_cam, rig), projection_jacobian(q_cam, rig)
     d_imu = d_cam @ R_cam_imu
     d_point = d_imu @ R_imu_first
-    d_intrinsics = np.zeros((len(key), 3, 5))
-    d_intrinsics[:, :2, 0], d_intrinsics[:, 2, 1] = uv_px[:, :2] - rig.cx_px, uv_px[:, 2] - rig.cy_px
-    d_intrinsics[:, :2, 2] = d_intrinsics[:, 2, 3] = 1.0
-    d_intrinsics[:, 1, 4] = -rig.fx_px * rig.baseline_m / q_cam[:, 2]
-    d_pose = np.concatenate([d_imu @ turn_of_q, -d_point], axis=2)
-    clock = later[:, :, None] * np.array([1.0, window.later])
-    d_camera = np.concatenate([d_intrinsics, d_cam @ skew(q_cam), -d_imu, d_imu @ clock], axis=2)
-    return Predicted(uv_px, d_pose, d_camera, d_point)
+    d = np.zeros((len(key), 3, POSE + _CAMERA))
+    d_pose, d_camera = d[:, :, :POSE], d[:, :, POSE:]
+    np.matmul(d_imu, turn_of_q, out=d_pose[:, :, :3])
+    d_pose[:, :, 3:] = -d_point
+    d_camera[:, :2, 0], d_camera[:, 2, 1] = uv_px[:, :2] - rig.cx_px, uv_px[:, 2] - rig.cy_px
+    d_camera[:, :2, 2] = d_camera[:, 2, 3] = 1.0
+    d_camera[:, 1, BASELINE] = -rig.fx_px * rig.baseline_m / q_cam[:, 2]
+    np.matmul(d_cam, skew(q_cam), out=d_camera[:, :, TURN])
+    d_camera[:, :, LEVER] = -d_imu
+    d_camera[:, :, LATE] = _applied(d_imu, later)
+    d_camera[:, :, CHANGE] = window.later * d_camera[:, :, LATE]
+    # Of the right image; v is the mean of both images' rows, and pixels need not be square.
+    d_right, aspect = d_camera[:, :, CHANGE + 1 :], rig.fx_px / rig.fy_px
+    d_right[:, 1, 0], d_right[:, 1, 1] = 1.0, aspect * (uv_px[:, 2] - rig.cy_px)
+    d_right[:, 2, 1] = -0.5 / aspect * (uv_px[:, 1] - rig.cx_px)
+    uv_px = uv_px + d_right @ np.array([calibration.right_shift_px, calibration.right_roll_rad])
+    return Predicted(uv_px, d, d_point)
 
 
 def _weighted(residual_px: Array, rig: StereoRig) -> Array:
@@ -230,7 +250,7 @@ def _tracks(window: Window, calibration: Calibration) -> _Tracks:
     residual, d_point = _applied(weight, window.uv_px - seen.uv_px), weight @ seen.d_point
     n, points = len(window.position), len(window.points)
     first, poses = np.searchsorted(track, np.arange(points)), POSE * n
-    d_both = weight @ np.concatenate([seen.d_pose, seen.d_camera], axis=2)
+    d_both = weight @ seen.d_seen
     information, gradients = np.zeros((poses + _CAMERA, poses + _CAMERA)), np.zeros((points, poses + _CAMERA))
     by_key = np.argsort(key, kind="stable")
     in_order = d_both[by_key].reshape(-1, POSE + _CAMERA)

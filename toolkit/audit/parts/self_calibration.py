@@ -10,7 +10,16 @@ import numpy as np
 from scipy.special import chdtri
 
 from toolkit.audit.parts.alignment import chained
-from toolkit.audit.parts.bundle import COMMON, GYRO_BIAS, Calibration, Reduced, Window, moved, reduce
+from toolkit.audit.parts.bundle import (
+    COMMON,
+    GYRO_BIAS,
+    RIGHT_SHIFT,
+    Calibration,
+    Reduced,
+    Window,
+    moved,
+    reduce,
+)
 from toolkit.audit.parts.intervals import Intervals, interval_means, moved_as_measured, moved_by
 from toolkit.audit.parts.robust import LEVEL
 from toolkit.audit.parts.strides import ImuStrides, TwistStrides, imu_strides, twist_strides
@@ -44,9 +53,14 @@ MOST: dict[MotionKind, Effort] = {"imu": Effort(6, 200, 10), "twist": Effort(4, 
 SETTLED = 0.4
 # A step of more than so many standard deviations of what a calibration is off by leads nowhere.
 STRAYED = 10.0
-# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2. What is beyond
-# them is no solution.
-OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3], [2, 2, 1, 3, 3, 1, 1, 3, 3])
+# Standard deviations of what a calibration is off by: shares, px, a share, rad, m, s, s, rad/s, m/s^2, px, rad. What is
+# beyond them is no solution.
+OFF_BY = np.repeat([0.2, 70.0, 0.2, 0.3, 0.3, 0.03, 0.1, 0.1, 0.3, 5.0, 0.1], [2, 2, 1, 3, 3, 1, 1, 3, 3, 1, 1])
+# The first of the unknowns are those of a rectified pair; what the right image is off by is held at nothing, and
+# estimated only where one step from the settled calibration has it beyond so many standard errors: few recordings need
+# it, and all others would know their focal length and baseline less well.
+_RECTIFIED, RIGHT = RIGHT_SHIFT, slice(RIGHT_SHIFT, COMMON)
+RIGHT_SIGMAS: dict[MotionKind, float] = {"imu": 4.0, "twist": 6.0}
 # Beside odometry: the place is that of the camera and of the point whose velocities are given (m), a twist may stand
 # for the interval before its stamp or after it (s), and for the bias of an accelerometer there is a turn of the
 # velocities (rad), as of cars that slip and pitch. A place that nothing tells, and a turn up to the last number, are no
@@ -55,7 +69,8 @@ POINT_M, PAIRING_S, SLIP_RAD, MOST_POINT_M, MOST_SLIP_RAD = 2.0, 0.06, 0.02, 10.
 
 
 def _beside_odometry(point_m: float, slip_rad: float) -> Array:
-    return np.concatenate([OFF_BY[:8], np.full(3, point_m), [PAIRING_S], OFF_BY[12:16], np.full(3, slip_rad)])
+    slip = np.full(3, slip_rad)
+    return np.concatenate([OFF_BY[:8], np.full(3, point_m), [PAIRING_S], OFF_BY[12:16], slip, OFF_BY[RIGHT_SHIFT:]])
 
 
 PRIOR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(POINT_M, SLIP_RAD)}
@@ -63,9 +78,10 @@ NEAR: dict[MotionKind, Array] = {"imu": OFF_BY, "twist": _beside_odometry(MOST_P
 
 
 class SelfCalibration(NamedTuple):
-    """What has to be added to the calibration's unknowns, or what its biases are (19,), and the covariance.
+    """What has to be added to the calibration's unknowns, or what its biases are (21,), and the covariance.
 
-    `bundle` has their order. They rest on so many ``windows``; one says nothing of a change of the clock.
+    `bundle` has their order. They rest on so many ``windows``; one says nothing of a change of the clock. Of a pair
+    that looks rectified the right image's are zero, with the covariance that they have beside the others.
     """
 
     value: Array
@@ -74,7 +90,7 @@ class SelfCalibration(NamedTuple):
 
     @property
     def error(self) -> Array:
-        """The standard errors (19,)."""
+        """The standard errors (21,)."""
         return np.sqrt(np.diag(self.cov))
 
 
@@ -91,54 +107,99 @@ def self_calibration(
         return None
     kind = sequence.motion_kind
     try:
-        value, settled, all_reduced = _adjusted(windows, Calibration(sequence.rig, 0.0, np.zeros(6)), kind)
-        cov = _cov(all_reduced, PRIOR[kind])
+        given = Calibration(sequence.rig, 0.0, np.zeros(6))
+        found, cov = _fitted(_At(windows, given, np.zeros(COMMON)), kind)
     except (np.linalg.LinAlgError, DataError):  # steps that lead nowhere: singular, or a rig that is none
         return None
-    if not settled or (np.abs(value) > NEAR[kind]).any():
+    value = found.value
+    if not found.settled or (np.abs(value) > NEAR[kind]).any():
         return None
     value[GYRO_BIAS] += w_bias
     return SelfCalibration(value, cov, len(windows))
 
 
-def _adjusted(windows: list[Window], calibration: Calibration, kind: MotionKind) -> tuple[Array, bool, list[Reduced]]:
-    """Return the calibration's change (19,) by Gauss-Newton, whether it settled, and what it rests on."""
-    value, prior = np.zeros(COMMON), PRIOR[kind]
+class _At(NamedTuple):
+    """Where an adjustment is linearised: the windows, the calibration, and what that was moved by (21,)."""
+
+    windows: list[Window]
+    calibration: Calibration
+    moved_by: Array
+
+
+class _Adjusted(NamedTuple):
+    """Where an adjustment ends: whether it settled, where it was linearised last, its last step (21,), the windows."""
+
+    settled: bool
+    at: _At
+    step: Array
+    all_reduced: list[Reduced]
+
+    @property
+    def value(self) -> Array:
+        """What the calibration is off by (21,)."""
+        return self.at.moved_by + self.step
+
+
+def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
+    """Return the adjustment and its covariance (21, 21).
+
+    It is that of a rectified pair, unless a step of all unknowns from where that settled wants the right image's.
+    """
+    rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
+    cov = _cov(rectified.all_reduced, prior)
+    right = _step(rectified.all_reduced, rectified.at.moved_by, prior)[RIGHT]
+    if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(cov)[RIGHT])).any():
+        found = _adjusted(rectified.at, kind, COMMON)
+        return found, _cov(found.all_reduced, prior)
+    cov[:_RECTIFIED], cov[:, :_RECTIFIED] = 0.0, 0.0
+    cov[:_RECTIFIED, :_RECTIFIED] = _cov(rectified.all_reduced, prior, _RECTIFIED)
+    return rectified, cov
+
+
+def _adjusted(at: _At, kind: MotionKind, free: int) -> _Adjusted:
+    """Adjust the first unknowns, so many, by Gauss-Newton."""
+    prior = PRIOR[kind]
     for _ in range(MOST[kind].iterations):
-        all_reduced = [reduce(window, calibration) for window in windows]
-        step = _step(all_reduced, value, prior)
-        value = value + step
-        if not (np.abs(step) < STRAYED * prior).all():
-            return value, False, all_reduced
-        if (np.abs(step) < SETTLED * np.sqrt(np.diag(np.linalg.inv(_information(all_reduced, prior))))).all():
-            return value, True, all_reduced
-        windows = [moved(window, reduced, step) for window, reduced in zip(windows, all_reduced, strict=True)]
-        calibration = calibration.moved(step)
-    return value, False, all_reduced
+        all_reduced = [reduce(window, at.calibration) for window in at.windows]
+        found = _Adjusted(False, at, _step(all_reduced, at.moved_by, prior, free), all_reduced)
+        if not (np.abs(found.step) < STRAYED * prior).all():
+            return found
+        error = np.sqrt(np.diag(np.linalg.inv(_information(all_reduced, prior)[:free, :free])))
+        if (np.abs(found.step[:free]) < SETTLED * error).all():
+            return found._replace(settled=True)
+        windows = [moved(window, reduced, found.step) for window, reduced in zip(at.windows, all_reduced, strict=True)]
+        at = _At(windows, at.calibration.moved(found.step), found.value)
+    return found
 
 
-def _step(all_reduced: list[Reduced], value: Array, prior: Array) -> Array:
-    """Return the step (19,) of the calibration that all windows want together, and the prior about zero."""
+def _step(all_reduced: list[Reduced], value: Array, prior: Array, free: int = COMMON) -> Array:
+    """Return the step (21,) of the calibration that all windows want together, and the prior about zero.
+
+    Only the first unknowns, so many, are free.
+    """
     gradient = sum(reduced.gradients.sum(axis=0) for reduced in all_reduced) - value / prior**2
-    return np.asarray(np.linalg.solve(_information(all_reduced, prior), gradient))
+    step = np.zeros(COMMON)
+    step[:free] = np.linalg.solve(_information(all_reduced, prior)[:free, :free], gradient[:free])
+    return step
 
 
 def _information(all_reduced: list[Reduced], prior: Array) -> Array:
     return np.asarray(np.diag(prior**-2.0) + sum(reduced.information for reduced in all_reduced))
 
 
-def _cov(all_reduced: list[Reduced], prior: Array) -> Array:
-    """Return the covariance (19, 19), robust to errors that stay the same along a track, for a second or in a window.
+def _cov(all_reduced: list[Reduced], prior: Array, free: int = COMMON) -> Array:
+    """Return the covariance of the first unknowns, so many, robust to errors that last.
 
-    Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models" (1986), the sandwich. It is no
-    less than that of errors that are all independent, for few parts can look too calm; and windows, of which there are
-    two to six, count only where they scatter more than is chance.
+    Errors may stay the same along a track, for a second or in a window. It is no less than that of errors that are all
+    independent, for few parts can look too calm; and windows, of which there are two to six, count only where they
+    scatter more than is chance. Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models"
+    (1986), the sandwich.
     """
-    inverse = np.linalg.inv(_information(all_reduced, prior))
-    gradients = np.concatenate([reduced.gradients for reduced in all_reduced])
-    cov = inverse @ (gradients.T @ gradients + np.diag(prior**-2.0)) @ inverse
+    inverse = np.linalg.inv(_information(all_reduced, prior)[:free, :free])
+    gradients = np.concatenate([reduced.gradients[:, :free] for reduced in all_reduced])
+    cov = inverse @ (gradients.T @ gradients + np.diag(prior[:free] ** -2.0)) @ inverse
     cov = cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))
-    by_window = np.array([reduced.gradients.sum(axis=0) for reduced in all_reduced]) @ inverse
+    by_window = np.array([reduced.gradients[:, :free].sum(axis=0) for reduced in all_reduced]) @ inverse
     dof = len(all_reduced) - 1
     if dof == 0:
         return np.asarray(cov)

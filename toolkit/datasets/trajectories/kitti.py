@@ -6,10 +6,10 @@ own poses are the left camera's; here, as in every file of this package, they ar
 
 import numpy as np
 
-from toolkit.datasets.trajectories.poses import FARTHEST_M, TOO_FAR, UNIT_TOLERANCE, PosesFile, rows_text
+from toolkit.datasets.trajectories.poses import TOO_FAR, UNIT_TOLERANCE, PosesFile, rows_text
 from toolkit.datasets.trajectories.rows import Rows
 from toolkit.errors import DataError
-from toolkit.estimate import Trajectory
+from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import quaternion_from_rotation, rotation_from_quaternion, se3
 
 COLUMNS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"

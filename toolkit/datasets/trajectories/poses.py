@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from toolkit.errors import DataError
-from toolkit.estimate import Trajectory
+from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import Array, IntArray, quaternion_from_rotation, rotation_from_quaternion, se3
 
 # Quaternions printed with four decimals are off by 1e-4; anything beyond 1e-2 is not a rounded rotation.
 UNIT_TOLERANCE = 1e-2
-# Farther than the Moon. Squares of 1e200 m overflow, and a metric would have no value without saying why.
-FARTHEST_M = 1e9
 TOO_FAR = f"has a position beyond {FARTHEST_M:g} m; check its unit, or remove the line"
 # A file whose first four-vector is this close to (1, 0, 0, 0) starts at the identity if it is w first.
 _IDENTITY_TOLERANCE = 1e-2
