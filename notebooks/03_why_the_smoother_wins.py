@@ -284,11 +284,11 @@ print("told as they are over told white, seed by seed:", ", ".join(f"{one:.2f}" 
 #
 # ## What it costs
 #
-# Time per frame on the drive, told white noise, the finish included, to one digit: it depends on the machine.
+# Processor time per frame on the drive, told white noise, the finish included, to one digit: it depends on the machine.
 
 # %%
 for run in white.runs.values():
-    ms = 1000 * run.timings.total_s / white.comparison.sequence.frame_count
+    ms = 1000 * run.timings.cpu_s / white.comparison.sequence.frame_count
     print(f"{run.estimator:{width}}  {float(f'{ms:.0e}'):g} ms")
 
 # %% [markdown]

@@ -19,6 +19,12 @@ class VislamError(Exception):
     exit_status: ClassVar[int] = 1
 
 
+class UnknownNameError(VislamError):
+    """A name that nothing has, as of a metric."""
+
+    exit_status = 2
+
+
 class DataError(VislamError):
     """A recording or truth file that cannot be used as it is."""
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from toolkit.audit import audit, faults
-from toolkit.errors import VislamError
+from toolkit.errors import UnknownNameError
 from toolkit.sequence import Sequence, check_runnable
 
 
@@ -45,7 +45,7 @@ def test_a_kept_fault_is_found_blocks_and_is_left_alone(plant: Any) -> None:
 
 
 def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[..., Sequence]) -> None:
-    with pytest.raises(VislamError, match="no fault is called rust; there are clock-jump"):
+    with pytest.raises(UnknownNameError, match="no fault is called rust; there are clock-jump"):
         audit(clean_recording(), keep=frozenset({"rust"}))
 
 

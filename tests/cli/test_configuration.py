@@ -196,6 +196,13 @@ def test_an_unknown_column_is_answered_with_the_nearest_before_anything_runs(
     assert not Path("run").exists()
 
 
+def test_an_unknown_fault_in_a_file_of_settings_is_a_wrong_command_line(vislam: Vislam, one_line: OneLine) -> None:
+    Path("run.toml").write_text('[compare]\nkeep = ["stale"]\n')
+    assert vislam("compare", "drive", "--config", "run.toml", "--out", "run", *QUICK) == 2
+    assert "no fault is called stale (did you mean stale-frames?)" in one_line()
+    assert not Path("run").exists()
+
+
 @pytest.mark.parametrize("width", ["40", "400"])
 def test_piped_output_is_never_wrapped_or_cut(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: str

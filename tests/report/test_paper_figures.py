@@ -15,7 +15,7 @@ from toolkit.geometry import about_z, interpolate_poses, se3
 from toolkit.metrics import Evaluation, in_sample
 from toolkit.report import figures
 from toolkit.report.curves import Components
-from toolkit.report.figures import FigureChoice, consistency, drawn, error_map, errors_over_time, top_view
+from toolkit.report.figures import FigureChoice, consistency, drawn, error_map, errors_over_time, panels, top_view
 from toolkit.report.figures.style import NamedFigure
 from toolkit.report.figures.top_view import NOWHERE, PathFromAbove, View, view_of, where_tracks_coincide
 from toolkit.sequence import Sequence
@@ -102,6 +102,15 @@ def test_the_share_in_the_band_is_the_metrics(offset: Comparison) -> None:
     share = row.value("nees_pose_in_band_percent")
     assert share is not None
     assert one.figure.axes[0].get_title(loc="right") == f"{share:.0f} % in band"
+
+
+def test_a_panel_whose_values_leave_the_figure_says_how_large_they_become() -> None:
+    t_s, ones = np.arange(4.0), np.ones(4)
+    inside = panels.Normalised(t_s, np.array([1.0, 9e3, 1.0, np.nan]), 0.5 * ones, 2.0 * ones)
+    beyond = inside._replace(value=np.array([1.0, 1.0, 7.2e5, np.nan]))
+    drawn = [panels.Drawn(name, "final", series) for name, series in (("in", inside), ("out", beyond))]
+    figure = panels.figure_with_bands(["in", "out"], drawn, "NEES", "a drive")
+    assert [axes.get_title(loc="right") for axes in figure.axes] == ["67 % in band", "67 % in band, up to 7e+05"]
 
 
 def test_without_truth_there_is_no_nees_and_without_innovations_no_nis(without_truth: Comparison) -> None:

@@ -16,7 +16,7 @@ from graphlib import TopologicalSorter
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Finding, Symptom, Undecided
-from toolkit.errors import VislamError, no_such
+from toolkit.errors import UnknownNameError, no_such
 from toolkit.sequence import Sequence
 
 # Share of the sightings that a repair may drop; frames cut off with theirs do not count, for what stays is whole.
@@ -40,11 +40,11 @@ class Audit:
 def audit(sequence: Sequence, keep: frozenset[str] = frozenset()) -> Audit:
     """Check every fault in turn and repair it, unless its name is in ``keep``; each sees the repairs before it.
 
-    Raises VislamError where ``keep`` names a fault that does not exist.
+    Raises UnknownNameError where ``keep`` names a fault that does not exist.
     """
     unknown = keep - faults().keys()
     if unknown:
-        raise VislamError(no_such("fault", min(unknown), faults()))
+        raise UnknownNameError(no_such("fault", min(unknown), faults()))
     evidence, findings, undecided = Evidence(sequence), [], {}
     for fault in _ordered():
         symptom = fault.check(evidence)

@@ -4,14 +4,13 @@ import argparse
 import math
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
-from toolkit.errors import ExtensionError, VislamError, did_you_mean, no_such, one_line
+from toolkit.errors import VislamError, did_you_mean, no_such, one_line
 from toolkit.threads import MOST_WORKERS
 
 if TYPE_CHECKING:
@@ -49,23 +48,6 @@ class UsageError(VislamError):
     """A command line that asks for something that does not exist."""
 
     exit_status: ClassVar[int] = 2
-
-
-@contextmanager
-def names_checked() -> Iterator[None]:
-    """Have a name that nobody knows end as a wrong command line; a defect of what was looked through stays one."""
-    try:
-        yield
-    except ExtensionError:
-        raise
-    except VislamError as error:
-        raise UsageError(str(error)) from error
-
-
-class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
-    """An interrupt after which something is kept that the same command continues from."""
-
-    exit_status: ClassVar[int] = 130
 
 
 class Parser(argparse.ArgumentParser):

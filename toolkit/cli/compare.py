@@ -8,10 +8,9 @@ import sys
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from toolkit.cli.arguments import (
-    Interrupted,
     UsageError,
     add_estimators_argument,
     add_option,
@@ -26,11 +25,10 @@ from toolkit.cli.arguments import (
     kept_faults,
     named_file,
     names,
-    names_checked,
     requested_assignments,
     with_tracks,
 )
-from toolkit.errors import printable
+from toolkit.errors import VislamError, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -38,11 +36,16 @@ if TYPE_CHECKING:
     from toolkit.experiment import Comparison, Plan
     from toolkit.experiment.configuration import Configuration
     from toolkit.experiment.outcome_store import OutcomeStore
-    from toolkit.report.comparison_table import Columns
     from toolkit.report.run_directory import MadeBy
 
 # The one with truth first: its table is the first impression.
 SEQUENCES = ("drive", "kitti00")
+
+
+class Interrupted(VislamError):  # noqa: N818 - the user's wish, no error
+    """An interrupt after which something is kept that the same command continues from."""
+
+    exit_status: ClassVar[int] = 130
 
 
 def _add_what_to_compare(parser: argparse.ArgumentParser) -> None:
@@ -141,12 +144,13 @@ def compare(options: argparse.Namespace) -> int:
     from toolkit.experiment import comparisons, prepared_cases, stores_of, workers_of
     from toolkit.files.documents import to_line
     from toolkit.progress import of_this_process, print_above
+    from toolkit.report.comparison_table import requested_columns
     from toolkit.report.comparison_text import comparison_text
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_directory import directories_for, write_run
     from toolkit.report.scores_json import scores_document
 
-    columns = _columns(options.columns)
+    columns = requested_columns(options.columns)
     requested = _configuration(options)
     plan, progress_for = _placed(_plan(requested), options), of_this_process()
     made_by, all_ok = _made_by(options, requested), True
@@ -206,14 +210,6 @@ def _found(comparison: Comparison, store: OutcomeStore | None) -> str:
     if store is None or not store.found:
         return ""
     return f" ({store.found} of {len(comparison.outcomes)} runs were there)"
-
-
-def _columns(names: tuple[str, ...]) -> Columns:
-    """Return the columns asked for; a name that is no metric's is a UsageError."""
-    from toolkit.report.comparison_table import requested_columns
-
-    with names_checked():
-        return requested_columns(names)
 
 
 def _configuration(options: argparse.Namespace) -> Configuration:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names, names_checked
+from toolkit.cli.arguments import UsageError, add_output_arguments, add_workers_argument, command, names
 from toolkit.errors import printable
 
 if TYPE_CHECKING:
@@ -128,8 +128,7 @@ def diff(options: argparse.Namespace) -> int:
     from toolkit.report.prose import width_of_output
     from toolkit.report.run_files import read_run
 
-    with names_checked():
-        columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
+    columns = known_metrics() if options.columns == ("all",) else metrics_called(options.columns)
     found = differences(read_run(options.before), read_run(options.after))
     if options.json:
         print(to_text(diff_document(found)), end="")

@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol, cast
 import numpy as np
 
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
-from toolkit.errors import ExtensionError, VislamError, did_you_mean
+from toolkit.errors import ExtensionError, UnknownNameError, did_you_mean
 from toolkit.estimate import Output, Run
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
@@ -129,7 +129,7 @@ def contract_keys() -> tuple[str, ...]:
 def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
     """Return the metrics of the given keys, names or groups ("ate_se3_m", "ATE SE(3)", "bound"), in the given order.
 
-    Raises VislamError for a name that no metric has, with the nearest one.
+    Raises UnknownNameError for a name that no metric has, with the nearest one.
     """
     files = _found().files
     known = [metric for file in files for metric in file.METRICS]
@@ -140,7 +140,7 @@ def metrics_called(names: Iterable[str]) -> tuple[Metric, ...]:
         if name not in by_name:
             close = did_you_mean(name, by_name)
             lacking = "".join(f"; {file} is unavailable: {why}" for file, why in unavailable().items())
-            raise VislamError(f"no metric is called {name}{close}; 'vislam list' names them all, by key{lacking}")
+            raise UnknownNameError(f"no metric is called {name}{close}; 'vislam list' names them all, by key{lacking}")
     return tuple(metric for name in chosen for metric in by_name[name])
 
 
@@ -163,7 +163,7 @@ def score_run(
     ``requested`` names the switches of metrics that are computed on request alone; with ``only``, the keys, names or
     groups of some metrics, no other file's are computed, and the scores have the keys of these files alone. A metric
     that cannot be computed, or is not finite, is None and has its reason in the notes. Raises ValueError where the run
-    has no output of that kind, VislamError where ``only`` names a metric that does not exist, ExtensionError
+    has no output of that kind, UnknownNameError where ``only`` names a metric that does not exist, ExtensionError
     where a file scores others than it declares; an error inside a metric is a defect and passes through.
     """
     evaluation = Evaluation(run, output, sequence)

@@ -38,7 +38,7 @@ class _Column(NamedTuple):
 def requested_columns(names: tuple[str, ...]) -> Columns:
     """Return the columns that some names ask for: the usual ones where there are none, all for the one word "all".
 
-    Raises VislamError for a name that is no metric's.
+    Raises UnknownNameError for a name that is no metric's.
     """
     if names == ("all",):
         return "all"

@@ -74,6 +74,27 @@ def test_images_of_the_recording_are_coloured_by_the_estimator_asked_for(
     assert "9.00 px off in the median" in page.find(canvas).get_attribute("aria-label")
 
 
+CUT = """
+window.cut = [];
+const draw = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+  const [wide, turn] = [this.measureText(text).width, this.getTransform()];
+  const left = x - { left: 0, start: 0, center: wide / 2, right: wide, end: wide }[this.textAlign];
+  if (turn.b === 0 && (left < -0.5 || left + wide > this.canvas.width / turn.a + 0.5)) window.cut.push(text);
+  draw.call(this, text, x, y);
+};
+"""
+
+
+def test_no_number_at_the_edge_of_a_view_is_cut(page: Page, single: Path) -> None:
+    """Without its sign -200 reads as 200."""
+    page.open(single, PHONE)
+    page.run(CUT)
+    for _ in range(8):
+        page.press("canvas[data-view='top']", Keys.ARROW_LEFT)
+    assert page.run("return window.cut") == []
+
+
 @pytest.mark.parametrize("view", ["top", "orbit"])
 def test_views_answer_to_the_pointer_and_the_buttons(page: Page, single: Path, view: str) -> None:
     page.open(single)

@@ -28,7 +28,7 @@ from toolkit.report.figures.style import (
 
 # Okabe & Ito (2008). In panels of one estimator the colour tells the output.
 COLOUR_OF: dict[Output, str] = {"causal": "#D55E00", "final": "#0072B2"}
-# What a NEES or NIS over its expectation is beyond these is drawn there.
+# What a NEES or NIS over its expectation is beyond these is drawn there, and the panel says how far it goes.
 RANGE = (1e-2, 1e4)
 # From so many panels on there are four in a row, before that three; two or four make a square.
 _MANY = 10
@@ -115,19 +115,25 @@ class Drawn(NamedTuple):
 
 
 def figure_with_bands(panels_for: Sequence[str], drawn: Sequence[Drawn], what: str, title: str) -> Figure:
-    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it."""
+    """Draw each estimator's normalised errors over their band, in a panel of its own that says how many are in it.
+
+    A panel whose values leave the figure says how large they become.
+    """
     figure, panels = panels_of(panels_for)
     shares: dict[str, list[float]] = {}
+    largest: dict[str, float] = {}
     least = most = 1.0
     for estimator, output, series in drawn:
         axes, shown = panels[estimator], np.clip(series.value, *RANGE)
         axes.fill_between(series.t_s, series.low, series.high, color=BAND_COLOUR, linewidth=0.0, zorder=1)
         axes.plot(series.t_s, shown, color=COLOUR_OF[output], linestyle=line_of(output), linewidth=1.0)
         shares.setdefault(estimator, []).append(series.in_band_percent)
+        largest[estimator] = np.nanmax([largest.get(estimator, 0.0), *series.value])
         least, most = np.nanmin([least, *shown, *series.low]), np.nanmax([most, *shown, *series.high])
     for estimator, percents in shares.items():
         text = ", ".join(f"{percent:.0f} %" for percent in percents)
-        annotate(panels, estimator, (f"{text} in band", text))
+        beyond = f", up to {largest[estimator]:.0e}" if largest[estimator] > RANGE[1] else ""
+        annotate(panels, estimator, (f"{text} in band{beyond}", f"{text}{beyond}", text))
     scale_by_decades(next(iter(panels.values())), max(0.7 * least, RANGE[0]), min(1.5 * most, RANGE[1]))
     finish(figure, panels, what, title, [*output_entries({one.output for one in drawn}), band_entry()])
     return figure

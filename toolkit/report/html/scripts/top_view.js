@@ -38,7 +38,10 @@ function topView(scene) {
     context.textAlign = "center";
     for (let x = first(origin[0], step * k); x < width; x += step * k) {
       strokeLine(context, 2, (i) => [x, i * height]);
-      context.fillText(shortText(Math.round((x - origin[0]) / k / step) * step), x, height - 6);
+      const text = shortText(Math.round((x - origin[0]) / k / step) * step);
+      // One that the edge would cut could lose its sign.
+      const reach = context.measureText(text).width / 2;
+      if (x >= reach && x <= width - reach) context.fillText(text, x, height - 6);
     }
     context.textAlign = "left";
     for (let y = first(origin[1], step * k); y < height - 20; y += step * k) {
