@@ -44,11 +44,29 @@ def test_frames_that_are_lost_or_stamped_rightly_are_not_accused(scenario: str, 
         assert uneven_stamps.check(Evidence(sequence)) is None
 
 
+@pytest.mark.parametrize("frames", [100, 101])
+@pytest.mark.parametrize("scenario", SCENARIOS_OF)
+def test_every_other_frame_late_is_told_whichever_steps_are_more_and_where_frames_are_lost(
+    scenario: str, frames: int
+) -> None:
+    """Of long and short steps that alternate the median is either; and a lost frame is no unevenness."""
+    late = faults.alternate_frames_late(simulated(scenario), 0.015).truncated(frames)
+    for sequence in (late, with_frames_lost(late)):
+        found = uneven_stamps.check(Evidence(sequence))
+        assert isinstance(found, Symptom)
+        told = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+        assert told is not None
+        assert -0.25 < float(told[1]) < 0.1
+
+
 def test_the_motion_follows_all_of_the_steps_where_stamps_are_right() -> None:
-    sound = with_frames_lost(simulated("flight"))
+    """Images two and three steps after one another, by turns."""
+    sound = simulated("flight")
+    sound = keep_frames(sound, np.flatnonzero(np.isin(np.arange(sound.frame_count) % 5, (0, 2))))
+    assert uneven_stamps.check(Evidence(sound)) is None
     camera, step_s = Evidence(sound).camera_motion, np.diff(sound.frames_t_ns) / 1e9
     rates = np.hstack([camera.v_mps, camera.w_radps])
-    followed = uneven_stamps._followed(rates, step_s, camera.known)
+    followed = uneven_stamps._followed(rates, step_s, uneven_stamps._even_steps_s(step_s), camera.known)
     assert followed is not None
     assert followed.value == pytest.approx(1.0, abs=4.0 * followed.error + 0.02)
 
@@ -59,5 +77,5 @@ def test_a_vehicle_that_stands_tells_nothing() -> None:
     still = np.linalg.norm(camera.v_mps, axis=1) < 0.05
     step_s = np.diff(standing.frames_t_ns) / 1e9
     rates = np.hstack([camera.v_mps, camera.w_radps])
-    followed = uneven_stamps._followed(rates, step_s, camera.known & still)
+    followed = uneven_stamps._followed(rates, step_s, uneven_stamps._even_steps_s(step_s), camera.known & still)
     assert followed is None or followed.value + 5.0 * followed.error > 0.5

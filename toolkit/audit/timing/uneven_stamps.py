@@ -20,6 +20,9 @@ LEAST_SHARE = 0.03
 # The share of the steps' unevenness that the motion follows is 1 where stamps are right. It counts below a half by so
 # many standard errors, of a jackknife.
 SIGMAS, MOST_FOLLOWED = 5.0, 0.5
+# Two steps together are as long as ever where every other frame is late. Of those of a recording that has lost frames,
+# at most half of them, the shortest quarter has none missing.
+UNHURT = 0.25
 # The intervals beside one that show how the camera moves there.
 BESIDE = (-2, -1, 1, 2)
 
@@ -30,10 +33,11 @@ def check(evidence: Evidence) -> Symptom | None:
     if evidence.spoilt_by or not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
         return None
     step_s = np.diff(sequence.frames_t_ns) / NS_PER_S
-    off_s = step_s - float(np.median(step_s))
-    if float(np.sqrt(np.mean(off_s[camera.known] ** 2))) < LEAST_SHARE * float(np.median(step_s)):
+    even_s = _even_steps_s(step_s)
+    off_s = step_s - even_s
+    if float(np.sqrt(np.mean(off_s[camera.known] ** 2))) < LEAST_SHARE * float(np.median(even_s)):
         return None
-    found = _followed(np.hstack([camera.v_mps, camera.w_radps]), step_s, camera.known)
+    found = _followed(np.hstack([camera.v_mps, camera.w_radps]), step_s, even_s, camera.known)
     if found is None or found.value + SIGMAS * found.error > MOST_FOLLOWED:
         return None
     typical_ms = 1e3 * float(np.median(np.abs(off_s)))
@@ -47,8 +51,19 @@ def check(evidence: Evidence) -> Symptom | None:
     )
 
 
-def _followed(rates: Array, step_s: Array, known: BoolArray) -> Scalar | None:
+def _even_steps_s(step_s: Array) -> Array:
+    """Return what the steps (K - 1,) are if images come evenly: multiples of a usual one, where frames were lost."""
+    usual_s = 0.5 * float(np.quantile(step_s[1:] + step_s[:-1], UNHURT))
+    for _ in range(2):
+        steps = np.maximum(np.round(step_s / usual_s), 1.0)
+        usual_s = float(step_s.sum() / steps.sum())
+    return np.asarray(usual_s * steps)
+
+
+def _followed(rates: Array, step_s: Array, even_s: Array, known: BoolArray) -> Scalar | None:
     """Return the share of the steps' unevenness that is in the camera's motion, from its rates (K - 1, 6).
+
+    ``even_s`` (K - 1,) are the steps without it.
 
     None where too few intervals are known with those beside them.
     """
@@ -60,8 +75,7 @@ def _followed(rates: Array, step_s: Array, known: BoolArray) -> Scalar | None:
         return None
     moved = rates * step_s[:, None]
     around = moved[beside].sum(axis=1) / step_s[beside].sum(axis=1)[:, None]
-    usual_s = float(np.median(step_s))
-    regressor, response = around * (step_s[rows] - usual_s)[:, None], moved[rows] - around * usual_s
+    regressor, response = around * (step_s - even_s)[rows, None], moved[rows] - around * even_s[rows, None]
     return Scalar(_share(regressor, response), jackknife_error(_share, regressor, response))
 
 
