@@ -208,6 +208,11 @@ def _tracks(sequence: Sequence) -> str:
     return content_digest((sequence.observations, sequence.frames_t_ns, sequence.rig))
 
 
+def _tracks_and_truth(sequence: Sequence) -> str:
+    seen = (sequence.observations, sequence.frames_t_ns, sequence.rig)
+    return content_digest((*seen, sequence.truth, sequence.motion_kind))
+
+
 @pytest.fixture(scope="package", autouse=True)
 def _derived_once() -> Iterator[None]:
     """Derive what several faults look at once of the same tracks, or of the same recording, for all tests of a worker.
@@ -215,9 +220,11 @@ def _derived_once() -> Iterator[None]:
     Most faults are planted in few recordings, many of them beside the tracks, and are audited more than once.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fault, "camera_motion", _once(fault.camera_motion, _tracks))
-        for name in ("alignment", "self_calibration"):
+        for name in ("camera_motion", "step_correlation"):
+            patch.setattr(fault, name, _once(getattr(fault, name), _tracks))
+        for name in ("agreement", "alignment", "self_calibration"):
             patch.setattr(fault, name, _once(getattr(fault, name), Sequence.content_hash))
+        patch.setattr(fault, "truth_clock", _once(fault.truth_clock, _tracks_and_truth))
         yield
 
 

@@ -26,8 +26,6 @@ def told(sequence: Sequence) -> list[str]:
 def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk(
     flight: Sequence, walk_px: float
 ) -> None:
-    from toolkit.audit.tracks.correlated_tracks import _correlation, _neighbouring_residuals
-
     # No walk of the disparity: what that does to the depth, and so to later steps, theory leaves out.
     walk = TrackNoise(np.zeros(3), walk_px * np.array([1.0, 0.0, 1.0]), np.zeros(3))
     observations = with_track_noise(flight.observations, walk, np.random.default_rng(3))
@@ -36,7 +34,9 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
     walk_px2 = to_pixels @ np.diag(walk.walk_px**2) @ to_pixels.T  # of (uL, uR, v)
     expected = -1.0 / (2.0 + np.trace(np.linalg.solve(sequence.rig.cov_uv_px2, walk_px2)) / 3.0)
     # The camera's motion is fitted to the tracks and takes some of it: 0.04 at most under three seeds.
-    assert _correlation(*_neighbouring_residuals(Evidence(sequence))) == pytest.approx(expected, abs=0.06)
+    found = Evidence(sequence).step_correlation
+    assert found is not None
+    assert found.value == pytest.approx(expected, abs=0.06)
 
 
 def test_tracks_with_a_walk_or_an_offset_of_their_own_are_told_and_white_ones_are_not(flight: Sequence) -> None:

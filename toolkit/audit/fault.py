@@ -5,11 +5,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
+from toolkit.audit.parts.agreement import Agreement, agreement
 from toolkit.audit.parts.alignment import Alignment, alignment
 from toolkit.audit.parts.deviations import Fallen, fallen_mps
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
 from toolkit.audit.parts.one_step import OneStep, one_step
+from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
+from toolkit.audit.parts.step_correlation import step_correlation
 from toolkit.audit.parts.truth_clock import TruthClock, truth_clock
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
@@ -95,6 +98,11 @@ class Evidence:
         return one_step(self.sequence, self.camera_motion)
 
     @cached_property
+    def step_correlation(self) -> Scalar | None:
+        """How neighbouring steps of a track go together; None of too few tracks, or of such without errors."""
+        return step_correlation(self.sequence, self.one_step)
+
+    @cached_property
     def blind(self) -> Undecided:
         """Why the motion samples cannot be compared with the camera, where ``intervals`` is None."""
         if self.spoilt_by:
@@ -118,6 +126,11 @@ class Evidence:
         if self.spoilt_by or not is_comparable(self.sequence):
             return None
         return compare(self.sequence, self.camera_motion)
+
+    @cached_property
+    def agreement(self) -> Agreement:
+        """How well the tracks follow the measured motion of a recording that has ``intervals``."""
+        return agreement(self.sequence, self.camera_motion)
 
     @cached_property
     def alignment(self) -> Alignment | None:
@@ -152,9 +165,9 @@ class Evidence:
         now, before = Evidence(remedy, self.spoilt_by), self.sequence
         same_tracks = remedy.observations is before.observations and remedy.frames_t_ns is before.frames_t_ns
         if same_tracks and remedy.rig.baseline_m == before.rig.baseline_m:
-            known = ["camera_motion", "one_step"]
+            known = ["camera_motion", "one_step", "step_correlation"]
             if remedy.motion is before.motion and remedy.rig is before.rig and remedy.noise is before.noise:
-                known += ["intervals", "alignment", "self_calibration", "fallen"]
+                known += ["intervals", "agreement", "alignment", "self_calibration", "fallen"]
             now.__dict__.update({name: self.__dict__[name] for name in known if name in self.__dict__})
         return now
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
-from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.units import force_ratio, rotation_ratio, speed_ratio
@@ -30,7 +29,7 @@ def check(evidence: Evidence) -> Symptom | Undecided | None:
     """Compare the median one-step residual with what the noise explains, and the sizes of the motions."""
     if evidence.intervals is None:
         return evidence.blind
-    found = agreement(evidence.sequence, evidence.camera_motion)
+    found = evidence.agreement
     findings = _ratios(evidence)
     if found.residual_px > found.limit_px or found.own_px > found.limit_px or findings:
         findings.append(

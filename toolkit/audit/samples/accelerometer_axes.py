@@ -11,7 +11,6 @@ import numpy as np
 
 from toolkit.audit.calibration.mixed_axes import MIRRORED, axes_named, cauchy, sigmas, signed_axes
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.alignment import chained
 from toolkit.audit.parts.intervals import Intervals, interval_means
 from toolkit.geometry import Array, IntArray, so3_exp
@@ -45,7 +44,7 @@ def check(evidence: Evidence) -> Symptom | None:
     intervals, sequence = evidence.intervals, evidence.sequence
     if intervals is None or sequence.motion_kind != "imu":
         return None
-    found = agreement(sequence, evidence.camera_motion)
+    found = evidence.agreement
     if found.residual_px > found.limit_px:
         return None  # the gyro is not the camera's, and a disagreement is told
     changes = _changes(evidence, intervals)

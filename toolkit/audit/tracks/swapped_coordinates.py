@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom
-from toolkit.audit.parts.agreement import agreement
 from toolkit.audit.parts.exchanged_rows import exchanged_rows, like_rows
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.models.stereo import disparity_px
@@ -153,7 +152,7 @@ def _is_sound(sequence: Sequence) -> bool:
     evidence = Evidence(sequence.truncated(TRIED_FRAMES))
     if evidence.intervals is None:
         return False
-    found = agreement(evidence.sequence, evidence.camera_motion)
+    found = evidence.agreement
     return found.residual_px <= found.limit_px
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from toolkit.audit.fault import Evidence, Fault, Symptom, Undecided
 from toolkit.audit.parts.intervals import LEAST_INTERVALS
-from toolkit.audit.tracks.correlated_tracks import MOST_CORRELATION, step_correlation
+from toolkit.audit.tracks.correlated_tracks import MOST_CORRELATION
 from toolkit.geometry import Array
 from toolkit.jackknife import jackknife_error
 from toolkit.models.gating import mahalanobis_squared
@@ -75,7 +75,7 @@ def _overstated(evidence: Evidence, scatter: float, error: float) -> Symptom | N
         evidence.sequence.observations.frame[evidence.one_step.after], return_inverse=True, return_counts=True
     )
     left = float(np.mean(np.maximum(1.0 - 2.0 / pairs, 0.0)[interval]))
-    correlation = step_correlation(evidence)
+    correlation = evidence.step_correlation
     if left <= 0.0 or scatter < _NO_ERROR or correlation is None:
         return None
     scatter, error = scatter / np.sqrt(left), error / np.sqrt(left)
