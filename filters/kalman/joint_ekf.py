@@ -36,7 +36,7 @@ class Correct(Protocol):
 
 
 class JointEkf:
-    """Propagate, correct pose and landmarks together, forget the landmarks lost, start those new.
+    """Propagate, forget the landmarks lost or outdated, correct pose and landmarks together, start those new.
 
     ``belief`` decides what a correction does to estimates and covariance, ``correct`` how a correction is found, and
     ``correlation`` what landmarks count for, in full if there is none.
@@ -70,6 +70,7 @@ class JointEkf:
         self._joint.clone(packet.index)
         gate = FrameGate(self._outliers.gate_probability, self._outliers.joint_huber, self._correlation.share)
         joint_landmarks.forget_lost(self._joint, packet.frame, self._memory)
+        joint_landmarks.forget(self._joint, self._at.outdated(self._joint), self._memory)
         self._correct(self._joint, packet.frame, self._at, self._rig, gate)
         self._noise.learn(packet.frame.t_ns, predicted, self._joint.core)
         joint = self._joint

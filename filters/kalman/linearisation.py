@@ -8,8 +8,10 @@ odometry", section 4).
 
 from typing import Protocol
 
+import numpy as np
+
 from filters.kalman.joint import JointBelief
-from toolkit.geometry import Array
+from toolkit.geometry import Array, BoolArray
 from toolkit.measured_motion import Motion
 from toolkit.models.motion import Increment
 from toolkit.models.state import Prediction
@@ -27,6 +29,9 @@ class Linearisation(Protocol):
     def points(self, joint: JointBelief) -> Array:
         """Return the landmarks (L, 3)."""
 
+    def outdated(self, joint: JointBelief) -> BoolArray:
+        """Say which landmarks (L,) are no longer where the Jacobians take them to be."""
+
 
 class AtLatestEstimates:
     """The standard EKF."""
@@ -43,9 +48,16 @@ class AtLatestEstimates:
         """Return the landmarks (L, 3) as estimated now."""
         return joint.points
 
+    def outdated(self, joint: JointBelief) -> BoolArray:
+        """Return none: each is where it is estimated."""
+        return np.zeros(len(joint.points), dtype=bool)
+
 
 class AtFirstEstimates:
-    """First-estimate Jacobians."""
+    """First-estimate Jacobians, of landmarks that have moved since by no more than a share of their distance."""
+
+    def __init__(self, most_moved: float = np.inf) -> None:
+        self._most_moved = most_moved
 
     def transition(self, joint: JointBelief, increment: Increment, prediction: Prediction) -> Array:
         """Return the transition (d, d) between the first estimates of both instants."""
@@ -58,6 +70,12 @@ class AtFirstEstimates:
     def points(self, joint: JointBelief) -> Array:
         """Return the landmarks (L, 3) as first estimated."""
         return joint.first_points
+
+    def outdated(self, joint: JointBelief) -> BoolArray:
+        """Say which have moved since they were first estimated by more than that of the way from the newest clone."""
+        moved_m = np.linalg.norm(joint.points - joint.first_points, axis=1)
+        distance_m = np.linalg.norm(joint.points - joint.clones[-1, :3, 3], axis=1)
+        return np.asarray(moved_m > self._most_moved * distance_m)
 
 
 class Integrator(Protocol):
