@@ -184,6 +184,11 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
         "image_2 has images and image_3 has none",
     ),
     ("an empty folder", lambda d: [p.unlink() for p in d.glob("image_0/*")], "image_1 has images and image_0 has none"),
+    (
+        "no image at all",
+        lambda d: [p.unlink() for p in d.glob("image_?/*")],
+        r"no image_0 and image_1, .* with images; unpack them there \(.png, .jpg, .*are read\)",
+    ),
     ("rows alike", lambda d: edit(d / "calib.txt", "-100.0", "0"), "P0 and P1 are the same, so there is no baseline"),
     (
         "times alike",
