@@ -9,8 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+import toolkit
 from toolkit.datasets import kitti_odometry, load_sequence
+from toolkit.datasets.trajectories import tum
 from toolkit.errors import DataError
+from toolkit.estimate import Trajectory
 from toolkit.experiment.recording import Recording, prepare
 from toolkit.measured_motion import NoSamples, TwistChangeNoise
 from toolkit.settings import Frontend
@@ -181,6 +184,11 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
         "image_2 has images and image_3 has none",
     ),
     ("an empty folder", lambda d: [p.unlink() for p in d.glob("image_0/*")], "image_1 has images and image_0 has none"),
+    (
+        "no image at all",
+        lambda d: [p.unlink() for p in d.glob("image_?/*")],
+        r"no image_0 and image_1, .* with images; unpack them there \(.png, .jpg, .*are read\)",
+    ),
     ("rows alike", lambda d: edit(d / "calib.txt", "-100.0", "0"), "P0 and P1 are the same, so there is no baseline"),
     (
         "times alike",
@@ -228,6 +236,18 @@ def test_cameras_may_name_and_store_their_images_each_in_its_own_way(drive: Path
 def test_tracks_cannot_be_simulated(drive: Path) -> None:
     with pytest.raises(DataError, match="EuRoC folders only"):
         load_sequence(str(drive), 0, Frontend(tracks="simulated"))
+
+
+def test_a_truth_and_a_trajectory_need_no_measured_motion(drive: Path, tmp_path: Path) -> None:
+    """No gyro says whether they turn rightly; they are scored all the same."""
+    poses = load_sequence(str(drive)).truth
+    assert poses is not None
+    (drive / "poses.txt").unlink()
+    file = tmp_path / "poses.tum"
+    file.write_text(tum.text(Trajectory(poses.t_ns, poses.T_world_imu)))
+    result = toolkit.compare(str(drive), ["dead-reckoning"], truth=file, trajectories={"theirs": file})
+    assert result.metrics["theirs", "final"]["ate_se3_m"] == pytest.approx(0.0, abs=1e-9)
+    assert result.metrics["dead-reckoning", "final"]["pairs"] == FRAMES
 
 
 def test_a_recording_without_motion_is_kept_and_read_again(drive: Path, tmp_path: Path) -> None:

@@ -228,6 +228,11 @@ BROKEN: list[tuple[str, Callable[[Path], object], str]] = [
     ),
     ("one camera", lambda d: shutil.rmtree(d / "image_01"), "image_00/data has images and image_01/data has none"),
     (
+        "no image at all",
+        lambda d: [p.unlink() for p in d.glob("image_*/data/*")],
+        r"no image_00/data and image_01/data, .* with images; unpack them there \(.png",
+    ),
+    (
         "two pairs' halves",
         lambda d: (d / "image_00").rename(d / "image_02"),
         "image_01/data has images and",

@@ -14,10 +14,12 @@ import numpy as np
 
 from toolkit.datasets.io.fields import check_frame_count, observations, stamps_ns
 from toolkit.datasets.io.image_pairs import (
+    UNPACK_IMAGES,
     Listed,
     check_both_cameras,
     check_several_stamps,
     facts_of,
+    has_folders,
     images_in,
     images_only,
     pairs_by_name,
@@ -61,8 +63,8 @@ uses_images = images_only
 
 
 def recognises(path: Path) -> bool:
-    """Say whether the path is a folder with the images of a rectified pair, named as KITTI odometry names them."""
-    return _layout(path) is not None
+    """Say whether the path has the folders of a rectified pair, as KITTI odometry names them, or one with images."""
+    return _layout(path) is not None or any(has_folders(path, left, right) for left, right, _ in _FOLDERS)
 
 
 def load(path: Path) -> Sequence:
@@ -106,7 +108,9 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Sequ
 def _whole(path: Path) -> _Layout:
     layout = _layout(path)
     if layout is None:
-        raise DataError(f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images")
+        raise DataError(
+            f"{path}: no image_0 and image_1, image_2 and image_3, or image_l and image_r with images; {UNPACK_IMAGES}"
+        )
     check_both_cameras(layout.root, layout.left, layout.right)
     return layout
 

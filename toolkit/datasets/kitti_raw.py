@@ -19,11 +19,13 @@ import numpy as np
 
 from toolkit.datasets.io.fields import Fields, check_frame_count, observations, rigid
 from toolkit.datasets.io.image_pairs import (
+    UNPACK_IMAGES,
     Listed,
     check_both_cameras,
     check_one_clock,
     check_several_stamps,
     facts_of,
+    has_folders,
     image_folder,
     images_in,
     images_only,
@@ -78,8 +80,8 @@ uses_images = images_only
 
 
 def recognises(path: Path) -> bool:
-    """Say whether the path is a folder with the images of a raw drive."""
-    return _layout(path) is not None
+    """Say whether the path has the folders of a raw drive's cameras, or one with images."""
+    return _layout(path) is not None or any(has_folders(path, *(f"image_{side}" for side in pair)) for pair in _SIDES)
 
 
 def load(path: Path) -> Sequence:
@@ -129,7 +131,9 @@ def _layout(path: Path) -> _Layout | None:
 def _whole(path: Path) -> _Layout:
     layout = _layout(path)
     if layout is None:
-        raise DataError(f"{path}: no image_00/data and image_01/data, or image_02 and image_03, with images")
+        raise DataError(
+            f"{path}: no image_00/data and image_01/data, or image_02 and image_03, with images; {UNPACK_IMAGES}"
+        )
     check_both_cameras(layout.root, layout.images(0), layout.images(1))
     return layout
 

@@ -20,6 +20,7 @@ from toolkit.sequence import StereoRig
 from toolkit.settings import Tracks
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm")
+UNPACK_IMAGES = f"unpack them there ({', '.join(SUFFIXES)} are read)"
 # Cameras of one trigger differ by microseconds; at 1 m/s and 2 m a millisecond moves a corner by .2 px.
 _SAME_INSTANT_NS = 1_000_000
 # So many of the pairs left out are told by name.
@@ -63,6 +64,11 @@ def images_only(path: Path, tracks: Tracks) -> bool:
     if tracks == "simulated":
         raise DataError(f"{path}: tracks are simulated for EuRoC folders only; leave --tracks simulated out")
     return True
+
+
+def has_folders(root: Path, left: str, right: str) -> bool:
+    """Say whether both folders of a pair are there, with images or without: what lacks is told when it is read."""
+    return (root / left).is_dir() and (root / right).is_dir()
 
 
 def images_in(folder: Path) -> list[Path]:

@@ -52,15 +52,15 @@ class Reference(NamedTuple):
 
     @classmethod
     def of_recording(cls, sequence: Sequence) -> "Reference":
-        """Return the frames, the gyro, and the truth or else the twists of a recording."""
+        """Return the frames, the gyro, and the truth or else the twists of a recording; no rates without motion."""
         motion, truth = sequence.motion, sequence.truth
-        usable = np.flatnonzero(np.isfinite(motion.values).all(axis=1))
+        usable = np.flatnonzero(np.isfinite(motion.values).all(axis=1) & (motion.values.shape[1] > 0))
         samples = usable[np.argsort(motion.t_ns[usable], kind="stable")]
         twists = isinstance(motion, TwistSamples)
         speeds = np.linalg.norm(motion.values[samples, :3], axis=1) if twists else np.full(samples.size, np.nan)
         return cls(
             sequence.name, "the frames", "the gyro says", sequence.frames_t_ns,
-            motion.t_ns[samples], motion.values[samples, 3:],
+            motion.t_ns[samples], motion.values[samples, 3:].reshape(-1, 3),
             np.empty(0, np.int64) if truth is None else truth.t_ns,
             np.empty((0, 3)) if truth is None else truth.T_world_imu[:, :3, 3],
             speeds,
