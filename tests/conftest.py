@@ -232,15 +232,15 @@ _audited_recording = recording.audited_recording
 
 
 @cache
-def _audited(_audit: Callable[..., Audit], asked: Recording, _changed_ns: int) -> Audit:
+def _audited(_audit: Callable[..., Audit], requested: Recording, _changed_ns: int) -> Audit:
     """Return a recording audited; a test that puts another audit in gets what that one says."""
-    return _audited_recording(asked)
+    return _audited_recording(requested)
 
 
-def _is_beginning(asked: Recording, scenario: Scenario) -> bool:
+def _is_beginning(requested: Recording, scenario: Scenario) -> bool:
     """Say whether no more is run of a simulation than its beginning that decides every fault."""
     decided = 0 if scenario.audited_s is None else scenario.audited_s * scenario.camera.rate_hz
-    return asked.part == WHOLE and asked.max_frames is not None and asked.max_frames <= decided
+    return requested.part == WHOLE and requested.max_frames is not None and requested.max_frames <= decided
 
 
 @pytest.fixture(scope="module")
@@ -250,17 +250,17 @@ def audited_once() -> Iterator[None]:
     As outside of tests, what decides every fault is audited of a simulation of which no more is run.
     """
 
-    def remembered(asked: Recording, progress: Progress = SILENT) -> Audit:
-        plain = Recording(asked.source, asked.seed, keep=asked.keep)
-        told = (asked.truth, asked.duration_s, asked.frontend, asked.vary)
-        if isinstance(asked.source, str) and told == (None, None, plain.frontend, plain.vary):
-            if asked.source in SCENARIOS:
-                begins = _is_beginning(asked, SCENARIOS[asked.source])
+    def remembered(requested: Recording, progress: Progress = SILENT) -> Audit:
+        plain = Recording(requested.source, requested.seed, keep=requested.keep)
+        given = (requested.truth, requested.duration_s, requested.frontend, requested.vary)
+        if isinstance(requested.source, str) and given == (None, None, plain.frontend, plain.vary):
+            if requested.source in SCENARIOS:
+                begins = _is_beginning(requested, SCENARIOS[requested.source])
                 return _audited(recording.audit, replace(plain, max_frames=2 if begins else None), 0)
-            file = Path(asked.source).absolute()
+            file = Path(requested.source).absolute()
             if file.is_file():
                 return _audited(recording.audit, replace(plain, source=str(file)), file.stat().st_mtime_ns)
-        return _audited_recording(asked, progress)
+        return _audited_recording(requested, progress)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recording, "audited_recording", remembered)

@@ -172,7 +172,7 @@ def test_a_metric_file_that_scores_otherwise_is_named(announce: Announce, answer
         metrics.score_run(run, "causal", sequence)
 
 
-def test_a_metric_that_is_unavailable_is_named_where_it_is_asked_for(announce: Announce) -> None:
+def test_a_metric_that_is_unavailable_is_named_where_it_is_requested(announce: Announce) -> None:
     announce("toolkit.metrics", {"answer.py": f"import no_such_package\n{METRIC}"})
     with pytest.raises(VislamError, match="answer is unavailable: it needs the package no_such_package"):
         metrics.metrics_called(["answer"])

@@ -120,7 +120,7 @@ def test_only_the_ladder_tells_what_its_rungs_change(result: Result) -> None:
     assert toolkit.compare("drive", LADDER, max_frames=2, workers=1).comparison.changes["ekf"]
 
 
-def test_a_table_has_the_columns_asked_for_in_their_order_by_key_or_name(result: Result) -> None:
+def test_a_table_has_the_columns_requested_in_their_order_by_key_or_name(result: Result) -> None:
     whole, chosen = comparison_table(result.comparison), result.table("nis_mean", "ATE SE(3)").table
     assert [heading[:2] for heading in chosen.headings[whole.labels :]] == [("NIS", "mean"), ("ATE", "SE(3)")]
     at = [heading[:2] for heading in whole.headings].index(("ATE", "SE(3)"))
@@ -148,13 +148,13 @@ def test_mappings_of_a_result_are_looked_into_and_shown_like_any(result: Result)
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"), [({"figures": "some"}, "few, all, none"), ({"figure_format": "jpg"}, "png, pdf")]
+    ("requested", "why"), [({"figures": "some"}, "few, all, none"), ({"figure_format": "jpg"}, "png, pdf")]
 )
 def test_figures_that_there_are_not_are_refused_before_anything_is_written(
-    result: Result, tmp_path: Path, asked: dict[str, Any], why: str
+    result: Result, tmp_path: Path, requested: dict[str, Any], why: str
 ) -> None:
-    with pytest.raises(SettingsError, match=rf"{next(iter(asked))} is '.*'; there are {why}"):
-        result.save(tmp_path / "run", **asked)
+    with pytest.raises(SettingsError, match=rf"{next(iter(requested))} is '.*'; there are {why}"):
+        result.save(tmp_path / "run", **requested)
     assert not list(tmp_path.iterdir())
 
 
@@ -249,8 +249,14 @@ def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> No
         return find("dead-reckoning").load()(setup)
 
     def compared(seeds: int) -> Result:
-        asked = {"own": {"mine": mine}, "max_frames": FRAMES, "seeds": seeds, "workers": 1, "resume": tmp_path / "run"}
-        return toolkit.compare("drive", "dead-reckoning", **asked)
+        requested = {
+            "own": {"mine": mine},
+            "max_frames": FRAMES,
+            "seeds": seeds,
+            "workers": 1,
+            "resume": tmp_path / "run",
+        }
+        return toolkit.compare("drive", "dead-reckoning", **requested)
 
     compared(2)
     kept = (tmp_path / "run" / "outcomes.jsonl").read_text().splitlines()
@@ -262,8 +268,8 @@ def test_what_is_kept_is_found_and_a_function_is_run_again(tmp_path: Path) -> No
 
 
 def test_settings_are_a_record_or_nested_values(result: Result) -> None:
-    told = {"noise": {"pixel_sigma_px": 0.5}, "first_seed": 1}
-    by_values = toolkit.compare("drive", "ekf", settings=told, max_frames=FRAMES, workers=1)
+    given = {"noise": {"pixel_sigma_px": 0.5}, "first_seed": 1}
+    by_values = toolkit.compare("drive", "ekf", settings=given, max_frames=FRAMES, workers=1)
     by_record = toolkit.compare("drive", "ekf", settings=by_values.comparison.settings, max_frames=FRAMES, workers=1)
     assert ate(by_values) == ate(by_record) != ate(result)[2:]
     with pytest.raises(
@@ -273,7 +279,7 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "why"),
+    ("requested", "why"),
     [
         ({"max_frames": 1}, "max_frames is 1"),
         ({"workers": 0}, "workers is 0"),
@@ -311,11 +317,11 @@ def test_settings_are_a_record_or_nested_values(result: Result) -> None:
     ],
 )
 def test_what_cannot_be_compared_is_refused_before_anything_runs(
-    asked: dict[str, object], why: str, monkeypatch: pytest.MonkeyPatch
+    requested: dict[str, object], why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(toolkit.api, "run_plan", None)
     with pytest.raises(SettingsError, match=why):
-        toolkit.compare(**{"source": "drive", "estimators": "ekf", **asked})
+        toolkit.compare(**{"source": "drive", "estimators": "ekf", **requested})
 
 
 def test_numbers_of_numpy_are_settings_like_any(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -350,7 +356,7 @@ def test_a_result_is_saved_as_a_run_directory(tmp_path: Path, over: Result, unre
 
 def surrounded(words: list[str], program: str | None, folder: Path) -> str:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    told = subprocess.run(
+    messages = subprocess.run(
         [sys.executable, *words],
         input=program,
         cwd=folder,
@@ -360,8 +366,8 @@ def surrounded(words: list[str], program: str | None, folder: Path) -> str:
         timeout=300,
         check=False,
     )
-    assert (told.returncode, told.stderr) == (0, "")
-    return told.stdout
+    assert (messages.returncode, messages.stderr) == (0, "")
+    return messages.stdout
 
 
 def as_script(folder: Path) -> str:
@@ -387,15 +393,15 @@ def in_a_notebook(folder: Path) -> str:
 @pytest.mark.parametrize("run", [as_script, from_standard_input, in_a_notebook])
 def test_it_runs_in_processes_from_anywhere_and_once(tmp_path: Path, run: Callable[[Path], str]) -> None:
     """No guard around the main program, no file to import again: and what the program prints, it prints once."""
-    told = run(tmp_path)
-    assert told.count("metrics agree: True\n") == 1
-    assert told.splitlines()[1] == "drive_small"
-    assert "mine" in told
+    reported = run(tmp_path)
+    assert reported.count("metrics agree: True\n") == 1
+    assert reported.splitlines()[1] == "drive_small"
+    assert "mine" in reported
 
 
 def test_nothing_slow_is_imported_before_it_is_used() -> None:
     slow = ("numpy", "gtsam", "matplotlib", "loky", "toolkit.api")
     program = f"import sys, toolkit; print([name for name in {slow!r} if name in sys.modules], dir(toolkit))"
-    told = surrounded(["-c", program], None, Path())
-    assert told.startswith("[] ")
-    assert all(repr(name) in told for name in toolkit.__all__)
+    messages = surrounded(["-c", program], None, Path())
+    assert messages.startswith("[] ")
+    assert all(repr(name) in messages for name in toolkit.__all__)

@@ -28,7 +28,7 @@ def module(tmp_path, monkeypatch):
     return written
 
 
-def test_without_numba_numpy_runs_unless_compiled_is_asked_for(monkeypatch):
+def test_without_numba_numpy_runs_unless_compiled_is_requested(monkeypatch):
     monkeypatch.setattr(compilation, "find_spec", lambda name: None)
     auto = Compilation("auto")
     assert auto.module("filters.kalman.kernels.track_gate") is None
@@ -39,7 +39,7 @@ def test_without_numba_numpy_runs_unless_compiled_is_asked_for(monkeypatch):
         find("msckf").check_usable(Settings(arithmetic="compiled"))
 
 
-def test_a_numba_that_does_not_fit_is_told_and_numpy_runs(module):
+def test_a_numba_that_does_not_fit_is_reported_and_numpy_runs(module):
     name = module("numba_does_not_fit", "raise ImportError('Numba needs NumPy 2.5 or less')")
     auto = Compilation("auto")
     assert auto.module(name) is None
@@ -49,7 +49,7 @@ def test_a_numba_that_does_not_fit_is_told_and_numpy_runs(module):
         Compilation("compiled").module(name)
 
 
-def test_what_was_compiled_is_told_once_in_a_process_and_what_was_found_is_not(module):
+def test_what_was_compiled_is_reported_once_in_a_process_and_what_was_found_is_not(module):
     name, found = module("was_compiled", "COMPILED = 'this was compiled'"), module("was_found", "COMPILED = ''")
     first, second, third = Compilation("auto"), Compilation("auto"), Compilation("auto")
     for one, of in ((first, name), (second, name), (third, found)):

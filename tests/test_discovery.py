@@ -146,7 +146,7 @@ def test_an_unknown_name_lists_the_known_ones(package):
         find("wasp")
 
 
-def test_an_entry_point_to_nowhere_is_told(monkeypatch):
+def test_an_entry_point_to_nowhere_is_reported(monkeypatch):
     point = EntryPoint("gone", "gone_package", ENTRY_POINT_GROUP)
     monkeypatch.setattr(discovery, "entry_points", lambda group: [point])
     with pytest.raises(ExtensionError, match="names gone_package, which is not a package"):

@@ -138,8 +138,8 @@ def test_noise_stated_too_small_is_seen_in_the_tracks(hard: list[Sequence]):
     """The pixels scatter by thrice what is stated: the covariance is scaled by what the tracks show."""
     sequence = hard[0]
     fine = replace(sequence, rig=replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 / 9.0))
-    told, stated = start_from_measurements(fine), start_from_measurements(sequence)
-    ratio = np.sqrt(np.diag(told.cov) / np.diag(stated.cov))[6:9]
+    reported, stated = start_from_measurements(fine), start_from_measurements(sequence)
+    ratio = np.sqrt(np.diag(reported.cov) / np.diag(stated.cov))[6:9]
     # Alone the smaller noise would make these about a third; the IMU's part of them does not change.
     assert (ratio > 0.8).all()
 
@@ -159,7 +159,7 @@ def shuffled(sequence: Sequence) -> Sequence:
     ],
     ids=["accelerations in g", "shuffled tracks"],
 )
-def test_a_start_that_cannot_be_told_is_refused_with_the_reason(
+def test_a_start_that_cannot_be_determined_is_refused_with_the_reason(
     hard: list[Sequence], spoil: Callable[[Sequence], Sequence], reason: str
 ):
     prior = start_from_measurements(spoil(hard[1]))
@@ -286,7 +286,7 @@ def test_a_start_from_truth_needs_truth_at_the_first_frame():
         start_from_truth(replace(sequence, truth=late))
 
 
-def test_an_adjustment_without_a_sound_solution_is_said_and_not_raised(monkeypatch):
+def test_an_adjustment_without_a_sound_solution_is_reported_and_not_raised(monkeypatch):
     def refuse(graph, values):
         raise RuntimeError("Indeterminate linear system detected while working near variable 1 (Symbol: v0).")
 

@@ -34,7 +34,7 @@ def test_long_work_leaves_lines_with_the_time_left_in_a_log(monkeypatch: pytest.
     assert lines[-1].startswith("drive: batch, iteration 5 % [")
 
 
-def test_the_time_left_is_not_told_from_the_first_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_left_is_not_reported_from_the_first_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "LOG_EVERY_S", 0.0)
     stream = io.StringIO()
     with progress.on_stream(stream)("drive") as watched:

@@ -22,14 +22,14 @@ class Perfect:
     """Knows the truth and says it; the estimators below each spoil one thing."""
 
     def __init__(self, poses: np.ndarray) -> None:
-        self.poses, self.said = poses, []
+        self.poses, self.reported = poses, []
 
     def step(self, packet: Packet) -> Estimate | None:
-        self.said.append(Estimate(packet.frame.t_ns, self.poses[packet.index], info={"nis": float(packet.index)}))
-        return self.said[-1]
+        self.reported.append(Estimate(packet.frame.t_ns, self.poses[packet.index], info={"nis": float(packet.index)}))
+        return self.reported[-1]
 
     def finish(self) -> Finished:
-        return Finished(Trajectory.of(self.said), Landmarks.none(), log=("all is well",))
+        return Finished(Trajectory.of(self.reported), Landmarks.none(), log=("all is well",))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def sequence() -> Sequence:
     return simulate(noise_free(replace(DRIVE, duration_s=(FRAMES - 1) / 10.0)), 0)
 
 
-class Heard:
+class Received:
     def __init__(self) -> None:
         self.calls = []
 
@@ -45,12 +45,12 @@ class Heard:
         self.calls.append((done, total))
 
 
-def run(kind: type[Perfect], sequence: Sequence, progress: Heard | None = None) -> Run:
+def run(kind: type[Perfect], sequence: Sequence, progress: Received | None = None) -> Run:
     def build(setup: Setup) -> Estimator:
         assert setup.prior is sequence.prior
         return kind(sequence.truth.T_world_imu)
 
-    return runner.run("some", build, sequence, sequence.prior, progress or Heard())
+    return runner.run("some", build, sequence, sequence.prior, progress or Received())
 
 
 def test_both_outputs_landmarks_diagnostics_and_log_are_kept(sequence):
@@ -62,9 +62,9 @@ def test_both_outputs_landmarks_diagnostics_and_log_are_kept(sequence):
 
 
 def test_progress_hears_every_frame(sequence):
-    heard = Heard()
-    run(Perfect, sequence, heard)
-    assert heard.calls == [(k + 1, FRAMES) for k in range(FRAMES)]
+    received = Received()
+    run(Perfect, sequence, received)
+    assert received.calls == [(k + 1, FRAMES) for k in range(FRAMES)]
 
 
 class AtTheEnd(Perfect):
@@ -87,7 +87,7 @@ class Breaks(Perfect):
         return super().step(packet)
 
 
-def test_an_error_ends_the_run_with_its_reason_and_what_was_said_before(sequence):
+def test_an_error_ends_the_run_with_its_reason_and_what_was_reported_before(sequence):
     done = run(Breaks, sequence)
     assert done.status == "failed"
     assert done.log[0] == "failed after 5 estimates: ZeroDivisionError: the map is empty"
@@ -111,7 +111,7 @@ def test_an_error_while_building_is_a_failed_run(sequence):
     def build(setup: Setup) -> Estimator:
         raise ValueError("no such noise")
 
-    done = runner.run("some", build, sequence, sequence.prior, Heard())
+    done = runner.run("some", build, sequence, sequence.prior, Received())
     assert done.status == "failed"
     assert done.causal is None
     assert "ValueError: no such noise" in done.log[0]
@@ -119,10 +119,10 @@ def test_an_error_while_building_is_a_failed_run(sequence):
 
 class NotANumber(Perfect):
     def step(self, packet: Packet) -> Estimate | None:
-        said = super().step(packet)
+        reported = super().step(packet)
         if packet.index >= 7:
-            self.said[-1] = replace(said, T_world_imu=np.full((4, 4), np.nan))
-        return self.said[-1]
+            self.reported[-1] = replace(reported, T_world_imu=np.full((4, 4), np.nan))
+        return self.reported[-1]
 
 
 def test_poses_that_are_not_finite_are_a_divergence(sequence):
@@ -131,7 +131,7 @@ def test_poses_that_are_not_finite_are_a_divergence(sequence):
     assert any("not numbers from estimate 7" in line for line in done.log)
 
 
-def test_a_run_is_judged_by_what_it_gave_alone(sequence):
+def test_a_run_is_checked_by_what_it_gave_alone(sequence):
     """Judging a run again, as from a file, gives the status and the reasons it had."""
     poses = np.tile(np.eye(4), (sequence.frame_count, 1, 1))
     poses[::2, 0, 3] = 50.0
@@ -234,7 +234,7 @@ def test_a_sequence_that_cannot_be_run_is_the_datas_fault_not_the_estimators(seq
 
 class Truncates(Perfect):
     def finish(self) -> Finished:
-        return Finished(Trajectory.of(self.said[:3]), Landmarks.none())
+        return Finished(Trajectory.of(self.reported[:3]), Landmarks.none())
 
 
 def test_a_final_answer_for_some_frames_only_is_kept_as_it_is(sequence):

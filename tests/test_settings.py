@@ -114,9 +114,9 @@ def test_the_page_documents_every_setting_as_it_is() -> None:
     ],
 )
 def test_a_value_of_another_type_is_shown_with_the_unit_it_should_be_in(assignment: str, why: str) -> None:
-    with pytest.raises(SettingsError) as told:
+    with pytest.raises(SettingsError) as raised:
         settings_of(with_assignments({}, [assignment]), "the command line")
-    assert str(told.value) == f"the command line: {why}"
+    assert str(raised.value) == f"the command line: {why}"
 
 
 def test_a_default_is_shown_as_it_can_be_written() -> None:

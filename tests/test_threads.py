@@ -30,7 +30,7 @@ def test_libraries_run_on_one_thread_those_too_that_are_loaded_after_the_first_t
     assert ended.returncode == 0, ended.stderr
 
 
-def test_these_tests_have_as_many_threads_as_asked_for_and_one_where_nothing_is_asked() -> None:
+def test_these_tests_have_as_many_threads_as_requested_and_one_where_nothing_is_requested() -> None:
     """What pytest loads before `conftest` must not load NumPy."""
-    told = {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
-    assert told == {int(os.environ["OPENBLAS_NUM_THREADS"])}
+    reported = {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+    assert reported == {int(os.environ["OPENBLAS_NUM_THREADS"])}

@@ -16,8 +16,8 @@ from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence
 from toolkit.simulation import SCENARIOS, simulate
 
-# Most faults show in a hundred and fifty frames.
-LENGTH_S = {"drive": 15.0, "drive-imu": 15.0, "flight": 7.5}
+# Most faults show in a hundred frames; of a flight as short a gap of two seconds would leave too little.
+LENGTH_S = {"drive": 10.0, "drive-imu": 10.0, "flight": 6.0}
 
 
 @cache

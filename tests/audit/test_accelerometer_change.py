@@ -18,17 +18,17 @@ def recording(scenario: str, seed: int, duration_s: float) -> Sequence:
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("dose", [0.97, 1.03, 1.06])
 @pytest.mark.parametrize(("scenario", "duration_s"), [("drive-imu", 12.0), ("flight", 8.0), ("flight-realistic", 8.0)])
-def test_an_accelerometer_whose_scale_changes_is_told_with_its_error(
+def test_an_accelerometer_whose_scale_changes_is_reported_with_its_error(
     scenario: str, duration_s: float, dose: float, seed: int
 ) -> None:
     sound = recording(scenario, seed, duration_s)
     found = accelerometer_change.check(Evidence(faults.changed_speed(sound, dose, seed)))
     assert isinstance(found, Symptom) and found.warns and not found.harmful
-    told = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
-    assert told is not None and told[4] == ("more" if dose > 1.0 else "less")
-    assert float(told[1]) == pytest.approx(0.5 * duration_s, abs=1.0)
+    match = re.search(r"from about (\d+) s .* gravity that is ([\d.]+) \+- ([\d.]+) m/s\^2 (more|less)", found.detail)
+    assert match is not None and match[4] == ("more" if dose > 1.0 else "less")
+    assert float(match[1]) == pytest.approx(0.5 * duration_s, abs=1.0)
     # Half of what tracks that creep make of it, and three standard errors as they are rounded.
-    assert float(told[2]) == pytest.approx(9.81 * abs(dose - 1.0), abs=0.08 + 3.0 * float(told[3]) + 0.02)
+    assert float(match[2]) == pytest.approx(9.81 * abs(dose - 1.0), abs=0.08 + 3.0 * float(match[3]) + 0.02)
 
 
 @pytest.mark.parametrize("scenario", ["drive-imu", "flight", "flight-realistic"])

@@ -52,9 +52,11 @@ def test_keeping_an_unknown_fault_is_refused_by_name(clean_recording: Callable[.
 def test_the_audit_imports_nothing_that_takes_as_long_as_an_audit() -> None:
     """Every process that runs an estimator audits first: scipy.stats alone takes a second to import."""
     program = "import sys; from toolkit.audit import faults; faults(); print(*sys.modules)"
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    messages = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert not {"scipy.stats", "scipy.optimize", "scipy.ndimage", "scipy.linalg", "matplotlib", "cv2"}.intersection(
-        told
+        messages
     )
 
 

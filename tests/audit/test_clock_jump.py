@@ -23,7 +23,9 @@ def recording(scenario: str, seed: int) -> Sequence:
 @pytest.mark.parametrize("steps", [-1.0, -0.6, 0.6, 1.0, 4.0])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("scenario", KINDS)
-def test_a_clock_that_is_set_by_steps_is_told_with_its_size_and_cut_at(scenario: str, seed: int, steps: float) -> None:
+def test_a_clock_that_is_set_by_steps_is_reported_with_its_size_and_cut_at(
+    scenario: str, seed: int, steps: float
+) -> None:
     sound = recording(scenario, seed)
     dose_s = steps * float(np.diff(sound.frames_s[:2])[0])
     found = clock_jump.check(Evidence(faults.clock_jump(sound, dose_s, seed)))
@@ -31,8 +33,8 @@ def test_a_clock_that_is_set_by_steps_is_told_with_its_size_and_cut_at(scenario:
         assert abs(steps) < 1.0 and "leap together" in found.why
         return
     assert isinstance(found, Symptom) and found.harmful and found.remedy is not None
-    told = re.search(r"set by ([-+][\d.]+) s at", found.detail)
-    assert told is not None and float(told[1]) == pytest.approx(dose_s, abs=1e-6)
+    match = re.search(r"set by ([-+][\d.]+) s at", found.detail)
+    assert match is not None and float(match[1]) == pytest.approx(dose_s, abs=1e-6)
     kept = found.remedy
     assert np.ptp(np.diff(kept.frames_t_ns)) <= 2 and np.ptp(np.diff(kept.motion.t_ns)) <= 2  # rounded to nanoseconds
     assert kept.frame_count >= sound.frame_count // 2
@@ -77,7 +79,7 @@ def test_stamps_that_tremble_together_are_no_jumps(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_told(seed: int) -> None:
+def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_reported(seed: int) -> None:
     """What its tracks move by is noise, of which every interval has as much, however long it is."""
     standing = faults.standstill(recording("drive", seed), 6.0, seed)
     speed_mps = np.linalg.norm(standing.motion.values[:, :3], axis=1)
@@ -94,6 +96,6 @@ def test_while_the_vehicle_stands_a_jump_and_a_pause_look_the_same_and_none_is_t
             motion=replace(standing.motion, t_ns=standing.motion.t_ns + np.where(samples_s > at_s, leap_ns, 0)),
         )
         for sequence in (paused, jumped):
-            said = clock_jump.check(Evidence(sequence))
-            assert isinstance(said, Undecided)
-            assert "do not tell whether time passed" in said.why
+            reported = clock_jump.check(Evidence(sequence))
+            assert isinstance(reported, Undecided)
+            assert "do not tell whether time passed" in reported.why

@@ -16,7 +16,7 @@ def simulated(scenario: str) -> Sequence:
 
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
-def test_rounded_samples_are_told_with_their_step(scenario: str) -> None:
+def test_rounded_samples_are_reported_with_their_step(scenario: str) -> None:
     found = coarse_samples.check(Evidence(faults.coarse_samples(simulated(scenario), 0.1)))
     assert isinstance(found, Symptom) and found.warns
     assert "in steps of 0.1 rad/s, which adds errors of 0.029" in found.detail
@@ -33,12 +33,12 @@ def test_steps_count_from_half_of_the_stated_noise_on() -> None:
     """A gyro of 200 samples a second and a density of 1.7e-4 rad/s/sqrt(Hz): 0.0024 rad/s a sample."""
     flight = simulated("flight")
     sigma = 1.7e-4 * np.sqrt(200.0)
-    for share, told in ((0.4, False), (0.6, True)):
+    for share, expected in ((0.4, False), (0.6, True)):
         values = flight.motion.values.copy()
         step = share * sigma * np.sqrt(12.0)
         values[:, 3:] = step * np.round(values[:, 3:] / step)
         found = coarse_samples.check(Evidence(replace(flight, motion=flight.motion.of(flight.motion.t_ns, values))))
-        assert (found is not None) == told
+        assert (found is not None) == expected
 
 
 def test_a_wheel_that_stands_or_an_axis_that_is_never_used_is_no_step() -> None:

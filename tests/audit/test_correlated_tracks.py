@@ -18,7 +18,7 @@ def flight() -> Sequence:
     return simulate(replace(SCENARIOS["flight"], duration_s=4.0), 3)
 
 
-def told(sequence: Sequence) -> list[str]:
+def reported(sequence: Sequence) -> list[str]:
     return [finding.detail for finding in audit(sequence).findings if finding.fault == "correlated-tracks"]
 
 
@@ -39,15 +39,15 @@ def test_the_correlation_of_neighbouring_steps_is_that_of_white_noise_and_a_walk
     assert found.value == pytest.approx(expected, abs=0.06)
 
 
-def test_tracks_with_a_walk_or_an_offset_of_their_own_are_told_and_white_ones_are_not(flight: Sequence) -> None:
+def test_tracks_with_a_walk_or_an_offset_of_their_own_are_reported_and_white_ones_are_not(flight: Sequence) -> None:
     drive = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3)
-    assert told(flight) == told(drive) == []
-    assert "each errs by itself" in told(track_faults.track_walk(flight, 4.0, 3))[0]
-    assert "noise.tracks=fitted" in told(track_faults.match_offset(drive, 3.0, 3))[0]
+    assert reported(flight) == reported(drive) == []
+    assert "each errs by itself" in reported(track_faults.track_walk(flight, 4.0, 3))[0]
+    assert "noise.tracks=fitted" in reported(track_faults.match_offset(drive, 3.0, 3))[0]
 
 
 def test_tracks_without_errors_and_tracks_whose_noise_is_stated_are_left_alone(flight: Sequence) -> None:
     noise = SCENARIOS["flight-realistic"].track_noise
     wandering = track_faults.track_walk(flight, 4.0, 3)
-    assert told(replace(wandering, rig=replace(wandering.rig, track_noise=noise))) == []
-    assert told(simulate(replace(SCENARIOS["flight"], duration_s=4.0, noise_scale=0.0), 3)) == []
+    assert reported(replace(wandering, rig=replace(wandering.rig, track_noise=noise))) == []
+    assert reported(simulate(replace(SCENARIOS["flight"], duration_s=4.0, noise_scale=0.0), 3)) == []

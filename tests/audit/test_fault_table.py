@@ -173,7 +173,7 @@ def test_the_fault_is_named_with_the_right_verdict(case: Case, scenario: str) ->
 
 
 @every_case
-def test_nothing_is_blessed_that_blocks_or_was_not_judged(case: Case, scenario: str) -> None:
+def test_nothing_is_blessed_that_blocks_or_was_not_checked(case: Case, scenario: str) -> None:
     outcome = audited(case.plant, case.dose, scenario)
     blessed = "nothing is left that spoils a result" in audit_text(outcome)
     assert blessed == (case.verdict == "repaired" and not outcome.undecided)
@@ -191,7 +191,7 @@ def test_the_offset_of_the_clocks_is_measured_and_undone(dose: float) -> None:
     assert abs(left_s) < 0.01  # three standard errors of 3 ms over six seconds
 
 
-def test_a_kept_offset_is_told_blocks_and_is_left() -> None:
+def test_a_kept_offset_is_reported_blocks_and_is_left() -> None:
     late = faults.camera_clock(clean("flight"), 0.25, 0)
     outcome = audit(late, frozenset({"time-offset"}))
     (finding,) = [f for f in outcome.findings if f.fault == "time-offset"]

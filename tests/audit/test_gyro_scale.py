@@ -20,14 +20,14 @@ def simulated(scenario: str, seed: int) -> Sequence:
 
 @pytest.mark.parametrize("dose", [0.85, 1.2])
 @pytest.mark.parametrize("scenario", ["drive", "drive-imu", "flight"])
-def test_the_sensitivity_of_an_axis_is_told(scenario: str, dose: float) -> None:
+def test_the_sensitivity_of_an_axis_is_reported(scenario: str, dose: float) -> None:
     found = gyro_scale.check(Evidence(faults.gyro_axis_scale(simulated(scenario, 51), dose)))
     assert isinstance(found, Symptom)
     assert found.warns and found.count == 1
-    told = re.search(r"turns (\S+) \+- (\S+) times as fast as the camera about", found.detail)
-    assert told is not None
+    match = re.search(r"turns (\S+) \+- (\S+) times as fast as the camera about", found.detail)
+    assert match is not None
     # A bound is off by the noise of the rates beside their scatter, a percent at most here.
-    assert float(told[1]) == pytest.approx(dose, abs=4.0 * float(told[2]) + 0.01)
+    assert float(match[1]) == pytest.approx(dose, abs=4.0 * float(match[2]) + 0.01)
 
 
 @pytest.mark.parametrize("seed", [61, 62, 63])
@@ -47,7 +47,7 @@ def test_noise_of_either_alone_accuses_nobody() -> None:
         assert not isinstance(gyro_scale.check(Evidence(faulty)), Symptom)
 
 
-def test_what_is_beyond_chance_and_does_not_count_is_said() -> None:
+def test_what_is_beyond_chance_and_does_not_count_is_reported() -> None:
     found = gyro_scale.check(Evidence(faults.gyro_axis_scale(simulated("flight", 51), 0.96)))
     assert isinstance(found, Undecided)
     assert "times as fast as the camera about" in found.why

@@ -77,7 +77,7 @@ def test_a_sensor_read_twice_as_often_as_it_measures_is_not_stuck(clean_recordin
     assert stuck(Evidence(_with_values(sound, held))) is None
 
 
-def test_wheels_that_stand_still_give_zeros_and_are_not_judged() -> None:
+def test_wheels_that_stand_still_give_zeros_and_are_not_checked() -> None:
     halted = faults.standstill(simulate(replace(SCENARIOS["drive"], duration_s=6.0), 3), 3.0, seed=1)
     stands = np.abs(halted.motion.values[:, :1]) < 0.5
     silent = _with_values(halted, np.where(stands, 0.0, halted.motion.values))

@@ -68,21 +68,21 @@ LIMITS = [(0, 0.06), (1, 0.06), (2, 8.0), (3, 12.0), (5, 0.06), (6, 0.06), (7, 0
 @pytest.mark.parametrize("unknown, limit", LIMITS)
 def test_what_is_found_counts_beyond_what_sound_recordings_have(unknown: int, limit: float) -> None:
     rig, cov = recorded(DRIVE, 0).rig, np.diag(np.full(COMMON, (0.01 * limit) ** 2))
-    for value, told in ((1.05 * limit, 0), (1.07 * limit, 1)):  # six standard errors are 0.06 of it
-        assert len(wrong(SelfCalibration(value * np.eye(COMMON)[unknown], cov, 1), rig, "twist")) == told
+    for value, wanted in ((1.05 * limit, 0), (1.07 * limit, 1)):  # six standard errors are 0.06 of it
+        assert len(wrong(SelfCalibration(value * np.eye(COMMON)[unknown], cov, 1), rig, "twist")) == wanted
 
 
 @pytest.mark.parametrize("unknown", [4, 8, 9, 10, 11, 12, 13])
-def test_what_odometry_cannot_tell_is_not_judged(unknown: int) -> None:
+def test_what_odometry_cannot_tell_is_not_checked(unknown: int) -> None:
     """The scale of odometry looks like the baseline, its point like the camera's place, its pairing like the clock."""
     found = SelfCalibration(np.eye(COMMON)[unknown], 1e-12 * np.eye(COMMON), 1)
     assert wrong(found, recorded(DRIVE, 0).rig, "twist") == []
 
 
-def test_the_error_that_is_told_has_what_sound_recordings_err_by_in_it() -> None:
+def test_the_error_that_is_reported_has_what_sound_recordings_err_by_in_it() -> None:
     rig = recorded(DRIVE, 0).rig
-    (told,) = wrong(SelfCalibration(0.2 * np.eye(COMMON)[0], 1e-12 * np.eye(COMMON), 1), rig, "twist")
-    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in told.summary
+    (reported,) = wrong(SelfCalibration(0.2 * np.eye(COMMON)[0], 1e-12 * np.eye(COMMON), 1), rig, "twist")
+    assert f"+- {0.03 * rig.fx_px * np.exp(0.2):.1f}" in reported.summary
 
 
 def test_of_a_long_drive_the_windows_that_turn_are_taken() -> None:

@@ -54,12 +54,12 @@ def test_a_part_of_a_sound_recording_warns_of_nothing(name: str, begin: int, end
     assert warnings_of(audit(part(name, begin, end))) == {}
 
 
-def test_a_disparity_that_is_off_is_told_on_a_shaken_imu() -> None:
-    said = warnings_of(audit(faults.stretched_disparity(part(GORE, 900, 1200), 1.1)))
-    assert "% shorter than the IMU's" in said["vision-scale"]
+def test_a_disparity_that_is_off_is_reported_on_a_shaken_imu() -> None:
+    reported = warnings_of(audit(faults.stretched_disparity(part(GORE, 900, 1200), 1.1)))
+    assert "% shorter than the IMU's" in reported["vision-scale"]
 
 
-def test_twists_whose_axes_are_turned_at_first_are_told_of_that_part() -> None:
+def test_twists_whose_axes_are_turned_at_first_are_reported_of_that_part() -> None:
     """The first 8 s of 03: velocities and rates of rotation alike are turned by 0.07 rad, and not from 15 s on."""
-    said = warnings_of(audit(part("ucsd/03.npz", 0, 80)))
-    assert "as if it were turned by 0.07" in said["miscalibration"]
+    reported = warnings_of(audit(part("ucsd/03.npz", 0, 80)))
+    assert "as if it were turned by 0.07" in reported["miscalibration"]

@@ -67,10 +67,10 @@ def test_the_longest_stretch_between_motion_gaps_is_kept(clean_recording: Make, 
 
 def test_a_gap_in_the_frames_alone_is_information(clean_recording: Make) -> None:
     clean = clean_recording()
-    kept = np.delete(np.arange(clean.frame_count), range(100, 104))
+    kept = np.delete(np.arange(clean.frame_count), range(70, 74))
     new_index = np.cumsum(np.isin(np.arange(clean.frame_count), kept)) - 1
     # Its tracks end at the gap, or they would be called back from an absence no frame shows.
-    observations = clean.observations.select(clean.observations.frame < 100)
+    observations = clean.observations.select(clean.observations.frame < 70)
     sequence = replace(
         clean,
         frames_t_ns=clean.frames_t_ns[kept],

@@ -250,12 +250,12 @@ def test_what_is_found_counts_beyond_what_sound_recordings_have(unknown: int, li
 
 def test_what_is_found_counts_beyond_four_standard_errors() -> None:
     rig = recorded(FLIGHT, 0).rig
-    for sigmas, told in ((3.9, 0), (4.1, 1)):
+    for sigmas, wanted in ((3.9, 0), (4.1, 1)):
         found = SelfCalibration((2.0 + sigmas) * np.eye(COMMON)[2], np.eye(COMMON), 1)
-        assert len(wrong(found, rig, "imu")) == told
+        assert len(wrong(found, rig, "imu")) == wanted
 
 
-def test_a_clock_is_judged_by_all_that_tracks_and_imu_tell() -> None:
+def test_a_clock_is_checked_by_all_that_tracks_and_imu_tell() -> None:
     """From rotations alone these five sound seconds have an offset of 7 ms, beyond five standard errors."""
     sound = simulate(replace(FLIGHT_REALISTIC, duration_s=5.0, varied=True), 501)
     assert "time-offset" not in {finding.fault for finding in audit(sound).findings}
@@ -283,12 +283,12 @@ def test_an_offset_between_chance_and_certainty_is_not_decidable() -> None:
     assert "frames look as if stamped late by 17 +- 5 ms" in outcome.undecided["time-offset"]
 
 
-def test_a_focal_length_beyond_chance_and_below_what_counts_is_said() -> None:
+def test_a_focal_length_beyond_chance_and_below_what_counts_is_reported() -> None:
     """Two percent on 6 s of a flight are eight standard errors, and double the error of what is estimated."""
     sound = simulate(replace(FLIGHT, duration_s=6.0, varied=True), 7301)
     assert "more than chance" not in audit(sound).undecided.get("miscalibration", "")
-    said = audit(faults.wrong_focal_length(sound, 1.02))
-    told = re.search(r"fit fx_px = (\S+) \+- (\S+), not", said.undecided["miscalibration"])
-    assert told is not None
-    assert float(told[1]) == pytest.approx(sound.rig.fx_px, abs=4.0 * float(told[2]))
-    assert "more than chance" in said.undecided["miscalibration"]
+    reported = audit(faults.wrong_focal_length(sound, 1.02))
+    match = re.search(r"fit fx_px = (\S+) \+- (\S+), not", reported.undecided["miscalibration"])
+    assert match is not None
+    assert float(match[1]) == pytest.approx(sound.rig.fx_px, abs=4.0 * float(match[2]))
+    assert "more than chance" in reported.undecided["miscalibration"]

@@ -28,24 +28,24 @@ def drive(seed: int, duration_s: float = 25.0, scenario: str = "drive") -> Seque
         (faults.wrong_focal_length, 0.97, -3.0),
     ],
 )
-def test_two_percent_of_scale_are_told_with_their_error(
+def test_two_percent_of_scale_are_reported_with_their_error(
     fault: Callable[[Sequence, float, int], Sequence], dose: float, percent: float, seed: int
 ) -> None:
     found = steady_difference.check(Evidence(fault(drive(seed), dose, seed)))
     assert isinstance(found, Symptom) and not found.harmful
-    told = re.search(r"steps are ([\d.]+) \+- ([\d.]+) % (longer|shorter)", found.detail)
-    assert told is not None and told[3] == ("longer" if percent > 0.0 else "shorter")
+    match = re.search(r"steps are ([\d.]+) \+- ([\d.]+) % (longer|shorter)", found.detail)
+    assert match is not None and match[3] == ("longer" if percent > 0.0 else "shorter")
     # The tracks' noise makes vision's steps up to half a percent longer.
-    assert float(told[1]) == pytest.approx(abs(percent), abs=0.6)
-    assert float(told[2]) < 0.6
+    assert float(match[1]) == pytest.approx(abs(percent), abs=0.6)
+    assert float(match[2]) < 0.6
 
 
 @pytest.mark.parametrize("seed", range(43, 47))
-def test_a_principal_point_that_is_12_px_off_is_told_by_the_direction(seed: int) -> None:
+def test_a_principal_point_that_is_12_px_off_is_reported_by_the_direction(seed: int) -> None:
     found = steady_difference.check(Evidence(faults.shifted_centre(drive(seed), 12.0, seed)))
     assert isinstance(found, Symptom)
-    told = re.search(r"which is (\d+) px of the principal point", found.detail)
-    assert told is not None and float(told[1]) == pytest.approx(12.0, abs=2.5)
+    match = re.search(r"which is (\d+) px of the principal point", found.detail)
+    assert match is not None and float(match[1]) == pytest.approx(12.0, abs=2.5)
 
 
 @pytest.mark.parametrize("scenario", ["drive", "drive-realistic"])

@@ -60,25 +60,27 @@ def test_a_truth_in_another_unit_is_named_and_not_taken_for_another_motion(
 
 @pytest.mark.parametrize("scale", [0.8, 1.25, 2.0])
 @pytest.mark.parametrize("recording", ["drive", "flight"])
-def test_a_wrong_baseline_is_told_with_its_size(recording: str, scale: float, request: pytest.FixtureRequest) -> None:
+def test_a_wrong_baseline_is_reported_with_its_size(
+    recording: str, scale: float, request: pytest.FixtureRequest
+) -> None:
     sound: Sequence = request.getfixturevalue(recording)
     wrong = replace(sound, rig=replace(sound.rig, baseline_m=scale * sound.rig.baseline_m))
     found = truth_mismatch.check(Evidence(wrong))
     assert isinstance(found, Symptom)
     assert found.warns and found.remedy is None
-    told = float(found.detail.split("steps are ")[1].split()[0])
+    reported = float(found.detail.split("steps are ")[1].split()[0])
     # what creeping and quantised disparities make of vision's scale on sound flights
-    assert told == pytest.approx(scale, rel=0.03)
+    assert reported == pytest.approx(scale, rel=0.03)
 
 
-def test_a_truth_that_runs_backwards_is_told(drive: Sequence) -> None:
+def test_a_truth_that_runs_backwards_is_reported(drive: Sequence) -> None:
     truth = truth_of(drive)
     found = with_truth(drive, Truth(truth.t_ns, truth.T_world_imu[::-1]))
     assert isinstance(found, Symptom)
     assert "but for one whose poses run backwards" in found.detail
 
 
-def test_a_truth_of_another_flight_is_told(flight: Sequence) -> None:
+def test_a_truth_of_another_flight_is_reported(flight: Sequence) -> None:
     """Of the same hall, later: speeds and turns are alike in size, and not in direction."""
     later = truth_of(simulate(replace(SCENARIOS["flight"], duration_s=3.0 * DURATION_S), 0))
     rows = later.t_ns > later.t_ns[0] + 2 * DURATION_S * NS_PER_S
@@ -91,24 +93,24 @@ def test_a_truth_of_another_flight_is_told(flight: Sequence) -> None:
 
 @pytest.mark.parametrize("late_s", [0.05, -0.2, 0.5])
 @pytest.mark.parametrize("scenario", ["flight", "drive", "drive-imu"])
-def test_a_truth_by_another_clock_is_told_with_its_offset(scenario: str, late_s: float) -> None:
+def test_a_truth_by_another_clock_is_reported_with_its_offset(scenario: str, late_s: float) -> None:
     sequence = simulate(replace(SCENARIOS[scenario], duration_s=12.0), 5)
     truth = truth_of(sequence)
     late = replace(truth, t_ns=truth.t_ns + round(late_s * NS_PER_S))
     symptom = with_truth(sequence, late)
     assert isinstance(symptom, Symptom)
     assert symptom.warns
-    told = re.search(r"the truth's stamps are shifted by (\S+) \+- (\S+) ms", symptom.detail)
-    assert told is not None
+    match = re.search(r"the truth's stamps are shifted by (\S+) \+- (\S+) ms", symptom.detail)
+    assert match is not None
     # Printed in whole milliseconds, with an error of less than one as 0.
-    assert float(told[1]) == pytest.approx(-1e3 * late_s, abs=4.0 * float(told[2]) + 2.0)
+    assert float(match[1]) == pytest.approx(-1e3 * late_s, abs=4.0 * float(match[2]) + 2.0)
 
 
 @pytest.mark.parametrize("recording", ["drive", "flight"])
-def test_a_truth_that_leaps_or_is_not_finite_is_told(recording: str, request: pytest.FixtureRequest) -> None:
+def test_a_truth_that_leaps_or_is_not_finite_is_reported(recording: str, request: pytest.FixtureRequest) -> None:
     sequence = request.getfixturevalue(recording)
     truth = truth_of(sequence)
-    for rows, added, told in (
+    for rows, added, expected in (
         (slice(len(truth.t_ns) // 2, None), 30.0, "leaps 1 time(s), the farthest by 30 m"),
         (slice(20, 21), 1e150, "leaps 2 time(s), the farthest by 1e+150 m"),
         (slice(20, 23), np.nan, "3 of"),
@@ -118,12 +120,12 @@ def test_a_truth_that_leaps_or_is_not_finite_is_told(recording: str, request: py
         symptom = with_truth(sequence, replace(truth, T_world_imu=T_world_imu))
         assert isinstance(symptom, Symptom)
         assert symptom.warns
-        assert told in symptom.detail
+        assert expected in symptom.detail
 
 
 @pytest.mark.parametrize("recording", ["drive", "flight"])
 @pytest.mark.parametrize("from_to", [(0, None), (40, None), (20, 65)])
-def test_a_truth_that_stands_still_while_the_camera_moves_is_told(
+def test_a_truth_that_stands_still_while_the_camera_moves_is_reported(
     recording: str, from_to: tuple[int, int | None], request: pytest.FixtureRequest
 ) -> None:
     """As a whole, from a time on, and for a time only, where it repeats a pose exactly."""
@@ -144,7 +146,7 @@ def test_a_truth_that_stands_with_the_vehicle_is_not_accused() -> None:
 
 
 @pytest.mark.parametrize("words", ["y and z exchanged (positions alone)", "the sign of y turned (positions alone)"])
-def test_a_truth_in_exchanged_axes_is_told_with_those(flight: Sequence, words: str) -> None:
+def test_a_truth_in_exchanged_axes_is_reported_with_those(flight: Sequence, words: str) -> None:
     truth = truth_of(flight)
     (exchange,) = (one for one in exchanges() if one.description == words)
     found = with_truth(flight, replace(truth, T_world_imu=exchange.reread(truth.T_world_imu)))
@@ -152,7 +154,7 @@ def test_a_truth_in_exchanged_axes_is_told_with_those(flight: Sequence, words: s
     assert f"but for one with {words}" in found.detail
 
 
-def test_a_truth_of_other_times_or_none_is_not_judged(drive: Sequence) -> None:
+def test_a_truth_of_other_times_or_none_is_not_checked(drive: Sequence) -> None:
     truth = truth_of(drive)
     assert with_truth(drive, None) is None
     elsewhen = Truth(truth.t_ns + 1000 * NS_PER_S, truth.T_world_imu)
@@ -162,7 +164,9 @@ def test_a_truth_of_other_times_or_none_is_not_judged(drive: Sequence) -> None:
 @pytest.mark.parametrize(
     ("name", "factor"), [("accel_noise_density", 1e3), ("gyro_noise_density", 1e3), ("accel_random_walk", 1e4)]
 )
-def test_a_thousand_times_the_noise_of_an_imu_is_told_by_its_name(flight: Sequence, name: str, factor: float) -> None:
+def test_a_thousand_times_the_noise_of_an_imu_is_reported_by_its_name(
+    flight: Sequence, name: str, factor: float
+) -> None:
     """A walk must be larger still: the motion of a flight hides it."""
     noise = flight.noise
     assert isinstance(noise, ImuNoise)

@@ -27,13 +27,13 @@ def with_frames_lost(sequence: Sequence) -> Sequence:
 
 @pytest.mark.parametrize("fault", [faults.alternate_frames_late, faults.frame_jitter])
 @pytest.mark.parametrize("scenario", SCENARIOS_OF)
-def test_stamps_that_the_cameras_motion_does_not_follow_are_told(scenario: str, fault: faults.Fault) -> None:
+def test_stamps_that_the_cameras_motion_does_not_follow_are_reported(scenario: str, fault: faults.Fault) -> None:
     found = uneven_stamps.check(Evidence(fault(simulated(scenario), 0.015, 3)))
     assert isinstance(found, Symptom) and found.warns
-    told = re.search(r"follows (\S+) \+- (\S+),", found.detail)
-    assert told is not None
+    match = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+    assert match is not None
     # None of it, and less: a stamp that is late lengthens one step and shortens the next by the same.
-    assert -0.5 < float(told[1]) < 0.1
+    assert -0.5 < float(match[1]) < 0.1
 
 
 @pytest.mark.parametrize("seed", [71, 72, 73])

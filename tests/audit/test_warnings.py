@@ -28,17 +28,17 @@ def test_a_sound_recording_warns_of_nothing(scenario: str, seed: int) -> None:
     assert [finding.fault for finding in findings] == ["correlated-tracks"] * ("realistic" in scenario)
 
 
-def test_a_conflict_is_told_at_its_time_and_of_its_size() -> None:
+def test_a_conflict_is_reported_at_its_time_and_of_its_size() -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 3)
     disturbed = faults.disturbed_motion(sound, 3.0, 3)
     off = np.flatnonzero(np.any(disturbed.motion.values != sound.motion.values, axis=1))
     begin_s, end_s = (disturbed.motion.t_ns[off[[0, -1]]] - sound.frames_t_ns[0]) / 1e9
     (found,) = (finding for finding in audit(disturbed).findings if finding.fault == "conflict")
-    told = re.search(r"at (\d+)-(\d+) s \(by ([\d.]+) m/s", found.detail)
-    assert told is not None
+    match = re.search(r"at (\d+)-(\d+) s \(by ([\d.]+) m/s", found.detail)
+    assert match is not None
     # Whole seconds, and a quarter of the stretch of 2 s at either end.
-    assert [float(told[1]), float(told[2])] == pytest.approx([begin_s, end_s], abs=1.0)
-    assert float(told[3]) == pytest.approx(3.0, abs=0.15)
+    assert [float(match[1]), float(match[2])] == pytest.approx([begin_s, end_s], abs=1.0)
+    assert float(match[3]) == pytest.approx(3.0, abs=0.15)
     assert found.warning and not found.blocking and not found.repaired
 
 
@@ -80,7 +80,7 @@ def test_the_turn_of_a_camera_is_measured_about_the_axes_that_the_motion_determi
     assert (np.abs(turn_of(T_imu_cam).rad) < 0.006).all()
 
 
-def test_a_turned_camera_is_told_on_five_seconds_of_a_drive() -> None:
+def test_a_turned_camera_is_reported_on_five_seconds_of_a_drive() -> None:
     """Three stretches as long as slip lasts tell little of their own scatter; what real odometry has helps them out."""
     sound = simulate(replace(SCENARIOS["drive"], duration_s=5.0), 2)
     assert "miscalibration" not in found_in(sound)
@@ -92,14 +92,14 @@ def found_in(sequence: Sequence) -> dict[str, str]:
     return {finding.fault: finding.detail for finding in audit(sequence).findings if not finding.repaired}
 
 
-def test_vision_that_is_too_long_beside_odometry_is_told_with_its_error() -> None:
+def test_vision_that_is_too_long_beside_odometry_is_reported_with_its_error() -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 4)
-    (said,) = found_in(faults.stretched_disparity(sound, 1.06)).values()
-    told = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", said)
-    assert told is not None
+    (reported,) = found_in(faults.stretched_disparity(sound, 1.06)).values()
+    match = re.search(r"vision's steps are ([\d.]+) \+- ([\d.]+) % shorter than the odometry's", reported)
+    assert match is not None
     # 1 - 1 / 1.06 is 5.7 %; the tracks' noise makes half a percent of bias.
-    assert float(told[1]) == pytest.approx(5.7, abs=1.0)
-    assert float(told[2]) < 0.6
+    assert float(match[1]) == pytest.approx(5.7, abs=1.0)
+    assert float(match[2]) < 0.6
 
 
 @pytest.mark.parametrize("seed", [515, 803])
@@ -111,7 +111,7 @@ def test_a_camera_in_its_place_is_not_accused_by_the_errors_that_last(seed: int)
     assert lever_arm.check(evidence) is None
 
 
-def test_a_camera_a_quarter_of_a_metre_from_its_place_is_told_beside_an_imu() -> None:
+def test_a_camera_a_quarter_of_a_metre_from_its_place_is_reported_beside_an_imu() -> None:
     sound = simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0), 102)
     assert isinstance(lever_arm.check(Evidence(faults.displaced_camera(sound, 0.25))), Symptom)
 
@@ -143,32 +143,32 @@ def test_a_scale_that_the_recording_hardly_shows_says_how_large_a_fault_it_hides
     assert "would not show" in audit(faults.stretched_disparity(sound, 1.02)).undecided["vision-scale"]
 
 
-def test_a_camera_that_is_elsewhere_is_told_and_one_that_hardly_turns_is_not_judged() -> None:
+def test_a_camera_that_is_elsewhere_is_reported_and_one_that_hardly_turns_is_not_checked() -> None:
     sound = simulate(replace(SCENARIOS["flight"], duration_s=12.0), 6)
     T_imu_cam = sound.rig.T_imu_cam.copy()
     T_imu_cam[1, 3] += 0.5
-    said = found_in(replace(sound, rig=replace(sound.rig, T_imu_cam=T_imu_cam)))
-    assert re.search(r"the camera is off by -0\.[45]\d \+- 0\.\d\d m along y", said["lever-arm"])
+    reported = found_in(replace(sound, rig=replace(sound.rig, T_imu_cam=T_imu_cam)))
+    assert re.search(r"the camera is off by -0\.[45]\d \+- 0\.\d\d m along y", reported["lever-arm"])
     straight = simulate(replace(SCENARIOS["drive-imu"], duration_s=6.0), 6)
     assert "too little rotation" in audit(straight).undecided["lever-arm"]
     assert "too little change of velocity" in audit(straight).undecided["vision-scale"]
 
 
-def test_tracks_that_scatter_more_than_their_noise_are_told_and_a_tenth_of_mismatches_is_not() -> None:
+def test_tracks_that_scatter_more_than_their_noise_are_reported_and_a_tenth_of_mismatches_is_not() -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=8.0), 7)
     assert set(found_in(faults.outlier_tracks(sound, 0.6, 7))) == {"track-scatter", "correlated-tracks"}
-    told = re.search(r"scatter ([\d.]+) \+-", found_in(faults.wrong_noise(sound, 1.0 / 3.0))["track-scatter"])
-    assert told is not None
-    assert float(told[1]) == pytest.approx(3.0, abs=0.1)
+    match = re.search(r"scatter ([\d.]+) \+-", found_in(faults.wrong_noise(sound, 1.0 / 3.0))["track-scatter"])
+    assert match is not None
+    assert float(match[1]) == pytest.approx(3.0, abs=0.1)
     assert found_in(faults.outlier_tracks(sound, 0.05, 7)) == {}
 
 
 @pytest.mark.parametrize(("scenario", "duration_s"), [("drive", 12.0), ("flight", 6.0)])
-def test_a_tenth_of_tracks_that_slide_is_told_where_the_noise_is_right(scenario: str, duration_s: float) -> None:
+def test_a_tenth_of_tracks_that_slide_is_reported_where_the_noise_is_right(scenario: str, duration_s: float) -> None:
     sound = simulate(replace(SCENARIOS[scenario], duration_s=duration_s), 9)
-    told = re.search(r"frame ([\d.]+)% \+- ([\d.]+)%", found_in(faults.outlier_tracks(sound, 0.1, 9))["track-scatter"])
-    assert told is not None
-    assert 1.0 < float(told[1]) < 10.0  # some slide by less than four standard deviations a frame
+    match = re.search(r"frame ([\d.]+)% \+- ([\d.]+)%", found_in(faults.outlier_tracks(sound, 0.1, 9))["track-scatter"])
+    assert match is not None
+    assert 1.0 < float(match[1]) < 10.0  # some slide by less than four standard deviations a frame
     # With twice the noise stated they are beneath it.
     beneath = scatter_of(faults.outlier_tracks(faults.wrong_noise(sound, 2.0), 0.1, 9))
     assert beneath is None or ("times too large" in beneath and "miss by more" not in beneath)
@@ -182,29 +182,29 @@ def scatter_of(sequence: Sequence) -> str | None:
 
 @pytest.mark.parametrize("scenario", ["drive", "flight", "drive-imu"])
 @pytest.mark.parametrize("seed", [11, 12])
-def test_a_pixel_noise_stated_too_large_or_too_small_is_told_with_its_ratio(scenario: str, seed: int) -> None:
+def test_a_pixel_noise_stated_too_large_or_too_small_is_reported_with_its_ratio(scenario: str, seed: int) -> None:
     sound = simulate(replace(SCENARIOS[scenario], duration_s=6.0), seed)
     assert scatter_of(sound) is None
     assert scatter_of(faults.wrong_noise(sound, 1.3)) is None
     for dose in (2.0, 5.0, 30.0):
-        told = re.search(r"stated ([\d.]+) times too large", scatter_of(faults.wrong_noise(sound, dose)) or "")
-        assert told is not None
-        assert float(told[1]) == pytest.approx(dose, rel=0.06)
-        told = re.search(r"stated ([\d.]+) times too small", scatter_of(faults.wrong_noise(sound, 1.0 / dose)) or "")
-        assert told is not None
-        assert float(told[1]) == pytest.approx(dose, rel=0.06)
+        match = re.search(r"stated ([\d.]+) times too large", scatter_of(faults.wrong_noise(sound, dose)) or "")
+        assert match is not None
+        assert float(match[1]) == pytest.approx(dose, rel=0.06)
+        match = re.search(r"stated ([\d.]+) times too small", scatter_of(faults.wrong_noise(sound, 1.0 / dose)) or "")
+        assert match is not None
+        assert float(match[1]) == pytest.approx(dose, rel=0.06)
 
 
-def test_of_tracks_whose_errors_go_together_only_a_noise_far_too_large_is_told_and_by_how_much_at_most() -> None:
+def test_of_tracks_whose_errors_go_together_only_a_noise_far_too_large_is_reported_and_by_how_much_at_most() -> None:
     """The steps of tracks that drift are smaller than their errors: 30 times too much looks like more."""
     sound = simulate(replace(SCENARIOS["flight-realistic"], duration_s=5.0), 11)
     assert scatter_of(sound) is None
-    told = re.search(r"by less than (\d+) times", scatter_of(faults.wrong_noise(sound, 30.0)) or "")
-    assert told is not None
-    assert float(told[1]) > 30.0
+    match = re.search(r"by less than (\d+) times", scatter_of(faults.wrong_noise(sound, 30.0)) or "")
+    assert match is not None
+    assert float(match[1]) > 30.0
 
 
-def test_half_a_pixel_that_is_assumed_and_too_much_is_told_for_information() -> None:
+def test_half_a_pixel_that_is_assumed_and_too_much_is_reported_for_information() -> None:
     """It is what the toolkit takes tracks to have of which nobody says more, and no fault of a recording."""
     sound = simulate(replace(SCENARIOS["drive"], duration_s=6.0), 11)
     sigma_px, assumed_px2 = 0.1, TRACKED_PIXEL_SIGMA_PX**2 * np.diag([1.0, 1.0, 0.5])
@@ -241,7 +241,7 @@ def exactly_seen(sequence: Sequence, T_world_cam: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("channels", "told"),
+    ("channels", "expected"),
     [
         ([0, 1, 2, 3, 5, 4], "the gyro's x, y, z are the extrinsic's x, z, y, which"),
         ([0, 1, 2, 5, 4, 3], "the gyro's x, y, z are the extrinsic's z, y, x, which"),
@@ -249,15 +249,15 @@ def exactly_seen(sequence: Sequence, T_world_cam: Array) -> Array:
     ],
 )
 def test_channels_that_are_exchanged_are_named_and_no_turn_of_the_extrinsic_is_taken(
-    channels: list[int], told: str
+    channels: list[int], expected: str
 ) -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
     exchanged = sound.motion.of(sound.motion.t_ns, sound.motion.values[:, channels])
-    said = found_in(replace(sound, motion=exchanged))["mixed-axes"]
-    assert told in said
+    reported = found_in(replace(sound, motion=exchanged))["mixed-axes"]
+    assert expected in reported
 
 
-def test_a_unit_that_holds_for_half_of_a_recording_is_told_and_not_converted() -> None:
+def test_a_unit_that_holds_for_half_of_a_recording_is_reported_and_not_converted() -> None:
     sound = simulate(replace(SCENARIOS["drive"], duration_s=12.0), 8)
     values = sound.motion.values.copy()
     values[len(values) // 2 :, 3:] *= 180.0 / np.pi
@@ -276,14 +276,14 @@ def test_feet_are_no_kilometres_an_hour() -> None:
 @pytest.mark.parametrize(
     ("scenario", "duration_s", "dose"), [("flight", 6.0, 1.1), ("drive-imu", 12.0, 1.05), ("drive", 12.0, 1.1)]
 )
-def test_a_gyro_that_turns_too_fast_is_told_with_the_ratio(
+def test_a_gyro_that_turns_too_fast_is_reported_with_the_ratio(
     scenario: str, duration_s: float, dose: float, seed: int
 ) -> None:
     sound = simulate(replace(SCENARIOS[scenario], duration_s=duration_s, varied=seed % 2 == 1), 60 + seed)
     assert "miscalibration" not in found_in(sound)
-    told = re.search(
+    match = re.search(
         r"turns ([\d.]+) \+- ([\d.]+) times as fast", found_in(faults.angular_unit(sound, dose))["miscalibration"]
     )
-    assert told is not None
+    assert match is not None
     # The noise of the camera's rotation lowers the ratio by up to 1.5 %.
-    assert float(told[1]) == pytest.approx(dose, abs=0.015 + 3.0 * float(told[2]))
+    assert float(match[1]) == pytest.approx(dose, abs=0.015 + 3.0 * float(match[2]))

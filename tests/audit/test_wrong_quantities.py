@@ -36,11 +36,11 @@ def test_missing_sightings_written_as_zeros_are_dropped_and_the_rest_stays_sound
     seen = drive().observations
     frame, track_id = (np.concatenate([part, part]) for part in (seen.frame, seen.track_id))
     zeros = Observations.sorted(frame, track_id, np.concatenate([seen.uv_px, np.zeros_like(seen.uv_px)]))
-    said = found(replace(drive(), observations=zeros))
-    assert said["swapped-coordinates"].repaired
-    assert not any(finding.blocking for finding in said.values())
-    assert "missing ones, written as 0" in said["swapped-coordinates"].detail
-    assert "with which the recording is another one" not in said["swapped-coordinates"].detail
+    reported = found(replace(drive(), observations=zeros))
+    assert reported["swapped-coordinates"].repaired
+    assert not any(finding.blocking for finding in reported.values())
+    assert "missing ones, written as 0" in reported["swapped-coordinates"].detail
+    assert "with which the recording is another one" not in reported["swapped-coordinates"].detail
 
 
 def test_one_camera_in_the_place_of_both_is_not_called_an_exchange() -> None:
@@ -75,17 +75,17 @@ def test_velocities_of_the_wrong_sign_block_with_their_angle() -> None:
 
 
 def test_odometry_that_is_zero_all_along_accuses_nothing_else() -> None:
-    said = found(with_twists(np.zeros_like(drive().motion.values)))
-    assert said["stuck-samples"].blocking
-    assert "velocities are zero while the camera moves" in said["stuck-samples"].detail
-    assert not said.keys() & {"mixed-axes", "extrinsic-translation", "disagreement", "lever-arm", "conflict"}
+    reported = found(with_twists(np.zeros_like(drive().motion.values)))
+    assert reported["stuck-samples"].blocking
+    assert "velocities are zero while the camera moves" in reported["stuck-samples"].detail
+    assert not reported.keys() & {"mixed-axes", "extrinsic-translation", "disagreement", "lever-arm", "conflict"}
 
 
 @pytest.mark.parametrize("factor", [3.45, 3.6])
 def test_a_speed_between_two_units_names_them(factor: float) -> None:
-    said = found(with_twists(drive().motion.values * np.repeat([factor, 1.0], 3)))
-    told = said["units"] if "units" in said else said["disagreement"]
-    assert "km/h" in told.detail
+    reported = found(with_twists(drive().motion.values * np.repeat([factor, 1.0], 3)))
+    messages = reported["units"] if "units" in reported else reported["disagreement"]
+    assert "km/h" in messages.detail
 
 
 def test_a_speed_in_knots_is_named_and_not_converted() -> None:
@@ -103,15 +103,15 @@ def test_rates_in_turns_a_minute_are_named_and_not_converted() -> None:
 @pytest.mark.parametrize("factor", [10.0, 1.0 / 60.0])
 def test_stamps_in_another_unit_than_seconds_accuse_neither_speeds_nor_axes(factor: float) -> None:
     t_ns = drive().frames_t_ns[0] + np.rint((drive().frames_t_ns - drive().frames_t_ns[0]) * factor).astype(np.int64)
-    said = found(replace(drive(), frames_t_ns=t_ns, motion=drive().motion.of(t_ns, drive().motion.values)))
-    assert said["units"].blocking
-    told = re.search(r"in the stamps time passes (\S+) times as fast", said["units"].detail)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(factor, rel=0.02)
-    assert not said.keys() & {"mixed-axes", "disagreement", "lever-arm", "conflict"}
+    reported = found(replace(drive(), frames_t_ns=t_ns, motion=drive().motion.of(t_ns, drive().motion.values)))
+    assert reported["units"].blocking
+    match = re.search(r"in the stamps time passes (\S+) times as fast", reported["units"].detail)
+    assert match is not None
+    assert float(match[1]) == pytest.approx(factor, rel=0.02)
+    assert not reported.keys() & {"mixed-axes", "disagreement", "lever-arm", "conflict"}
 
 
-def test_stamps_rounded_to_seconds_are_told_to_be_rounded() -> None:
+def test_stamps_rounded_to_seconds_are_reported_to_be_rounded() -> None:
     t_ns = np.asarray(np.round(drive().frames_t_ns / 1e9) * 1e9, dtype=np.int64)
     finding = found(replace(drive(), frames_t_ns=t_ns, motion=drive().motion.of(t_ns, drive().motion.values)))
     assert finding["time-order"].blocking
@@ -123,26 +123,26 @@ def test_missing_sightings_written_as_one_value_are_no_camera_in_the_place_of_bo
     seen = drive().observations
     frame, track_id = (np.concatenate([part, part]) for part in (seen.frame, seen.track_id))
     pixels = np.concatenate([seen.uv_px, np.full_like(seen.uv_px, filler)])
-    said = found(replace(drive(), observations=Observations.sorted(frame, track_id, pixels)))
-    assert said["swapped-coordinates"].repaired
-    assert f"missing ones, written as {filler:g}" in said["swapped-coordinates"].detail
+    reported = found(replace(drive(), observations=Observations.sorted(frame, track_id, pixels)))
+    assert reported["swapped-coordinates"].repaired
+    assert f"missing ones, written as {filler:g}" in reported["swapped-coordinates"].detail
 
 
-def test_velocities_or_rates_that_are_zero_all_along_are_told_apart() -> None:
+def test_velocities_or_rates_that_are_zero_all_along_are_distinguished() -> None:
     for columns, words in (([1.0, 0.0], "rates of rotation are zero"), ([0.0, 1.0], "velocities are zero")):
-        said = found(with_twists(drive().motion.values * np.repeat(columns, 3)))
-        assert said["stuck-samples"].blocking
-        assert words in said["stuck-samples"].detail
-        assert not said.keys() & {"mixed-axes", "disagreement", "lever-arm", "conflict"}
+        reported = found(with_twists(drive().motion.values * np.repeat(columns, 3)))
+        assert reported["stuck-samples"].blocking
+        assert words in reported["stuck-samples"].detail
+        assert not reported.keys() & {"mixed-axes", "disagreement", "lever-arm", "conflict"}
 
 
-def test_a_column_of_nan_is_named_and_no_sample_is_said_to_be_zero() -> None:
+def test_a_column_of_nan_is_named_and_no_sample_is_reported_to_be_zero() -> None:
     values = drive().motion.values.copy()
     values[:, 1] = np.nan
-    said = found(with_twists(values))
-    assert said["not-finite"].blocking
-    assert "velocity y in all of them" in said["not-finite"].detail
-    assert not said.keys() & {"stuck-samples", "outside-motion", "units"}
+    reported = found(with_twists(values))
+    assert reported["not-finite"].blocking
+    assert "velocity y in all of them" in reported["not-finite"].detail
+    assert not reported.keys() & {"stuck-samples", "outside-motion", "units"}
 
 
 def test_images_exchanged_for_a_time_come_back_as_they_were() -> None:

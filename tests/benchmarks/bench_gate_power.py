@@ -139,7 +139,7 @@ def drawn_checks(every: list[Column], size: Size, planted: tuple[str, str]) -> t
     )
 
 
-def told(rates: Table) -> str:
+def reported(rates: Table) -> str:
     """Return a rate with its interval, in percent."""
     low, high = np.percentile(rates, [2.5, 97.5])
     return f"{100.0 * np.mean(rates):5.1f} [{100.0 * low:3.0f}, {100.0 * high:3.0f}]"
@@ -161,7 +161,7 @@ def print_rates(pool: list[dict[str, Any]], tests: int, seeds: int) -> None:
             if any(_moves(column, plant) for column in of_it):
                 _print_row(f"{plant}, {name}", every, size, (name, plant))
     for name in names:
-        print(f"{gate_pool.MEAN_ATE}, {name}: {_changed(every, name) or 'not told as a changed metric'}")
+        print(f"{gate_pool.MEAN_ATE}, {name}: {_changed(every, name) or 'not reported as a changed metric'}")
 
 
 def _moves(column: Column, plant: str) -> bool:
@@ -173,7 +173,7 @@ def _moves(column: Column, plant: str) -> bool:
 
 def _print_row(what: str, every: list[Column], size: Size, planted: tuple[str, str]) -> None:
     fails = drawn_checks(every, size, planted)
-    cells = [told(np.asarray(one.any(axis=-1).mean(axis=-1))) for one in fails]
+    cells = [reported(np.asarray(one.any(axis=-1).mean(axis=-1))) for one in fails]
     print(f"{what:<38}" + "".join(f"{cell:>22}" for cell in cells), flush=True)
 
 

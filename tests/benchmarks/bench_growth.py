@@ -94,8 +94,11 @@ def measure(name: str) -> None:
             scale = 1e3 / sequence.frame_count if growth.per_frame else 1.0
             costs.append(scale * timed.cpu_s)
             memory.append(max((timed.peak_rss_mb or 0.0) - (least.peak_rss_mb or 0.0), 0.0))
-        told = "  ".join(f"{cost:7.2f}" for cost in costs), "  ".join(f"{mb:5.0f}" for mb in memory)
-        print(f"  {estimator:<12}{told[0]} | {told[1]} | time ~ n^{exponent(growth.values, costs):.2f}", flush=True)
+        reported = "  ".join(f"{cost:7.2f}" for cost in costs), "  ".join(f"{mb:5.0f}" for mb in memory)
+        print(
+            f"  {estimator:<12}{reported[0]} | {reported[1]} | time ~ n^{exponent(growth.values, costs):.2f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

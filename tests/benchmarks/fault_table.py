@@ -47,7 +47,7 @@ class Ended:
     """How one run ended: its error (m) or None, and whether it says that something is wrong."""
 
     ate_m: float | None
-    told: bool
+    reported: bool
 
 
 def ended(sequence: Sequence, estimators: tuple[str, ...], usual: frozenset[str]) -> dict[str, Ended]:
@@ -55,7 +55,7 @@ def ended(sequence: Sequence, estimators: tuple[str, ...], usual: frozenset[str]
     try:
         comparison = toolkit.compare(sequence, estimators).comparison
     except VislamError:  # refused, in words
-        return dict.fromkeys(estimators, Ended(None, told=True))
+        return dict.fromkeys(estimators, Ended(None, reported=True))
     found = _telling(comparison.findings) - usual
     rows = {row.estimator: row for row in comparison.rows}  # the final one stays
     return {
@@ -72,12 +72,12 @@ def _telling(findings: Iterable[Finding]) -> frozenset[str]:
 def cell(now: Ended, clean: Ended) -> str:
     """Return the ratio of the errors, in brackets where the run says that something is wrong."""
     ratio = "-" if now.ate_m is None or not clean.ate_m else f"{now.ate_m / clean.ate_m:.1f}"
-    return f"[{ratio}]" if now.told else ratio
+    return f"[{ratio}]" if now.reported else ratio
 
 
 def is_silent(now: Ended, clean: Ended, limit: float) -> bool:
     """Say whether a run is worse than the limit allows, or without a result, and says nothing."""
-    return not now.told and (now.ate_m is None or (clean.ate_m is not None and now.ate_m > limit * clean.ate_m))
+    return not now.reported and (now.ate_m is None or (clean.ate_m is not None and now.ate_m > limit * clean.ate_m))
 
 
 def print_table(sequence: Sequence, wanted: argparse.Namespace) -> tuple[int, int]:

@@ -99,7 +99,7 @@ def simulated(options: argparse.Namespace) -> None:
     policies = [REFERENCE, *(policy for policy in options.policies if policy != REFERENCE)]
     estimators, seeds = options.estimators, range(FIRST_SEED, FIRST_SEED + options.seeds)
     everything: dict[str, list[Array]] = {}
-    told: dict[str, dict[str, list[float]]] = {}
+    reported: dict[str, dict[str, list[float]]] = {}
     for scene in options.scenarios:
         scenario, duration_s = SCENARIOS[scene]
         duration_s = options.duration or duration_s
@@ -115,14 +115,14 @@ def simulated(options: argparse.Namespace) -> None:
                 over = np.mean(list(per.values()), axis=0)
                 print(f"  {policy:28s} {'all':12s} {with_error(over)}   {bad} ended badly", flush=True)
                 everything.setdefault(policy, []).append(over)
-                told[f"{scene} {rate:g} {policy}"] = {name: d.tolist() for name, d in per.items()}
+                reported[f"{scene} {rate:g} {policy}"] = {name: d.tolist() for name, d in per.items()}
             bad = sum(r.status != "ok" for seed in found for r in seed if r.policy == REFERENCE)
             print(f"  {REFERENCE:28s} {'all':12s} {bad} ended badly", flush=True)
     print("\nmean over scenarios, rates and estimators")
     for policy, parts in everything.items():
         print(f"  {policy:28s} {with_error(np.mean(parts, axis=0))}")
     if options.out is not None:
-        options.out.write_text(json.dumps(told, indent=1) + "\n")
+        options.out.write_text(json.dumps(reported, indent=1) + "\n")
 
 
 def recorded(options: argparse.Namespace) -> None:

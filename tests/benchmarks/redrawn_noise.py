@@ -37,7 +37,7 @@ from toolkit.simulation.sensors import Imu, ImuStamps, measure_imu
 from toolkit.simulation.trajectory import FreeTrajectory, RotationSpline, UniformKnots, VectorSpline, blending_matrix
 
 IMU_HZ, START_BIAS_SIGMA = 400.0, np.repeat([1e-3, 1e-4], 3)
-MARGIN, FITTING_STEPS, RELATIVE_FRAMES, FIRST_JUDGED = 6, 60, 50, 100
+MARGIN, FITTING_STEPS, RELATIVE_FRAMES, FIRST_CHECKED = 6, 60, 50, 100
 NAMES = ("stated heading", "stated position", "ATE yaw", "over 5 s", "NEES heading", "CPU ms")
 
 
@@ -135,18 +135,18 @@ def redrawn(world: World, seed: int) -> Sequence:
     )
 
 
-def figures(sequence: Sequence, said: Trajectory, cpu_s: float) -> Array:
+def figures(sequence: Sequence, reported: Trajectory, cpu_s: float) -> Array:
     """Return the figures that NAMES has, logarithms but for the last two."""
-    assert sequence.truth is not None and said.cov is not None
-    truth, own, count = sequence.truth.T_world_imu[: len(said.t_ns)], said.T_world_imu, len(said.t_ns)
+    assert sequence.truth is not None and reported.cov is not None
+    truth, own, count = sequence.truth.T_world_imu[: len(reported.t_ns)], reported.T_world_imu, len(reported.t_ns)
     attitude = own[:, :3, :3]
-    heading_var = (attitude @ said.cov[:, :3, :3] @ np.swapaxes(attitude, 1, 2))[:, 2, 2]
+    heading_var = (attitude @ reported.cov[:, :3, :3] @ np.swapaxes(attitude, 1, 2))[:, 2, 2]
     turned = attitude @ np.swapaxes(truth[:, :3, :3], 1, 2)
     heading = np.unwrap(np.arctan2(turned[:, 1, 0] - turned[:, 0, 1], turned[:, 0, 0] + turned[:, 1, 1]))
-    nees = ((heading - heading[0]) ** 2 / heading_var)[FIRST_JUDGED::RELATIVE_FRAMES].mean()
-    position_var = np.trace(said.cov[FIRST_JUDGED:, 3:6, 3:6], axis1=1, axis2=2).mean()
+    nees = ((heading - heading[0]) ** 2 / heading_var)[FIRST_CHECKED::RELATIVE_FRAMES].mean()
+    position_var = np.trace(reported.cov[FIRST_CHECKED:, 3:6, 3:6], axis1=1, axis2=2).mean()
     off = fit_yaw(truth[:, :3, 3], own[:, :3, 3]).apply(own)[:, :3, 3] - truth[:, :3, 3]
-    k = np.arange(FIRST_JUDGED, count - RELATIVE_FRAMES, 10)
+    k = np.arange(FIRST_CHECKED, count - RELATIVE_FRAMES, 10)
     moved, claimed = (se3_inverse(T[k]) @ T[k + RELATIVE_FRAMES] for T in (truth, own))
     over_5_s = (se3_log(se3_inverse(moved) @ claimed)[:, 3:] ** 2).sum(axis=1).mean()
     logs = 0.5 * np.log([heading_var[-1], position_var, (off**2).sum(axis=1).mean(), over_5_s])

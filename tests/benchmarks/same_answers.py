@@ -148,9 +148,9 @@ def print_comparison(old: Answers, new: Answers, wanted: argparse.Namespace) -> 
             beyond = [kind for kind, found in kinds.items() if not found.relative <= wanted.tolerance]
             failed = str(before.get("status")) == "failed"  # then there is nothing to compare
             agree = agree and not beyond and not failed
-            told = [f"{kind} {d.absolute:.1e} ({d.relative:.1e})" for kind, d in kinds.items() if d.absolute > 0.0]
-            verdict = "FAILED " if failed else "DIFFERS" if beyond else "agrees " if told else "same   "
-            print(f"{verdict} {sequence:<10} {estimator:<15} {', '.join(told)}", flush=True)
+            reported = [f"{kind} {d.absolute:.1e} ({d.relative:.1e})" for kind, d in kinds.items() if d.absolute > 0.0]
+            verdict = "FAILED " if failed else "DIFFERS" if beyond else "agrees " if reported else "same   "
+            print(f"{verdict} {sequence:<10} {estimator:<15} {', '.join(reported)}", flush=True)
             for key in [k for k in before if "/metrics/" in k] if "metrics" in beyond else []:
                 now = answers_of(new, sequence, estimator).get(key, "absent")
                 if now == "absent" or difference("metrics", before[key], now).relative > wanted.tolerance:

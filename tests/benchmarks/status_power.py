@@ -174,7 +174,7 @@ class Ended:
     disputes: bool = False
 
     @property
-    def is_told(self) -> bool:
+    def is_reported(self) -> bool:
         """Say whether its status, its mark, a note, or the audit tells of a fault."""
         by_mark, by_notes = self.mark in TELLING_MARKS, self.refuses or self.harms or self.disputes
         return bool(self.found) or self.status != "ok" or by_mark or by_notes
@@ -182,7 +182,7 @@ class Ended:
     @property
     def is_alarm(self) -> bool:
         """Say whether anything but ``ok`` is said."""
-        return self.is_told or bool(self.mark)
+        return self.is_reported or bool(self.mark)
 
 
 def is_bad(run: Ended, sound: Ended) -> bool:
@@ -331,24 +331,24 @@ def print_table(lines: list[Ended]) -> bool:
     sound = {(one.recording, one.seed, one.estimator): one for one in lines if one.fault == SOUND}
     pairs = [(one, sound.get((one.recording, one.seed, one.estimator))) for one in lines if one.fault != SOUND]
     bad = [one for one, clean in pairs if clean is not None and is_bad(one, clean)]
-    told, alarms = [one for one in bad if one.is_told], [one for one in sound.values() if one.is_alarm]
+    reported, alarms = [one for one in bad if one.is_reported], [one for one in sound.values() if one.is_alarm]
     harmless = [one for one, clean in pairs if clean is not None and not is_bad(one, clean)]
-    print(f"{len(pairs)} faulty runs, {len(bad)} bad: {len(told)} of them say so ({_percent(told, bad)})")
+    print(f"{len(pairs)} faulty runs, {len(bad)} bad: {len(reported)} of them say so ({_percent(reported, bad)})")
     print(f"{len(sound)} sound runs: {len(alarms)} raise a false alarm ({_percent(alarms, sound)})")
-    warned = [one for one in harmless if one.is_told]
+    warned = [one for one in harmless if one.is_reported]
     print(f"{len(harmless)} runs that a fault cost less: {len(warned)} tell of it ({_percent(warned, harmless)})")
-    by = Counter(_first_to_tell(one) for one in told)
+    by = Counter(_first_to_tell(one) for one in reported)
     print(f"what says so first of audit, status, mark, gate and comparison: {dict(by)}")
     for key in ("estimator", "fault"):
         for name in sorted({getattr(one, key) for one in bad}):
             of_name = [one for one in bad if getattr(one, key) == name]
-            print(f"{name:<24} bad {len(of_name):>3}, silent {sum(not one.is_told for one in of_name):>3}")
-    for one in (*(one for one in bad if not one.is_told), *alarms):
+            print(f"{name:<24} bad {len(of_name):>3}, silent {sum(not one.is_reported for one in of_name):>3}")
+    for one in (*(one for one in bad if not one.is_reported), *alarms):
         what = "false alarm" if one.fault == SOUND else f"silent: {one.fault}"
         print(
             f"{what}, {one.recording} {one.seed}, {one.estimator}: {one.error_m} m, {one.status} {one.mark} {one.found}"
         )
-    return len(told) >= 0.95 * len(bad) and len(alarms) <= 0.02 * len(sound)
+    return len(reported) >= 0.95 * len(bad) and len(alarms) <= 0.02 * len(sound)
 
 
 def _first_to_tell(run: Ended) -> str:

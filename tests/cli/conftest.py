@@ -58,9 +58,9 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> OneLine:
     """Return a function that returns what was told on stderr, which must be an error in one line."""
 
     def read() -> str:
-        told = capsys.readouterr().err
-        assert told.startswith("vislam: error: ")
-        assert told.count("\n") == 1
-        return told
+        messages = capsys.readouterr().err
+        assert messages.startswith("vislam: error: ")
+        assert messages.count("\n") == 1
+        return messages
 
     return read

@@ -68,14 +68,14 @@ def test_a_run_directory_stands_for_what_it_compared(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [(None, "no estimator or format is called mscf"), ('CITES = ("li2013hihg",)', "did you mean li2013high?")],
 )
-def test_what_is_unknown_is_told_in_one_line(tmp_path, monkeypatch, capsys, text, told) -> None:
+def test_what_is_unknown_is_reported_in_one_line(tmp_path, monkeypatch, capsys, text, expected) -> None:
     monkeypatch.chdir(tmp_path)
     if text is not None:
         Path("mine.py").write_text(text)
     assert main(["cite", "mscf" if text is None else "mine.py"]) == 5
-    said = capsys.readouterr().err
-    assert told in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert expected in printed
+    assert printed.count("\n") == 1

@@ -78,10 +78,10 @@ def test_check_data_fails_on_a_fault_that_stays(
     finding = Finding("time-gap", 2, repaired, "two frames are 3 s apart", blocking)
     monkeypatch.setattr(recording, "audit", lambda sequence, _keep: Audit(sequence, (finding,)))
     assert vislam("check-data", "drive") == status
-    told = capsys.readouterr().out
-    assert "time-gap" in told
-    assert finding.detail in told
-    assert ("not repaired" in told) == blocking
+    messages = capsys.readouterr().out
+    assert "time-gap" in messages
+    assert finding.detail in messages
+    assert ("not repaired" in messages) == blocking
 
 
 def test_check_data_says_what_was_done_to_read_the_recording(
@@ -91,8 +91,8 @@ def test_check_data_says_what_was_done_to_read_the_recording(
     assert vislam("simulate", "flight", "--images", "--duration", "0.4", "--out", "film") == 0
     sorted(Path("film/mav0/cam0/data").iterdir())[3].write_bytes(b"")
     vislam("check-data", "film")
-    assert "facts: " in (told := capsys.readouterr().out)
-    assert "1 of 9 image pairs could not be used and are left out" in " ".join(told.split())
+    assert "facts: " in (messages := capsys.readouterr().out)
+    assert "1 of 9 image pairs could not be used and are left out" in " ".join(messages.split())
 
 
 def test_keep_reaches_the_audit(vislam: Vislam, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,7 +121,7 @@ def test_directory_names_are_plain_and_differ() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "told"),
+    ("requested", "expected"),
     [
         (["--lens", "radtan"], "--lens is of images; add --images"),
         (["--images", "--blur", "50"], "expected milliseconds from 0 to 40"),
@@ -129,10 +129,10 @@ def test_directory_names_are_plain_and_differ() -> None:
     ],
 )
 def test_what_images_cannot_be_is_a_line(
-    vislam: Vislam, capsys: pytest.CaptureFixture[str], asked: list[str], told: str
+    vislam: Vislam, capsys: pytest.CaptureFixture[str], requested: list[str], expected: str
 ) -> None:
-    assert vislam("simulate", "flight", "--out", "filmed", *asked) == 2
-    assert told in capsys.readouterr().err
+    assert vislam("simulate", "flight", "--out", "filmed", *requested) == 2
+    assert expected in capsys.readouterr().err
     assert not Path("filmed").exists()
 
 

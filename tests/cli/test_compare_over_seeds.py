@@ -21,9 +21,9 @@ def test_a_run_directory_over_seeds(
 ) -> None:
     monkeypatch.setattr(progress, "LOG_EVERY_S", float("inf"))  # work that is soon done leaves no line
     assert vislam("compare", "drive", *QUICK, "--seeds", "3", "--seed", "1", "--workers", "1", "--out", "run") == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert "results: run\n" in told.out
+    messages = capsys.readouterr()
+    assert messages.err == ""
+    assert "results: run\n" in messages.out
     document = read_seeds(Path("run/seeds.json"))
     assert document.seeds == (1, 2, 3)
     assert len(set(document.hashes)) == 3
@@ -56,7 +56,7 @@ RECORDING = str(Path(__file__).parents[2] / "data" / "drive_small")
         (("drive", "--workers", "2", "--scheduler", "tcp://host:8786"), 2, "exclude each other"),
     ],
 )
-def test_what_cannot_be_repeated_is_told_before_anything_runs(
+def test_what_cannot_be_repeated_is_reported_before_anything_runs(
     vislam: Vislam, one_line: OneLine, words: tuple[str, ...], status: int, why: str
 ) -> None:
     if words[0] == "drive" and "--truth" in words:

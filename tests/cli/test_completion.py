@@ -17,8 +17,8 @@ def completed(text: str, *words: str) -> list[str]:
     """Return what bash offers for the last of the words."""
     line = " ".join(f"'{word}'" for word in words)
     program = f"{text}\nCOMP_WORDS=(vislam {line}); COMP_CWORD={len(words)}; _vislam; echo ${{COMPREPLY[@]}}"
-    told = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
-    return told.stdout.split()
+    messages = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    return messages.stdout.split()
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")

@@ -45,24 +45,24 @@ def test_a_file_says_what_is_compared_and_with_which_settings(vislam: Vislam) ->
         '[compare]\nsequences = ["drive-imu"]\nestimators = ["dead-reckoning"]\nmax_frames = 8\nkeep = ["time-gap"]\n'
     )
     assert vislam("compare", "--config", "run.toml", "--out", "run") == 0
-    told = manifest()
-    assert (told["sequence"]["name"], told["estimators"], told["seeds"]) == (
+    document = manifest()
+    assert (document["sequence"]["name"], document["estimators"], document["seeds"]) == (
         "drive-imu",
         ["dead-reckoning"],
         {"sequence": 7},
     )
-    assert "truth" in told["start"]
-    assert told["settings"]["window"]["lag_s"] == 3.0
-    assert told["settings"]["noise"]["pixel_sigma_px"] == 0.7
-    assert (told["compare"]["max_frames"], told["compare"]["keep"]) == (8, ["time-gap"])
+    assert "truth" in document["start"]
+    assert document["settings"]["window"]["lag_s"] == 3.0
+    assert document["settings"]["noise"]["pixel_sigma_px"] == 0.7
+    assert (document["compare"]["max_frames"], document["compare"]["keep"]) == (8, ["time-gap"])
     assert json.loads(Path("run/metrics.json").read_text())["sequence"]["frames"] == 8
 
 
 def test_a_policy_is_named_whole_and_single_settings_go_on_top_of_it(vislam: Vislam) -> None:
     words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK)
     assert vislam(*words, "--outliers", "none", "--set", "outliers.filter_huber=3", "--out", "one") == 0
-    told = json.loads(Path("one/manifest.json").read_text())["settings"]["outliers"]
-    assert (told["policy"], told["gate_probability"], told["filter_huber"]) == ("none", None, 3.0)
+    document = json.loads(Path("one/manifest.json").read_text())["settings"]["outliers"]
+    assert (document["policy"], document["gate_probability"], document["filter_huber"]) == ("none", None, 3.0)
     again = (
         "compare",
         "--config",
@@ -92,12 +92,12 @@ def test_the_command_line_goes_before_set_and_set_before_the_file(vislam: Vislam
     words = ("drive", "--estimators", "dead-reckoning", "--max-frames", "5", "--seed", "2", "--start", "measurements")
     given = ("--set", "window.lag_s=4", "--set", "first_seed=9", "--set", "start=truth")
     assert vislam("compare", "--config", "run.toml", *words, *given, "--out", "run") == 0
-    told = manifest()
-    settings = told["settings"]
+    document = manifest()
+    settings = document["settings"]
     assert (settings["window"]["lag_s"], settings["window"]["most_states"]) == (4.0, 9)
     assert (settings["first_seed"], settings["start"]) == (2, "measurements")
-    assert (told["compare"]["sequences"], told["compare"]["estimators"]) == (["drive"], ["dead-reckoning"])
-    assert told["compare"]["max_frames"] == 5
+    assert (document["compare"]["sequences"], document["compare"]["estimators"]) == (["drive"], ["dead-reckoning"])
+    assert document["compare"]["max_frames"] == 5
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_setting_that_does_not_exist_is_2_in_one_line_before_anything_runs(
     assert not Path("run").exists()
 
 
-def test_an_option_that_an_estimator_does_not_have_is_told_before_anything_runs(
+def test_an_option_that_an_estimator_does_not_have_is_reported_before_anything_runs(
     vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "run", None)
@@ -149,9 +149,9 @@ def test_a_run_is_repeated_from_its_manifest(vislam: Vislam) -> None:
     assert vislam("compare", "--config", "once/manifest.json", "--out", "again") == 0
     assert metrics("again") == metrics("once")
     once, again = manifest("once"), manifest("again")
-    for told in (once, again):
+    for expected in (once, again):
         for key in ("command", "date", "threads"):
-            del told[key]
+            del expected[key]
     assert again == once
 
 
@@ -175,12 +175,12 @@ def test_without_words_the_default_sequences_and_estimators_are_compared(vislam:
         assert manifest(f"run/{sequence}")["estimators"] == list(defaults())
 
 
-def table(told: str) -> list[str]:
+def table(reported: str) -> list[str]:
     """Return the lines of a printed table, its headings with it."""
-    return told.partition("start:")[0].partition("\n\n")[2].strip().splitlines()
+    return reported.partition("start:")[0].partition("\n\n")[2].strip().splitlines()
 
 
-def test_columns_are_those_asked_for(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
+def test_columns_are_those_requested(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("compare", "drive", "--estimators", "dead-reckoning", *QUICK, "--out", "run")
     assert vislam(*words, "--columns", "ate_sim3_m,NIS mean") == 0
     heads = [line.split() for line in table(capsys.readouterr().out)[:2]]

@@ -112,7 +112,7 @@ def test_a_reader_that_goes_away_is_no_trouble() -> None:
     read_end, write_end = os.pipe()
     os.close(read_end)
     with os.fdopen(write_end, "w") as closed_pipe:
-        told = subprocess.run(
+        messages = subprocess.run(
             [sys.executable, "-m", "toolkit.cli", "list"],
             stdout=closed_pipe,
             stderr=subprocess.PIPE,
@@ -120,25 +120,25 @@ def test_a_reader_that_goes_away_is_no_trouble() -> None:
             check=False,
             timeout=PATIENCE_S,
         )
-    assert told.stderr == ""
-    assert told.returncode == 141
+    assert messages.stderr == ""
+    assert messages.returncode == 141
 
 
 def test_nothing_but_results_is_written_when_all_is_well(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:
     assert vislam(*QUICK, "--out", "run") == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert "results: run\n" in told.out
+    messages = capsys.readouterr()
+    assert messages.err == ""
+    assert "results: run\n" in messages.out
     assert [path.name for path in Path().iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize("words", [("list",), ("--help",), ("--version",), ("compare", "--help")])
 def test_an_output_on_a_full_disk_is_4_in_one_line(words: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
-        told = _vislam(*words, stdout=full)
-    assert told.stderr.startswith("vislam: error: the standard output cannot be written")
-    assert told.stderr.count("\n") == 1
-    assert told.returncode == 4
+        messages = _vislam(*words, stdout=full)
+    assert messages.stderr.startswith("vislam: error: the standard output cannot be written")
+    assert messages.stderr.count("\n") == 1
+    assert messages.returncode == 4
 
 
 def test_closed_streams_are_no_trouble() -> None:
@@ -153,7 +153,7 @@ def test_closed_streams_are_no_trouble_to_processes_either(closed: str, tmp_path
     assert subprocess.run(["sh", "-c", program], cwd=tmp_path, check=False, timeout=PATIENCE_S).returncode == 0
 
 
-def test_a_directory_that_is_gone_is_told(vislam: Vislam, one_line: OneLine) -> None:
+def test_a_directory_that_is_gone_is_reported(vislam: Vislam, one_line: OneLine) -> None:
     Path("gone").mkdir()
     os.chdir("gone")
     Path("../gone").rmdir()
@@ -166,10 +166,10 @@ def test_a_full_shared_memory_is_not_taken_for_a_full_output(
 ) -> None:
     monkeypatch.setattr(workers, "_executor", _raiser(OSError(28, "No space left on device")))
     assert vislam(*QUICK[:-1], "2", "--out", "run") == 71
-    told = one_line()
-    assert "no worker process can be started (No space left on device)" in told
-    assert "/dev/shm" in told
-    assert "--workers 1" in told
+    messages = one_line()
+    assert "no worker process can be started (No space left on device)" in messages
+    assert "/dev/shm" in messages
+    assert "--workers 1" in messages
 
 
 @pytest.mark.parametrize("kilobytes", [150_000, 200_000, 260_000])
@@ -177,10 +177,10 @@ def test_too_little_memory_for_the_libraries_is_71_in_one_line_at_once(kilobytes
     program = f"ulimit -v {kilobytes}; exec {sys.executable} -m toolkit.cli list"
     environment = {name: value for name, value in os.environ.items() if name not in THREAD_VARIABLES}
     how = {"capture_output": True, "text": True, "env": environment, "timeout": PATIENCE_S}
-    told = subprocess.run(["sh", "-c", program], check=False, **how)
-    assert told.returncode == 71
-    assert "MB (ulimit -v), and NumPy, SciPy and GTSAM alone take 307 MB" in told.stderr
-    assert told.stderr.count("\n") == 1
+    messages = subprocess.run(["sh", "-c", program], check=False, **how)
+    assert messages.returncode == 71
+    assert "MB (ulimit -v), and NumPy, SciPy and GTSAM alone take 307 MB" in messages.stderr
+    assert messages.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(("limit", "status"), [(2**40, 71), (-1, 70)])
@@ -195,12 +195,12 @@ def test_an_interpreter_that_fails_within_a_limit_of_memory_lacks_it(
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
-def test_a_name_that_is_no_text_is_told_in_any_encoding(encoding: str, tmp_path: Path) -> None:
+def test_a_name_that_is_no_text_is_reported_in_any_encoding(encoding: str, tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9 \xe2\x82\xac.npz")
-    told = _vislam("check-data", str(tmp_path / name), environment={"LC_ALL": "C", "PYTHONIOENCODING": encoding})
-    assert told.returncode == 3
-    assert told.stderr.count("\n") == 1
-    assert "caf\\udce9" in told.stderr
+    messages = _vislam("check-data", str(tmp_path / name), environment={"LC_ALL": "C", "PYTHONIOENCODING": encoding})
+    assert messages.returncode == 3
+    assert messages.stderr.count("\n") == 1
+    assert "caf\\udce9" in messages.stderr
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_whatever_nobody_foresaw_is_one_line_with_a_documented_status(
 @pytest.mark.parametrize(
     ("lack", "status"), [(OSError(24, "Too many open files"), 71), (FileNotFoundError(2, "no"), 70)]
 )
-def test_a_lack_of_means_is_told_where_a_library_hides_it_and_nothing_else_is(
+def test_a_lack_of_means_is_reported_where_a_library_hides_it_and_nothing_else_is(
     vislam: Vislam, one_line: OneLine, monkeypatch: pytest.MonkeyPatch, lack: Exception, status: int
 ) -> None:
     monkeypatch.setattr(runner, "run", _raiser(_hidden(lack)))
@@ -235,7 +235,7 @@ def test_a_lack_of_means_is_told_where_a_library_hides_it_and_nothing_else_is(
     assert ("Too many open files" in one_line()) == (status == 71)
 
 
-def test_the_place_of_a_defect_is_shown_when_asked_for(
+def test_the_place_of_a_defect_is_shown_when_requested(
     vislam: Vislam, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "run", _raiser(ZeroDivisionError()))
@@ -254,22 +254,22 @@ def test_signals_leave_no_file_and_no_process(
     for name in signals:
         os.kill(running.pid, getattr(signal, name))
         time.sleep(0.05)
-    _, told = running.communicate(timeout=PATIENCE_S)
-    assert told == "vislam: error: interrupted; what was not finished is not written\n"
+    _, messages = running.communicate(timeout=PATIENCE_S)
+    assert messages == "vislam: error: interrupted; what was not finished is not written\n"
     assert running.returncode == 130
     assert list(tmp_path.iterdir()) == []
     _wait_until(lambda: not _group(running.pid))
 
 
-def test_a_terminal_that_is_closed_is_one_line_though_all_its_processes_are_told(
+def test_a_terminal_that_is_closed_is_one_line_though_all_its_processes_are_signalled(
     tmp_path: Path, starts_group: StartsGroup
 ) -> None:
     words = ("compare", "drive", "--estimators", "dead-reckoning,ekf,batch", "--workers", "2", "--out", "run")
     running = starts_group(("-m", "toolkit.cli", *words), tmp_path, {"PYTHONPATH": str(ROOT)})
     _wait_until(lambda: len(_group(running.pid)) > 4)  # two workers, and what watches over what they share
     os.killpg(running.pid, signal.SIGHUP)
-    _, told = running.communicate(timeout=PATIENCE_S)
-    assert told == "vislam: error: interrupted; what was not finished is not written\n"
+    _, messages = running.communicate(timeout=PATIENCE_S)
+    assert messages == "vislam: error: interrupted; what was not finished is not written\n"
     assert running.returncode == 130
     assert list(tmp_path.iterdir()) == []
     _wait_until(lambda: not _group(running.pid))

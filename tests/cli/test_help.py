@@ -61,8 +61,8 @@ def test_help_imports_nothing_slow(command: str) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_an_example_and_the_exit_statuses(command: str) -> None:
     assert re.search(r"^  \$ vislam ", help_of(command).stdout, flags=re.MULTILINE)
-    told = re.findall(r"^  (\d+) ", help_of(command).stdout, flags=re.MULTILINE)
-    assert tuple(told) == STATUSES
+    matches = re.findall(r"^  (\d+) ", help_of(command).stdout, flags=re.MULTILINE)
+    assert tuple(matches) == STATUSES
 
 
 @pytest.mark.usefixtures("one_process", "unrendered", "own_cache")

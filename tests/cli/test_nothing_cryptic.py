@@ -34,9 +34,9 @@ def test_names_act_neither_on_the_terminal_nor_in_the_report(
 ) -> None:
     words = ("compare", str(hostile), "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
     assert vislam(*words, "--out", "run") == 0
-    told = capfd.readouterr()
-    assert told.err == ""
-    assert told.out.replace("\n", "").isprintable()
+    messages = capfd.readouterr()
+    assert messages.err == ""
+    assert messages.out.replace("\n", "").isprintable()
     report = Path("run/report.md").read_text(encoding="utf-8")
     assert report.replace("\n", "").isprintable()
     assert not re.search(r"(?<!\\)(<img|\[click|\|c )|^---", report, re.MULTILINE)
@@ -51,7 +51,7 @@ def test_plain_text_is_the_same_in_markdown(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("drive", "--estimators", "ekf", "batch", "iekf"), "give names with commas: --estimators ekf,batch,iekf (see"),
         (("drive", "--max-frames", "9", "batch"), "unexpected argument batch (see"),
@@ -59,13 +59,13 @@ def test_plain_text_is_the_same_in_markdown(text: str) -> None:
     ],
 )
 def test_an_argument_that_is_left_over_is_answered_by_its_command(
-    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], told: str
+    vislam: Vislam, one_line: OneLine, words: tuple[str, ...], expected: str
 ) -> None:
     assert vislam("compare", *words) == 2
-    assert f"{told} vislam compare --help)" in one_line()
+    assert f"{expected} vislam compare --help)" in one_line()
 
 
-def test_a_run_directory_given_as_a_recording_is_told_from_one(vislam: Vislam, one_line: OneLine) -> None:
+def test_a_run_directory_given_as_a_recording_is_distinguished_from_one(vislam: Vislam, one_line: OneLine) -> None:
     Path("run").mkdir()
     for name in ("manifest.json", "metrics.json"):
         (Path("run") / name).write_text("{}")
@@ -74,7 +74,7 @@ def test_a_run_directory_given_as_a_recording_is_told_from_one(vislam: Vislam, o
 
 
 @pytest.mark.parametrize("seconds", ["1e9", "3601", "1e-9"])
-def test_a_simulation_of_no_sensible_length_is_refused_before_memory_is_asked_for(
+def test_a_simulation_of_no_sensible_length_is_refused_before_memory_is_requested(
     vislam: Vislam, one_line: OneLine, seconds: str
 ) -> None:
     assert vislam("simulate", "drive", "--out", "recording", "--duration", seconds) == 2
@@ -120,29 +120,31 @@ def test_a_misspelt_name_gets_the_nearest_one(
 
 
 @pytest.mark.parametrize(
-    ("source", "told"),
+    ("source", "expected"),
     [
         ("", "a SEQUENCE has no name: give a path, or one of"),
         ("https://example.org/03.npz", "it is an address: download it and name the file"),
     ],
 )
-def test_what_names_no_file_is_told_from_one_that_is_missing(
-    vislam: Vislam, one_line: OneLine, source: str, told: str
+def test_what_names_no_file_is_distinguished_from_one_that_is_missing(
+    vislam: Vislam, one_line: OneLine, source: str, expected: str
 ) -> None:
     assert vislam("compare", source, "--estimators", "dead-reckoning") == 3
-    assert told in one_line()
+    assert expected in one_line()
 
 
 @pytest.mark.parametrize("words", [("diff", "n" * 5000, "run"), ("compare", "drive", "--workers", "n" * 5000)])
-def test_of_a_word_of_thousands_of_letters_both_ends_are_told(
+def test_of_a_word_of_thousands_of_letters_both_ends_are_reported(
     vislam: Vislam, one_line: OneLine, words: tuple[str, ...]
 ) -> None:
     assert vislam(*words) in (2, 3)
-    assert "nnn...nnn" in (told := one_line())
-    assert len(told) < 300
+    assert "nnn...nnn" in (messages := one_line())
+    assert len(messages) < 300
 
 
-def test_a_path_in_bytes_that_are_no_text_is_read_and_told(vislam: Vislam, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_path_in_bytes_that_are_no_text_is_read_and_reported(
+    vislam: Vislam, capfd: pytest.CaptureFixture[str]
+) -> None:
     folder = shutil.copytree(RECORDING, os.fsdecode(b"caf\xe9"))
     words = ("compare", folder, "--estimators", "dead-reckoning", "--max-frames", "10", "--workers", "1")
     assert vislam(*words, "--out", os.fsdecode(b"r\xe9sultats")) == 0
@@ -171,7 +173,9 @@ def test_a_name_too_long_for_the_system_is_no_run_directory(
     Path("run").mkdir()
     (Path("run") / "metrics.json").write_text("{}")
     assert vislam(words[0], "n" * 300, *words[1:]) == status
-    assert "is not a directory; give a run directory" in (told := one_line()) or "or name a run directory" in told
+    assert (
+        "is not a directory; give a run directory" in (messages := one_line()) or "or name a run directory" in messages
+    )
 
 
 @pytest.mark.parametrize("source", ["drive", str(RECORDING)])

@@ -28,9 +28,9 @@ def test_the_page_goes_into_the_run_directory(
 ) -> None:
     capsys.readouterr()
     assert vislam("report", "run") == 0
-    told = capsys.readouterr()
-    assert told.out == "report: run/report.html\n"
-    assert told.err == ""
+    messages = capsys.readouterr()
+    assert messages.out == "report: run/report.html\n"
+    assert messages.err == ""
     (case,) = payload_of(short_run / "report.html")["cases"]
     assert case["title"] == "drive"
     assert vislam("compare", "drive", *QUICK, "--out", "run") == 0  # the run directory is still one of ours
@@ -51,11 +51,11 @@ def test_a_comparison_over_seeds_has_a_page(vislam: Vislam, short_run: Path) -> 
     assert vislam("report", "seeds", str(short_run), "--out", "both.html") == 0
     seeds, run = payload_of(Path("both.html"))["cases"]
     assert [seeds["kind"], run["kind"]] == ["seeds", "run"]
-    told = json.loads(Path("seeds/seeds.json").read_text())
+    document = json.loads(Path("seeds/seeds.json").read_text())
     (row,) = seeds["rows"]
     assert row["output"] == "both"
-    assert row["metrics"]["ate_none_m"] == told["runs"][0]["metrics"]["ate_none_m"]["mean"]
-    assert row["values"]["ate_none_m"] == told["runs"][0]["metrics"]["ate_none_m"]["values"]
+    assert row["metrics"]["ate_none_m"] == document["runs"][0]["metrics"]["ate_none_m"]["mean"]
+    assert row["values"]["ate_none_m"] == document["runs"][0]["metrics"]["ate_none_m"]["values"]
     assert len(row["nees"]["pose"]) == len(row["errors"]["position_m"]) == 10
 
 
@@ -69,7 +69,7 @@ def test_a_comparison_over_seeds_has_a_page(vislam: Vislam, short_run: Path) -> 
         (("run", "--out", "file/report.html"), 4, "file/report.html cannot be written"),
     ],
 )
-def test_trouble_is_told_in_one_line(
+def test_trouble_is_reported_in_one_line(
     vislam: Vislam,
     capsys: pytest.CaptureFixture[str],
     one_line: OneLine,

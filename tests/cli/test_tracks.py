@@ -31,9 +31,9 @@ def test_stills_show_both_images_with_the_tracks(
     coloured = (still.max(axis=2).astype(int) - still.min(axis=2)) > 60
     assert coloured[:, :320].sum() > 200
     assert coloured[:, 320:].sum() > 200
-    said = capsys.readouterr().out
-    assert "8 pairs" in said
-    assert "tracks a frame" in said
+    messages = capsys.readouterr().out
+    assert "8 pairs" in messages
+    assert "tracks a frame" in messages
 
 
 def test_a_video_has_every_frame(folder: Path, vislam: Vislam) -> None:

@@ -109,7 +109,7 @@ def test_another_system_is_in_everything_a_comparison_leaves(again: Path) -> Non
         (("--trajectory", "theirs=empty"), 3, "empty: the file holds no poses"),
     ],
 )
-def test_a_trajectory_that_cannot_be_used_is_told_before_anything_runs(
+def test_a_trajectory_that_cannot_be_used_is_reported_before_anything_runs(
     vislam: Vislam, one_line: OneLine, words: tuple[str, ...], status: int, why: str
 ) -> None:
     Path("empty").touch()
@@ -125,7 +125,7 @@ def test_a_trajectory_that_cannot_be_used_is_told_before_anything_runs(
         (("--estimator", "batch"), "has no trajectory of batch; there are dead-reckoning, ekf, truth"),
     ],
 )
-def test_a_choice_that_is_not_there_is_told_with_those_that_are(
+def test_a_choice_that_is_not_there_is_reported_with_those_that_are(
     vislam: Vislam, one_line: OneLine, run: Path, words: tuple[str, ...], why: str
 ) -> None:
     assert vislam("export", str(run), *words, "--format", "tum", "--out", "out.tum") == 3
@@ -133,7 +133,7 @@ def test_a_choice_that_is_not_there_is_told_with_those_that_are(
     assert not Path("out.tum").exists()
 
 
-def test_an_output_that_was_not_given_is_told(vislam: Vislam, one_line: OneLine, again: Path) -> None:
+def test_an_output_that_was_not_given_is_reported(vislam: Vislam, one_line: OneLine, again: Path) -> None:
     words = ("--estimator", "by tum", "--output", "causal", "--format", "tum", "--out", "out.tum")
     assert vislam("export", str(again), *words) == 3
     assert "has no causal trajectory of by tum, only a final one" in one_line()
@@ -153,7 +153,7 @@ def test_the_truth_and_either_output_can_be_exported(vislam: Vislam, run: Path) 
         assert len(read_poses(Path("out.csv"))) == 20
 
 
-def test_a_file_that_cannot_be_written_is_told(vislam: Vislam, one_line: OneLine, run: Path) -> None:
+def test_a_file_that_cannot_be_written_is_reported(vislam: Vislam, one_line: OneLine, run: Path) -> None:
     Path("taken").mkdir()
     assert vislam("export", str(run), "--estimator", "ekf", "--format", "tum", "--out", "taken") == 4
     assert "taken is a directory" in one_line()

@@ -101,8 +101,8 @@ def test_no_two_columns_have_the_same_name():
 
 
 def test_every_metric_the_gate_judges_has_a_name_there():
-    judged = {COVERAGE, *DEFAULT_BOUNDS.simulated, *DEFAULT_BOUNDS.recorded}
-    assert judged == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
+    checked = {COVERAGE, *DEFAULT_BOUNDS.simulated, *DEFAULT_BOUNDS.recorded}
+    assert checked == {metric.key for metric in metrics.known_metrics() if metric.gate_name}
 
 
 @pytest.mark.parametrize("key", KEYS)

@@ -19,7 +19,7 @@ def digests(made_once: Callable[[str, Callable[[], list[dict[str, str]]]], list[
 @pytest.mark.parametrize("scenario", ["drive", "flight"])
 @pytest.mark.parametrize("name", sorted(discover()))
 def test_one_thread_and_two_say_the_same_bits(name, scenario, digests) -> None:
-    one, two = (said[f"{name} on {scenario}"] for said in digests)
+    one, two = (reported[f"{name} on {scenario}"] for reported in digests)
     if one == two == UNAVAILABLE:
         pytest.skip(f"{name} is unavailable")
     assert one == two

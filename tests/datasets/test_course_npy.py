@@ -80,8 +80,8 @@ def test_each_convention_of_the_extrinsic_is_found_with_noise_and_mismatches(tmp
     audited = audit(load_sequence(str(given)))
     # The stereo tracks decide among four candidates; the right one is the simulation's to rounding.
     np.testing.assert_allclose(audited.sequence.rig.T_imu_cam, drive().rig.T_imu_cam, atol=1e-12)
-    (told,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
-    assert told.endswith(f"the extrinsic is taken {convention}")
+    (reported,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
+    assert reported.endswith(f"the extrinsic is taken {convention}")
     assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
 
 
@@ -99,11 +99,11 @@ def test_where_the_camera_is_decides_between_readings_that_look_the_same_way(tmp
     given["v_t"], given["w_t"] = given["v_t"][: sequence.frame_count], given["w_t"][: sequence.frame_count]
     audited = audit(load_sequence(str(saved(tmp_path, given))))
     assert f"the extrinsic is taken {convention}" in audited.sequence.provenance.facts
-    (told,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
-    assert "in turns the camera's velocity is" in told
+    (reported,) = [finding.detail for finding in audited.findings if finding.fault == "extrinsic-convention"]
+    assert "in turns the camera's velocity is" in reported
 
 
-def test_kept_the_convention_is_told_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:
+def test_kept_the_convention_is_reported_and_the_extrinsic_left_as_it_is(tmp_path: Path) -> None:
     path = saved(tmp_path, course_dict(drive(), "inverted, camera axes regular"))
     audited = audit(load_sequence(str(path)), keep=frozenset({"extrinsic-convention", "mixed-axes"}))
     assert any(finding.fault == "extrinsic-convention" and finding.blocking for finding in audited.findings)
@@ -271,7 +271,7 @@ def test_unpacked_images_go_when_they_are_no_longer_used(with_images: Path) -> N
     assert not image.parent.parent.exists()
 
 
-def test_features_are_taken_before_images_unless_asked(with_images: Path) -> None:
+def test_features_are_taken_before_images_unless_requested(with_images: Path) -> None:
     content = {key: value.read() for key, value in read_dict(with_images).items()}
     with_images = saved(with_images.parent, {**content, "features": np.full((4, 2, 8), -1.0)}, with_images.name)
     assert len(load_sequence(str(with_images)).observations) == 0

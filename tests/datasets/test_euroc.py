@@ -222,8 +222,8 @@ def test_of_two_truths_the_one_that_turns_as_the_gyro_says_is_used(recording: Pa
 def test_a_gap_of_the_truth_is_no_disagreement_with_the_gyro(recording: Path) -> None:
     truth_s = np.concatenate([np.arange(0.5, 0.9, 0.005), np.arange(1.7, 2.5, 0.005)])
     write(recording / "mav0/state_groundtruth_estimate0/data.csv", truth_text(truth_s, orientations(truth_s)))
-    told = load_sequence(str(recording)).provenance.facts[1]
-    scatter_radps = float(told.rpartition(" by ")[2].removesuffix(" rad/s)"))
+    reported = load_sequence(str(recording)).provenance.facts[1]
+    scatter_radps = float(reported.rpartition(" by ")[2].removesuffix(" rad/s)"))
     assert scatter_radps < 0.01  # 0.2 where the poses on both sides of the gap are joined by a straight turn
 
 

@@ -60,13 +60,13 @@ def test_sound_poses_of_any_body_and_world_are_not_accused(scenario: str, durati
     check_axes("run.tum", truth, se3(np.tile(np.eye(3), (len(truth), 1, 1)), estimate[:, :3, 3]))
 
 
-def test_positions_that_are_mirrored_beside_no_orientations_are_told_to_be() -> None:
+def test_positions_that_are_mirrored_beside_no_orientations_are_reported_to_be() -> None:
     truth, estimate = of("flight", 8.0)
     mirrored = se3(np.tile(np.eye(3), (len(truth), 1, 1)), estimate[:, [0, 2, 1], 3])
     assert exchanged(truth, mirrored) == "its positions mirrored"
 
 
-def test_poses_that_are_inverted_are_not_said_to_be_mirrored() -> None:
+def test_poses_that_are_inverted_are_not_reported_to_be_mirrored() -> None:
     """Where the body hardly turns, inverse positions are the true ones with every sign turned."""
     truth, estimate = of("flight", 8.0)
     facing = se3(so3_exp(0.002 * np.arange(len(truth))[:, None] * np.array([0.0, 0.1, 1.0])), truth[:, :3, 3])
@@ -76,7 +76,7 @@ def test_poses_that_are_inverted_are_not_said_to_be_mirrored() -> None:
     check_mirrored("run.tum", truth, estimate)
 
 
-def test_an_estimate_that_is_lost_is_not_said_to_be_in_other_axes() -> None:
+def test_an_estimate_that_is_lost_is_not_reported_to_be_in_other_axes() -> None:
     truth, estimate = of("flight", 8.0)
     rng = np.random.default_rng(1)
     for seed in range(5):

@@ -36,7 +36,7 @@ def test_a_folder_is_recognised_by_its_images(drive: Path) -> None:
     assert kitti_odometry.recognises(drive)
 
 
-def test_no_motion_is_measured_and_that_is_said(drive: Path) -> None:
+def test_no_motion_is_measured_and_that_is_reported(drive: Path) -> None:
     sequence = load_sequence(str(drive))
     assert sequence.motion_kind == "none"
     assert isinstance(sequence.motion, NoSamples)
@@ -98,7 +98,7 @@ def test_poses_of_all_images_serve_where_there_are_fewer_or_more_stamps(drive: P
     np.testing.assert_allclose(sequence.truth.T_world_imu[:, 0, 3], STEP_M * np.arange(used), atol=1e-9)
 
 
-def test_what_is_not_there_is_assumed_and_said_or_left_out(drive: Path) -> None:
+def test_what_is_not_there_is_assumed_and_reported_or_left_out(drive: Path) -> None:
     (drive / "times.txt").unlink()
     (drive / "poses.txt").unlink()
     (drive / "image_1/000003.png").unlink()
@@ -109,14 +109,14 @@ def test_what_is_not_there_is_assumed_and_said_or_left_out(drive: Path) -> None:
     assert sequence.frames_t_ns.tolist() == [100_000_000 * k for k in range(FRAMES) if k != 3]
 
 
-def test_a_calibration_of_images_half_as_large_is_said(drive: Path) -> None:
-    def said() -> bool:
+def test_a_calibration_of_images_half_as_large_is_reported(drive: Path) -> None:
+    def reported() -> bool:
         return any("far from the middle" in fact for fact in load_sequence(str(drive)).provenance.facts)
 
-    assert not said()
+    assert not reported()
     text = (drive / "calib.txt").read_text()
     (drive / "calib.txt").write_text(text.replace(" 160", " 80").replace(" 100 ", " 50 "))
-    assert said()
+    assert reported()
 
 
 def edit(path: Path, old: str, new: str) -> None:

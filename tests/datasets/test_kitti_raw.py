@@ -130,7 +130,7 @@ def test_images_of_the_sensors_size_are_rectified_here(drive: Path) -> None:
     assert sequence.rig.baseline_m == pytest.approx(0.4)
 
 
-def test_blank_and_late_stamps_are_left_out_or_sorted_and_said(drive: Path) -> None:
+def test_blank_and_late_stamps_are_left_out_or_sorted_and_reported(drive: Path) -> None:
     lines = [stamp(0.1 * k) for k in range(FRAMES)]
     lines[3], lines[4], lines[6] = lines[4], lines[3], "\n"
     (drive / "image_00/timestamps.txt").write_text("".join(lines))

@@ -132,7 +132,7 @@ def test_seconds_are_exact_and_order_and_compression_do_not_matter(tmp_path: Pat
         (lambda text: "# a drive\n\n" + text.replace(".", "x"), r"line 4: .* is .*x.*, expected a number"),
     ],
 )
-def test_tables_as_spreadsheets_write_them_are_read_or_told(
+def test_tables_as_spreadsheets_write_them_are_read_or_reported(
     tmp_path: Path, assert_refused: Refused, write: Callable[[str], str], pattern: str | None
 ) -> None:
     folder = written(recorded("twist"), tmp_path / "own")
@@ -250,7 +250,7 @@ def test_nothing_of_anybody_is_written_over(tmp_path: Path) -> None:
         toolkit.save(tmp_path / "own", **tables_of(sequence), rig=rig_of(sequence))
 
 
-def test_a_folder_with_a_table_missing_is_told_which(tmp_path: Path) -> None:
+def test_a_folder_with_a_table_missing_is_reported_with_its_name(tmp_path: Path) -> None:
     folder = written(recorded("imu"), tmp_path / "own")
     (folder / "imu.csv").unlink()
     with pytest.raises(DataError, match=r"missing imu\.csv or twist\.csv"):

@@ -22,7 +22,7 @@ def test_every_format_has_a_summary() -> None:
     assert all(summary.endswith(".") or len(summary) > 20 for summary in formats().values())
 
 
-def test_built_in_names_are_told_without_making_any() -> None:
+def test_built_in_names_are_reported_without_making_any() -> None:
     assert "kitti00" in built_in_names()
 
 
@@ -59,7 +59,7 @@ def test_exactly_one_format_recognises_a_recording(course: dict[str, Any], openv
     ],
     ids=["gzip", "zstd", "tar", "trajectory"],
 )
-def test_what_a_file_is_instead_is_told(tmp_path: Path, content: bytes, pattern: str) -> None:
+def test_what_a_file_is_instead_is_reported(tmp_path: Path, content: bytes, pattern: str) -> None:
     (tmp_path / "drive").write_bytes(content)
     with pytest.raises(DataError, match=pattern):
         load_sequence(str(tmp_path / "drive"))
@@ -106,7 +106,7 @@ def test_a_path_that_is_not_there_is_answered_with_what_is(tmp_path: Path) -> No
         load_sequence(tmp_path / "recordings" / "drive.npz")
 
 
-def test_a_path_that_is_not_there_in_a_folder_that_cannot_be_listed_is_told_plainly(
+def test_a_path_that_is_not_there_in_a_folder_that_cannot_be_listed_is_reported_plainly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(_folder: Path) -> None:

@@ -283,6 +283,6 @@ def test_a_position_that_no_body_has_is_refused(
 ) -> None:
     rows = lines_of(name, trajectory)
     rows[3][{"tum": 1, "kitti": 3, "euroc": 1, "openvins": 5}[name]] = cell
-    told = complaint(spoiled(tmp_path, name, rows))
-    assert "line 4" in told
-    assert re.search(pattern, told)
+    reported = complaint(spoiled(tmp_path, name, rows))
+    assert "line 4" in reported
+    assert re.search(pattern, reported)

@@ -393,8 +393,8 @@ def test_every_page_is_reached_from_the_readme() -> None:
 def test_exit_statuses_are_those_of_the_help() -> None:
     from toolkit.cli import parser
 
-    told = re.findall(r"^  (\d+) ", parser().format_help(), flags=re.M)
-    assert re.findall(r"^\| (\d+) \|", (PROJECT / "README.md").read_text(encoding="utf-8"), flags=re.M) == told
+    matches = re.findall(r"^  (\d+) ", parser().format_help(), flags=re.M)
+    assert re.findall(r"^\| (\d+) \|", (PROJECT / "README.md").read_text(encoding="utf-8"), flags=re.M) == matches
 
 
 def test_pictures_are_small() -> None:

@@ -39,8 +39,8 @@ def test_one_file_is_scored_without_gtsam_or_a_recording(scene, vislam, tmp_path
         "status = main(['evaluate', 'truth.tum', 'mine=other.tum', '--out', 'out'])\n"
         "print(sorted(sys.modules.keys() & {'gtsam', 'cv2', 'matplotlib', 'filters', 'toolkit.runner'}), status)"
     )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert told.stdout.splitlines()[-1] == "[] 0"
+    messages = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert messages.stdout.splitlines()[-1] == "[] 0"
     (run,) = document()["runs"]
     # 600 poses with independent errors of 0.1 m an axis.
     assert run["metrics"]["ate_se3_m"] == pytest.approx(0.1 * np.sqrt(3.0), rel=0.05)
@@ -68,10 +68,10 @@ def test_failures_are_counted_and_never_dropped(tree, capsys) -> None:
     assert over["good", "S0"]["metrics"]["ate_se3_m"]["median"] is None
     (paired,) = found["paired"]
     assert (paired["better"], paired["worse"]) == (5, 2)
-    told = capsys.readouterr().out
-    assert "2 of 3 failed" in told
-    assert "good, S0, 1: results/good/S0/1.tum: 3 columns" in told
-    assert "there is no trajectory" in told
+    messages = capsys.readouterr().out
+    assert "2 of 3 failed" in messages
+    assert "good, S0, 1: results/good/S0/1.tum: 3 columns" in messages
+    assert "there is no trajectory" in messages
 
 
 def test_the_better_system_is_ahead_and_seven_sequences_tell(tree) -> None:
@@ -104,12 +104,12 @@ def test_runs_that_ought_to_be_there_are_missed(tree) -> None:
     assert standing(document(), "good")["ok"] == 21
 
 
-def test_fewer_runs_of_one_sequence_than_of_another_are_told(tree) -> None:
+def test_fewer_runs_of_one_sequence_than_of_another_are_reported(tree) -> None:
     """A run that crashed may have left no file, and nothing else shows it."""
     Path("results/good/S2/1.tum").unlink()
     assert tree("evaluate", "truths", "results", "--out", "out", "--quiet") == 0
-    told = "good has 2 of S2 and 3 runs elsewhere; --runs 3 counts those missing as failed"
-    assert told in document()["notes"]
+    messages = "good has 2 of S2 and 3 runs elsewhere; --runs 3 counts those missing as failed"
+    assert messages in document()["notes"]
 
 
 def test_repeated_runs_of_one_sequence_have_median_and_quartiles(tree, capsys) -> None:
@@ -171,7 +171,7 @@ def bad_text(scene, kind: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "expected"),
     [
         ("nanoseconds", "nanoseconds: divide by 1e9"),
         ("milliseconds from zero", "time must be in seconds"),
@@ -189,21 +189,23 @@ def bad_text(scene, kind: str) -> str:
         ("one pose", "bad.tum: it has one pose, and errors are of two and more"),
     ],
 )
-def test_a_bad_file_is_told_in_one_line_and_beside_a_good_one_counted(scene, vislam, capsys, kind, told) -> None:
+def test_a_bad_file_is_reported_in_one_line_and_beside_a_good_one_counted(
+    scene, vislam, capsys, kind, expected
+) -> None:
     Path("bad.tum").write_text(bad_text(scene, kind))
     assert vislam("evaluate", "truth.tum", "bad.tum", "--out", "out") == 3
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert told in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert expected in printed
     assert not Path("out").exists()
     scene.write("fine.tum", scene.stamps(10.0), scene.estimated(scene.stamps(10.0), 0.1))
     assert vislam("evaluate", "truth.tum", "bad.tum", "fine.tum", "--out", "out") == 1
     assert [run["status"] for run in document()["runs"]] == ["failed", "ok"]
-    assert told in document()["runs"][0]["log"][0]
+    assert expected in document()["runs"][0]["log"][0]
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "told"),
+    ("words", "status", "expected"),
     [
         (("truth.tum", "nowhere.tum"), 3, "nowhere.tum: there is no such file"),
         (("nowhere", "truth.tum"), 3, "nowhere: there is no such truth"),
@@ -216,14 +218,14 @@ def test_a_bad_file_is_told_in_one_line_and_beside_a_good_one_counted(scene, vis
         (("truth.tum", "truth.tum", "--out", "results"), 4, "results"),
     ],
 )
-def test_trouble_is_told_in_one_line(tree, capsys, words, status, told) -> None:
+def test_trouble_is_reported_in_one_line(tree, capsys, words, status, expected) -> None:
     try:
         assert tree("evaluate", *words) == status
     except SystemExit as left:
         assert left.code == status
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert told in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert expected in printed
 
 
 def test_formats_say_the_same(tree, capsys) -> None:
@@ -279,10 +281,10 @@ def test_the_gate_refuses_an_evaluation_on_other_terms(tree, capsys) -> None:
     assert tree("baseline", "--trajectories", "before/evaluation.json", "--out", "base.json") == 0
     named = [entry["sequence"] for entry in json.loads(Path("base.json").read_text())["sequences"]]
     assert named == ["good/S0", "poor/S0"]
-    for words, told in ((("--max-dt", "0.01"), "without --max-dt"), (("--gap", "3"), "again with --gap 5")):
+    for words, expected in ((("--max-dt", "0.01"), "without --max-dt"), (("--gap", "3"), "again with --gap 5")):
         assert tree(*one, *words, "--out", "after") == 0
         assert tree("check", "--trajectories", "after/evaluation.json", "--baseline", "base.json") == 1
-        assert told in " ".join(capsys.readouterr().out.split())
+        assert expected in " ".join(capsys.readouterr().out.split())
 
 
 def openvins_text(t_ns, poses, cov_orientation, cov_position) -> str:

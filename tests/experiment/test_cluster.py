@@ -37,21 +37,21 @@ def local() -> Iterator[Any]:
 
 
 def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local: Any, units: Units) -> None:
-    asked = [
+    requested = [
         replace(unit, recording=replace(unit.recording, duration_s=3.0))  # a short recording is quickly simulated
         for unit in units((0, 1, 2), ("dead-reckoning", "ekf"))
     ]
     found: dict[int, Outcome] = {}
     with Cluster(local.scheduler_address) as cluster:
         assert cluster.count == 2
-        for place, outcome in cluster.results(asked, run_unit, SILENT):
+        for place, outcome in cluster.results(requested, run_unit, SILENT):
             assert place not in found
             assert isinstance(outcome, Outcome)
             if not found:
                 os.kill(local.workers[0].pid, signal.SIGKILL)
             found[place] = outcome
-    assert len(found) == len(asked)
-    for place, outcome in results_of(asked, 1, run_unit, SILENT):
+    assert len(found) == len(requested)
+    for place, outcome in results_of(requested, 1, run_unit, SILENT):
         assert isinstance(outcome, Outcome)
         one, other = (each.outputs["causal"] for each in (outcome, found[place]))
         assert found[place].sequence_hash == outcome.sequence_hash
@@ -59,7 +59,7 @@ def test_a_cluster_of_which_a_worker_is_killed_equals_one_process(local: Any, un
         np.testing.assert_array_equal(one.position_m, other.position_m)
 
 
-def test_a_worker_of_another_version_is_told(local: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_of_another_version_is_reported(local: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     ours = clusters.numeric_versions() | {"gtsam": "4.9"}
     monkeypatch.setattr(clusters, "numeric_versions", lambda: ours)
     with pytest.raises(ClusterError, match=r"has gtsam 4\.3.*, not 4\.9; install"):
@@ -92,13 +92,13 @@ def test_a_unit_that_ends_its_worker_is_lost_alone(local: Any) -> None:
     assert found == {0: 0, 1: Lost("the workers that tried it ended before they answered (2 of them)")}
 
 
-def test_a_scheduler_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_is_not_there_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clusters, "_CONNECT_S", 0.3)
     with pytest.raises(ClusterError, match=r"no scheduler can be reached at tcp://127\.0\.0\.1:9 "):
         Cluster("tcp://127.0.0.1:9")
 
 
 @pytest.mark.parametrize("address", ["head-node", "tcp://head-node", "tcp://:8786 "])
-def test_what_is_no_address_is_told_before_anything_connects(address: str) -> None:
+def test_what_is_no_address_is_reported_before_anything_connects(address: str) -> None:
     with pytest.raises(ClusterError, match="is no address of a scheduler; give one like tcp://host:8786"):
         Cluster(address)

@@ -23,9 +23,9 @@ def make_evaluation() -> Callable[..., Evaluation]:
 
     def make(frames: int, dof: float) -> Evaluation:
         sequence = load_sequence("drive").truncated(frames)
-        said = Trajectory(sequence.frames_t_ns, np.tile(np.eye(4), (frames, 1, 1)))
+        reported = Trajectory(sequence.frames_t_ns, np.tile(np.eye(4), (frames, 1, 1)))
         info = {"nis": np.full(frames, dof), "nis_dof": np.full(frames, dof)}
-        return Evaluation(Run("made-up", "ok", said, said, Landmarks.none(), None, info), "causal", sequence)
+        return Evaluation(Run("made-up", "ok", reported, reported, Landmarks.none(), None, info), "causal", sequence)
 
     return make
 
@@ -50,7 +50,7 @@ def verdict(*runs: Scored) -> str | None:
     ("nees", "expected"),
     [(0.19, "timid"), (0.22, "consistent"), (1.0, "consistent"), (2.3, "consistent"), (2.5, "overconfident")],
 )
-def test_one_run_is_judged_by_the_band_of_one_pose(nees: float, expected: str) -> None:
+def test_one_run_is_checked_by_the_band_of_one_pose(nees: float, expected: str) -> None:
     """A textbook's quantiles of six degrees of freedom, 1.237 and 14.449, over 6: 0.206 and 2.408."""
     assert verdict(run_of(nees)) == expected
 
@@ -71,7 +71,7 @@ def test_the_errors_decide_where_there_are_any_and_else_the_innovations() -> Non
     assert verdict(run_of()) is None
 
 
-def test_corrections_that_lean_one_way_are_told_unless_errors_tell_of_too_much_certainty() -> None:
+def test_corrections_that_lean_one_way_are_reported_unless_errors_tell_of_too_much_certainty() -> None:
     assert verdict(leaning(5.1, 4.0)) == "contradicted"
     assert verdict(leaning(5.1, 4.0, nees_pose_mean=1.0)) == "contradicted"
     assert verdict(leaning(5.1, 4.0, nis_mean=0.5)) == "contradicted"
@@ -128,11 +128,11 @@ def test_the_band_of_a_frame_holds_95_percent_behind_a_gate_and_where_frames_sha
     assert share_above_and_below(alone[:, :10], 180.0, 180.0).sum() == pytest.approx(0.05, abs=0.02)  # chi-square's
 
 
-def test_without_truth_innovations_mark_a_filter_that_is_told_half_the_noise(
+def test_without_truth_innovations_mark_a_filter_that_is_given_half_the_noise(
     run_estimator: Callable[..., Run],
 ) -> None:
     sequence = replace(load_sequence("drive", seed=1).truncated(60), truth=None)
     rig = replace(sequence.rig, cov_uv_px2=sequence.rig.cov_uv_px2 / 4.0)
-    for name, told, expected in (("sound", sequence, ""), ("told", replace(sequence, rig=rig), "overconfident")):
-        outcome = outcome_of(run_estimator("msckf-fej", told), told, 1)
+    for name, wanted, expected in (("sound", sequence, ""), ("told", replace(sequence, rig=rig), "overconfident")):
+        outcome = outcome_of(run_estimator("msckf-fej", wanted), wanted, 1)
         assert Row("causal", (outcome,)).mark == expected, name

@@ -28,8 +28,8 @@ def row(name: str, poses: Array | None = None, cov: Array | None = None, trend: 
     """Return a row that rests on the motion where it has no trend, else one whose trend has a limit of 4."""
     values, notes = {TREND: trend, LIMIT: None if trend is None else 4.0}, {TREND: NOTHING_CORRECTED}
     scored = Scored(Scores(values, notes if trend is None else {}), np.empty(0), np.empty(0))
-    said = None if poses is None else Trajectory(STAMPS_NS[: len(poses)], poses, cov=cov)
-    run = Run(name, "ok", said, said, Landmarks.none(), None)
+    reported = None if poses is None else Trajectory(STAMPS_NS[: len(poses)], poses, cov=cov)
+    run = Run(name, "ok", reported, reported, Landmarks.none(), None)
     return Row("causal", (Outcome(0, name, "ok", {"causal": scored}, final_is_causal=True, run=run),))
 
 
@@ -50,9 +50,9 @@ def test_poses_drawn_from_what_is_stated_never_part_and_a_shift_of_ten_sigmas_do
     assert 1.5 < np.median(squared) < max(squared) < FARTHEST
     shifted = drawn(3)
     shifted[25, :3, 3] += np.array([0.0, 2.0, 0.0])
-    told = apart(drawn(4), shifted, cov)
-    assert (told.t_s, told.squared > FARTHEST) == (2.5, True)
-    assert told.distance_m == pytest.approx(2.0, abs=4.0 * SIGMA[5])
+    messages = apart(drawn(4), shifted, cov)
+    assert (messages.t_s, messages.squared > FARTHEST) == (2.5, True)
+    assert messages.distance_m == pytest.approx(2.0, abs=4.0 * SIGMA[5])
 
 
 def test_where_the_pose_is_known_for_certain_rounding_parts_nobody() -> None:
@@ -83,7 +83,7 @@ def test_the_motion_is_in_doubt_where_half_of_those_that_use_vision_dispute_it(
     assert len(list(dispute_lines(dispute))) == doubted
 
 
-def test_one_that_parts_and_whose_corrections_cannot_be_judged_is_no_witness_against_the_motion() -> None:
+def test_one_that_parts_and_whose_corrections_cannot_be_checked_is_no_witness_against_the_motion() -> None:
     poses, cov = drawn(0), np.tile(np.diag(SIGMA**2), (40, 1, 1))
     far = poses @ se3_exp(np.array([0.0, 0.0, 0.0, 50.0, 0.0, 0.0]))
     held = row("seed-ekf", far, cov)
@@ -107,7 +107,7 @@ def _row_of(name: str, prepared: Prepared) -> Row:
     return Row("causal", (outcome_of(run, prepared.sequence, 0),))
 
 
-def test_an_odometer_that_slips_is_told_of_dead_reckoning_too_and_a_sound_one_of_nobody() -> None:
+def test_an_odometer_that_slips_is_reported_of_dead_reckoning_too_and_a_sound_one_of_nobody() -> None:
     sound = simulate(replace(DRIVE, duration_s=8.0), 5)
     assert not any(True for _ in dispute_lines(Dispute.of(rows_of(sound))))
     slipping = Dispute.of(rows_of(faults.disturbed_motion(sound, 0.8, 5)))

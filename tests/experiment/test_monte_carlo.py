@@ -92,7 +92,7 @@ def test_a_bad_run_spoils_the_quartiles_it_reaches():
     assert quantiles_of_all([1.0], 1, "") is quantiles_of_all([], 0, "least") is None
 
 
-def test_runs_that_ended_badly_are_told_beside_the_means(over: Comparison, document: Document) -> None:
+def test_runs_that_ended_badly_are_reported_beside_the_means(over: Comparison, document: Document) -> None:
     astray, broken = (document["runs"][i] for i in (2, 3))
     assert (astray["ok_share"], broken["ok_share"]) == (0.75, 0.0)
     # Under the seeds 3, 5 and 6 its ATE is 3, 5 and 6 m; seed 4 diverged.
@@ -114,15 +114,15 @@ def test_the_paired_difference_is_that_of_the_seeds_both_have():
     assert paired([1.0, 2.0], [1.0, 2.0]).seeds_needed == np.inf
 
 
-def test_equal_estimators_are_told_apart_at_5_percent_and_others_by_the_seeds_said_to_be_needed():
+def test_equal_estimators_are_distinguished_at_5_percent_and_others_by_the_seeds_reported_to_be_needed():
     rng, half = np.random.default_rng(5), 0.5  # of the standard deviation of a difference
     needed = round(Paired(100, half, 1.0 / np.sqrt(100)).seeds_needed)
     assert needed == 42
     for effect, share in ((0.0, 0.05), (half, 0.9)):
         draws = effect + rng.standard_normal((2000, needed))
-        told = np.mean([paired(draw, np.zeros(needed)).is_significant for draw in draws])
+        reported = np.mean([paired(draw, np.zeros(needed)).is_significant for draw in draws])
         # Four standard errors of the share, and one percent by which Student's test needs more than the normal one.
-        assert told == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
+        assert reported == pytest.approx(share, abs=4.0 * np.sqrt(share * (1.0 - share) / 2000) + 0.01)
 
 
 def test_under_the_table_stands_who_differs_from_the_best(over: Comparison) -> None:
@@ -173,7 +173,7 @@ def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> 
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "expected"),
     [
         (lambda d: d.update(schema="vislam.seeds/2"), "its schema is 'vislam.seeds/2'"),
         (lambda d: d.pop("runs"), "lacks runs"),
@@ -187,10 +187,10 @@ def test_seeds_json_obeys_its_contract(over: Comparison, document: Document) -> 
     ],
 )
 def test_a_broken_document_is_refused_with_the_place(
-    document: Document, spoil: Callable[[Document], object], told: str
+    document: Document, spoil: Callable[[Document], object], expected: str
 ) -> None:
     spoil(document)
-    with pytest.raises(DataError, match=re.escape(told)):
+    with pytest.raises(DataError, match=re.escape(expected)):
         parse(json.dumps(document), Seeds)
 
 
@@ -205,11 +205,11 @@ def test_the_report_names_what_went_wrong_and_who_is_too_sure(over: Comparison) 
 def test_the_stated_share_of_the_true_variance_is_a_ratio_of_means_with_its_error(over: Comparison) -> None:
     honest = over.rows[0].outcomes
     claims, excesses = (1.2, 1.0, 1.1, 1.1), (0.1, 0.3, -0.1, 0.1)
-    told = [
+    reported = [
         _with_values(one, {"claimed_variance": claim, "excess_variance": excess})
         for one, claim, excess in zip(honest, claims, excesses, strict=True)
     ]
-    known = replace(over, outcomes=in_order((*told, *over.rows[2].outcomes), ("honest", "astray"), over.seeds))
+    known = replace(over, outcomes=in_order((*reported, *over.rows[2].outcomes), ("honest", "astray"), over.seeds))
     assert "it states 1.00 ± 0.10 of its true variance" in " ".join(report_text(known, {}).split())
     ratio = ratio_of_means((1.2, 1.0, 1.1, 1.1), (1.1, 1.3, 0.9, 1.1))
     assert ratio is not None and ratio.value == pytest.approx(1.0)

@@ -50,15 +50,15 @@ def sweep(tmp_path: Path, ran: Ran, monkeypatch: pytest.MonkeyPatch) -> Sweep:
     """Return a function that compares over seeds, with what ended kept in a directory."""
     whole = Plan.recording
     # Two seconds are drawn and audited at once, and a minute is not; nor are the two that tell what a seed changes.
-    monkeypatch.setattr(Plan, "recording", lambda *asked: replace(whole(*asked), duration_s=2.0))
+    monkeypatch.setattr(Plan, "recording", lambda *requested: replace(whole(*requested), duration_s=2.0))
     monkeypatch.setattr(pipeline, "is_drawn_from_a_seed", lambda *_: True)
 
     def compare(
         estimators: tuple[str, ...] = TWO, directory: str = "run", keep: bool = False, **settings: object
     ) -> Comparison:
         ran.clear()
-        asked = settings_of({"seeds": 2, **settings}, "here")
-        plan = Plan(("drive",), estimators, settings=asked, max_frames=10, workers=1, keep_trajectories=keep)
+        requested = settings_of({"seeds": 2, **settings}, "here")
+        plan = Plan(("drive",), estimators, settings=requested, max_frames=10, workers=1, keep_trajectories=keep)
         with Workers(1) as workers:
             cases = prepared_cases(plan, workers)
             (store,) = stores_of(plan, cases, [tmp_path / directory])
@@ -106,7 +106,7 @@ def test_interrupted_and_continued_equals_uninterrupted(
     assert len((tmp_path / "run" / OUTCOMES).read_bytes().splitlines()) == 4
 
 
-def test_what_is_asked_for_in_addition_is_all_that_runs(sweep: Sweep, ran: Ran) -> None:
+def test_what_is_requested_in_addition_is_all_that_runs(sweep: Sweep, ran: Ran) -> None:
     sweep(("ekf",))
     sweep(("ekf",), seeds=3)
     assert ran == [(2, "ekf")]
@@ -204,8 +204,8 @@ def test_every_number_is_found_again_to_the_bit(store: OutcomeStore, tmp_path: P
     scored = Scored(Scores({**dict.fromkeys(describe()), **values}), numbers, numbers[::-1], numbers[seed])
     store.keep(UNIT, replace(OUTCOME, outputs={"final": scored}))
     store.close()
-    asked = replace(UNIT, settings=Settings())
-    found = OutcomeStore(tmp_path, Conditions("hash")).find(asked)
+    requested = replace(UNIT, settings=Settings())
+    found = OutcomeStore(tmp_path, Conditions("hash")).find(requested)
     assert found is not None
     one = found.outputs["final"]
     np.testing.assert_array_equal(one.nees_pose, numbers)
@@ -232,7 +232,7 @@ def test_two_processes_do_not_write_into_one_another(store: OutcomeStore, tmp_pa
     OutcomeStore(tmp_path, Conditions("hash")).close()
 
 
-def test_a_damaged_line_is_told_with_its_number(store: OutcomeStore, tmp_path: Path) -> None:
+def test_a_damaged_line_is_reported_with_its_number(store: OutcomeStore, tmp_path: Path) -> None:
     for seed in (0, 1):
         store.keep(replace(UNIT, seed=seed), replace(OUTCOME, seed=seed))
     store.close()

@@ -17,7 +17,7 @@ from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
 from toolkit.simulation.track_faults import moving_objects
 
 
-def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
+def messages(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
     """Return the pixel covariance (3, 3) px^2 and the motion noise that estimators are told."""
     short = load_sequence(source).truncated(20)  # soon audited
     sequence = prepare(Recording(short, noise=Noise(**noise))).sequence
@@ -27,7 +27,7 @@ def told(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
 @pytest.mark.parametrize("source", ["drive", "drive-imu"])
 def test_without_settings_the_noise_is_the_recordings(source: str) -> None:
     recorded = load_sequence(source)
-    cov_uv_px2, noise = told(source)
+    cov_uv_px2, noise = messages(source)
     np.testing.assert_array_equal(cov_uv_px2, recorded.rig.cov_uv_px2)
     assert noise == recorded.noise
 
@@ -42,22 +42,22 @@ def test_a_warning_of_times_that_are_not_run_is_none_of_the_runs_results() -> No
 
 def test_a_pixel_sigma_is_that_of_the_columns_and_the_row_keeps_its_proportion() -> None:
     recorded = load_sequence("drive").rig.cov_uv_px2
-    cov_uv_px2, _ = told("drive", pixel_sigma_px=0.7)
+    cov_uv_px2, _ = messages("drive", pixel_sigma_px=0.7)
     np.testing.assert_allclose(np.diag(cov_uv_px2)[:2], 0.49, rtol=1e-12)
     np.testing.assert_allclose(cov_uv_px2 / cov_uv_px2[0, 0], recorded / recorded[0, 0], rtol=1e-12)
 
 
-def test_a_pixel_sigma_that_the_tracks_refute_is_told() -> None:
+def test_a_pixel_sigma_that_the_tracks_refute_is_reported() -> None:
     """The audit reads the recording's own noise; estimators are told the one of the settings."""
-    for sigma_px, told in ((1.0, None), (30.0, "30 times too large"), (0.1, "9.99 times too small")):
-        asked = Recording("drive", duration_s=5.0, noise=Noise(pixel_sigma_px=sigma_px))
-        said = {finding.fault: finding.detail for finding in prepare(asked).findings if finding.warning}
-        assert set(said) == ({"track-scatter"} if told else set())
-        assert told is None or told in said["track-scatter"]
+    for sigma_px, expected in ((1.0, None), (30.0, "30 times too large"), (0.1, "9.99 times too small")):
+        requested = Recording("drive", duration_s=5.0, noise=Noise(pixel_sigma_px=sigma_px))
+        reported = {finding.fault: finding.detail for finding in prepare(requested).findings if finding.warning}
+        assert set(reported) == ({"track-scatter"} if expected else set())
+        assert expected is None or expected in reported["track-scatter"]
 
 
 def test_a_factor_on_twists_scales_both_densities() -> None:
-    before, (_, after) = load_sequence("drive").noise, told("drive", motion_scale=3.0)
+    before, (_, after) = load_sequence("drive").noise, messages("drive", motion_scale=3.0)
     assert isinstance(before, TwistNoise)
     assert isinstance(after, TwistNoise)
     np.testing.assert_array_equal(after.velocity_noise_density, 3.0 * before.velocity_noise_density)
@@ -65,7 +65,7 @@ def test_a_factor_on_twists_scales_both_densities() -> None:
 
 
 def test_a_factor_on_an_imu_leaves_its_random_walks() -> None:
-    before, (_, after) = load_sequence("drive-imu").noise, told("drive-imu", motion_scale=3.0)
+    before, (_, after) = load_sequence("drive-imu").noise, messages("drive-imu", motion_scale=3.0)
     assert isinstance(before, ImuNoise)
     densities = ("gyro_noise_density", "accel_noise_density")
     assert after == replace(before, **{name: 3.0 * getattr(before, name) for name in densities})
@@ -89,7 +89,7 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "undecided", "audited_s"),
+    ("requested", "undecided", "audited_s"),
     [
         (Recording("drive", max_frames=7), {}, [30]),
         (Recording("flight", max_frames=7), {}, [40]),
@@ -101,23 +101,23 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
     ],
 )
 def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_that_tells_too_little(
-    asked: Recording, undecided: dict[str, str], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
+    requested: Recording, undecided: dict[str, str], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths_s: list[float] = []
 
-    def told(sequence: Sequence, _keep: frozenset[str]) -> Audit:
+    def messages(sequence: Sequence, _keep: frozenset[str]) -> Audit:
         lengths_s.append(sequence.duration_s)
         return Audit(sequence, (), undecided)
 
-    monkeypatch.setattr(recording, "audit", told)
-    prepared = prepare(asked)
+    monkeypatch.setattr(recording, "audit", messages)
+    prepared = prepare(requested)
     assert lengths_s == audited_s
     assert (prepared.whole.duration_s, prepared.undecided) == (60.0, undecided)
-    prepare(replace(asked, source=prepared.whole))  # as a recording of somebody's own
+    prepare(replace(requested, source=prepared.whole))  # as a recording of somebody's own
     assert lengths_s[-1] == 60.0
 
 
-def test_a_part_is_what_lies_between_its_times_thinned_and_is_told() -> None:
+def test_a_part_is_what_lies_between_its_times_thinned_and_is_reported() -> None:
     whole = load_sequence("drive").truncated(40)  # 10 Hz
     prepared = prepare(Recording(whole, part=Part(1.0, 3.0, 3), max_frames=5))
     np.testing.assert_array_equal(prepared.sequence.frames_t_ns, whole.frames_t_ns[10:31:3][:5])
@@ -152,8 +152,8 @@ def test_the_truth_of_thinned_frames_is_at_those_that_stay_and_its_own_where_it_
     np.testing.assert_array_equal(thinned.truth.T_world_imu, truth.T_world_imu[:21:5])
     np.testing.assert_array_equal(thinned.truth.v_world, truth.v_world[:21:5])
     elsewhere = replace(whole, truth=replace(truth, t_ns=truth.t_ns + 2_000_000))
-    for asked in (replace(every, source=elsewhere), Recording(whole)):
-        kept = prepare(asked).sequence.truth
+    for requested in (replace(every, source=elsewhere), Recording(whole)):
+        kept = prepare(requested).sequence.truth
         assert kept is not None
         assert kept.t_ns.size == truth.t_ns.size
 
@@ -164,7 +164,7 @@ def test_a_part_without_two_frames_is_refused_with_what_there_is() -> None:
         prepare(Recording(whole, part=Part(5.0)))
 
 
-def test_a_budget_of_tracks_is_kept_and_told() -> None:
+def test_a_budget_of_tracks_is_kept_and_reported() -> None:
     prepared = prepare(Recording(load_sequence("drive").truncated(20), tracks=TrackUse(budget=25)))
     assert np.bincount(prepared.sequence.visible.frame).max() == 25
     assert prepared.sequence.provenance.facts[-1].startswith(
@@ -173,22 +173,22 @@ def test_a_budget_of_tracks_is_kept_and_told() -> None:
     assert prepared.whole.track_budget is None
 
 
-def test_what_moves_is_left_out_where_it_is_asked_for_and_told() -> None:
+def test_what_moves_is_left_out_where_it_is_requested_and_reported() -> None:
     among = moving_objects(simulate(replace(DRIVE, duration_s=2.0), 0), dose=0.4, seed=0)
     plain = prepare(Recording(among))
-    asked = prepare(Recording(among, tracks=TrackUse(leave_out_moving=True, budget=60), card=True))
+    requested = prepare(Recording(among, tracks=TrackUse(leave_out_moving=True, budget=60), card=True))
     assert plain.sequence is among
-    assert asked.sequence.content_hash() != plain.sequence.content_hash()
-    np.testing.assert_array_equal(asked.sequence.held_out.uv_px, plain.sequence.held_out.uv_px)
-    assert np.bincount(asked.sequence.visible.frame).max() == 60
-    told = next(fact for fact in asked.sequence.provenance.facts if "tracks.leave_out_moving" in fact)
-    gone = len(among.observations) - len(asked.sequence.observations)
+    assert requested.sequence.content_hash() != plain.sequence.content_hash()
+    np.testing.assert_array_equal(requested.sequence.held_out.uv_px, plain.sequence.held_out.uv_px)
+    assert np.bincount(requested.sequence.visible.frame).max() == 60
+    messages = next(fact for fact in requested.sequence.provenance.facts if "tracks.leave_out_moving" in fact)
+    gone = len(among.observations) - len(requested.sequence.observations)
     visible = len(among.observations) - len(among.held_out)
     assert gone > 0.1 * visible
-    assert f"{gone / visible:.1%} of the sightings, of " in told
-    assert asked.card is not None
-    assert asked.card.left_out == gone / visible
-    np.testing.assert_array_equal(asked.prior.T_world_imu, plain.prior.T_world_imu)
+    assert f"{gone / visible:.1%} of the sightings, of " in messages
+    assert requested.card is not None
+    assert requested.card.left_out == gone / visible
+    np.testing.assert_array_equal(requested.prior.T_world_imu, plain.prior.T_world_imu)
 
 
 def test_a_plan_reads_its_recordings_by_the_settings() -> None:

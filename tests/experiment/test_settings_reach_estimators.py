@@ -69,17 +69,17 @@ def test_an_estimator_is_given_its_options_and_the_common_settings(tunable: str)
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "expected"),
     [
         ({"tunable": {"gian": 1.0}}, "estimator tunable has no option gian; it has gain, mode"),
         ({"plain": {"gain": 1.0}}, "estimator plain has no option gain; it has none"),
     ],
 )
 def test_an_option_nobody_reads_is_refused_before_anything_runs(
-    tunable: str, monkeypatch: pytest.MonkeyPatch, options: dict[str, dict[str, float]], told: str
+    tunable: str, monkeypatch: pytest.MonkeyPatch, options: dict[str, dict[str, float]], expected: str
 ) -> None:
     monkeypatch.setattr(runner, "run", None)
-    with pytest.raises(EstimatorError, match=told):
+    with pytest.raises(EstimatorError, match=expected):
         prepared_cases(plan({"estimators": options}, tunable, "plain"), Workers(1))
 
 

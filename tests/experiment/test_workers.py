@@ -126,8 +126,8 @@ def by_place(units: list[Any], workers: int, work: Any) -> list[Any]:
 
 def test_processes_equal_one_process_bit_for_bit(units: Units) -> None:
     """Several seeds and several estimators, a smoother with them: scores, trajectories and landmarks."""
-    asked = units((0, 1), ("dead-reckoning", "ekf", "batch"))
-    for one, other in zip(by_place(asked, 2, run_unit), by_place(asked, 1, run_unit), strict=True):
+    requested = units((0, 1), ("dead-reckoning", "ekf", "batch"))
+    for one, other in zip(by_place(requested, 2, run_unit), by_place(requested, 1, run_unit), strict=True):
         _assert_equal(one, other)
 
 
@@ -187,7 +187,7 @@ def test_an_error_of_the_recording_ends_everything_at_once(jobs: Jobs, work: Mod
     assert time.monotonic() - began < 300.0  # the other process, asleep for ten minutes, was not waited for
 
 
-def test_a_defect_is_told_with_the_traceback_of_its_process(jobs: Jobs, work: ModuleType) -> None:
+def test_a_defect_is_reported_with_the_traceback_of_its_process(jobs: Jobs, work: ModuleType) -> None:
     with pytest.raises(ZeroDivisionError, match="a defect") as raised:
         list(results_of(jobs((0,)), 2, work.is_broken, SILENT))
     assert "in is_broken" in str(raised.value.__cause__)
@@ -216,9 +216,9 @@ def test_a_process_that_has_a_recording_ready_gets_what_needs_it_while_others_ha
     jobs: Jobs, work: ModuleType
 ) -> None:
     """Two processes, six seeds: only at the end may both have worked on one seed."""
-    asked = jobs(tuple(range(6)), ("batch", "ekf", "riekf"))
-    found = dict(results_of(asked, 2, work.names_its_process, SILENT, lambda job: job.seed))
-    processes = [{found[place] for place, job in enumerate(asked) if job.seed == seed} for seed in range(6)]
+    requested = jobs(tuple(range(6)), ("batch", "ekf", "riekf"))
+    found = dict(results_of(requested, 2, work.names_its_process, SILENT, lambda job: job.seed))
+    processes = [{found[place] for place, job in enumerate(requested) if job.seed == seed} for seed in range(6)]
     assert sorted(map(len, processes))[:5] == [1] * 5
 
 
@@ -233,19 +233,19 @@ def test_processes_go_on_while_the_reader_of_their_results_is_busy(
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_progress_is_that_of_all_units_and_never_goes_back(jobs: Jobs, work: ModuleType, workers: int) -> None:
-    heard: list[tuple[int, int]] = []
+    received: list[tuple[int, int]] = []
 
     class Listening:
         def advance(self, done: int, total: int, stage: str = "") -> None:
-            heard.append((done, total))
+            received.append((done, total))
             if done:
                 work.MARK.touch()  # no unit ends before it was heard of
 
-    asked = jobs((0, 1), ("ekf",))
-    assert sorted(result for _, result in results_of(asked, workers, work.goes_on, Listening())) == [0, 1]
-    shares = [done / total for done, total in heard]
+    requested = jobs((0, 1), ("ekf",))
+    assert sorted(result for _, result in results_of(requested, workers, work.goes_on, Listening())) == [0, 1]
+    shares = [done / total for done, total in received]
     assert shares == sorted(shares)
-    assert len({total for _, total in heard}) == 1
+    assert len({total for _, total in received}) == 1
     assert any(0.0 < share < 0.5 for share in shares)
     assert shares[-1] == 1.0 or workers == 1
 
@@ -273,10 +273,10 @@ def test_an_interrupt_is_130_in_one_line_and_leaves_what_has_ended_and_no_proces
         _wait_until(lambda: any(map(_has_begun, tmp_path.glob("vislam-*/progress"))))
     time.sleep(0.2)
     os.killpg(vislam.pid, signal.SIGINT)  # as a terminal does: to every process of the group
-    _, told = vislam.communicate(timeout=300)
+    _, messages = vislam.communicate(timeout=300)
     assert vislam.returncode == 130
-    assert (told.startswith("vislam: error: interrupted; what "), told.count("\n")) == (True, 1)
-    assert (tmp_path / "run").exists() == ("what has ended is kept in run" in told)
+    assert (messages.startswith("vislam: error: interrupted; what "), messages.count("\n")) == (True, 1)
+    assert (tmp_path / "run").exists() == ("what has ended is kept in run" in messages)
     assert {path.name for path in tmp_path.rglob("*")} <= {"run", "outcomes.jsonl"}
     _assert_gone(vislam.pid)
 

@@ -33,7 +33,7 @@ class Tree(Struct, frozen=True, kw_only=True):
     note: str | UnsetType = UNSET
 
 
-def told(text: str | bytes) -> str:
+def reported(text: str | bytes) -> str:
     with pytest.raises(DataError) as raised:
         parse(text, Tree)
     assert "\n" not in str(raised.value)
@@ -83,20 +83,20 @@ def test_a_record_that_breaks_its_rule_cannot_be_made() -> None:
     ],
 )
 def test_the_place_is_named_with_every_key(body: str, expected: str) -> None:
-    assert expected in told(of(body))
+    assert expected in reported(of(body))
 
 
 @pytest.mark.parametrize("text", ["", "{", "\x00", "[" * 100_000, b"\xff\xfe\x00", '{"schema": "test.tree/1"'])
-def test_what_is_not_json_is_told(text: str | bytes) -> None:
-    assert "cannot be read as JSON" in told(text)
+def test_what_is_not_json_is_reported(text: str | bytes) -> None:
+    assert "cannot be read as JSON" in reported(text)
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null", "{}", '{"schema": null}', '{"schema": NaN}', '{"schema": []}'])
-def test_what_has_another_schema_is_told(text: str) -> None:
-    assert "has not the schema test.tree/1" in told(text)
+def test_what_has_another_schema_is_reported(text: str) -> None:
+    assert "has not the schema test.tree/1" in reported(text)
 
 
-def test_the_file_and_the_remedy_are_told(tmp_path: Path) -> None:
+def test_the_file_and_the_remedy_are_reported(tmp_path: Path) -> None:
     path = tmp_path / "tree.json"
     with pytest.raises(DataError, match=r"tree\.json is missing; plant one$"):
         read(path, Tree, remedy="plant one")

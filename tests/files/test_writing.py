@@ -73,7 +73,7 @@ def test_of_a_link_the_file_behind_it_is_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "new"
 
 
-def test_a_place_where_no_file_can_be_is_told_before_there_is_anything_to_write(tmp_path: Path) -> None:
+def test_a_place_where_no_file_can_be_is_reported_before_there_is_anything_to_write(tmp_path: Path) -> None:
     pipe, file = tmp_path / "pipe", tmp_path / "file"
     os.mkfifo(pipe)
     file.write_text("kept")
@@ -97,7 +97,7 @@ def test_a_signal_waits_until_something_is_in_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("theirs", "ours", "told"),
+    ("theirs", "ours", "expected"),
     [
         ("what I must not forget", "<!doctype html>", True),
         ("what I must not forget", "0.0 1 2 3", True),
@@ -108,7 +108,7 @@ def test_a_signal_waits_until_something_is_in_its_place() -> None:
     ],
 )
 def test_a_file_is_replaced_by_a_later_version_of_itself_alone(
-    tmp_path: Path, theirs: str, ours: str, told: bool
+    tmp_path: Path, theirs: str, ours: str, expected: bool
 ) -> None:
     target = tmp_path / "file"
     target.write_text(theirs)
@@ -117,10 +117,10 @@ def test_a_file_is_replaced_by_a_later_version_of_itself_alone(
         with replaced_file(target) as partial:
             partial.write_text(ours)
 
-    if told:
+    if expected:
         with pytest.raises(OutputError, match="a file of another kind, which would be lost"):
             write()
     else:
         write()
-    assert target.read_text() == (theirs if told else ours)
+    assert target.read_text() == (theirs if expected else ours)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]

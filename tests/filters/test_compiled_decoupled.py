@@ -112,7 +112,7 @@ def test_compiled_and_numpy_predict_alike(compiled, turn_rate, scaled):
     assert np.array_equal(theirs.cov, theirs.cov.T)
 
 
-def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
+def test_numpy_runs_where_nothing_is_set_and_where_it_is_requested():
     for compilation in (Compilation(), Compilation("numpy")):
         found = decoupled_steps(TwistModel(NOISE), NOISE, compilation)
         assert (found.correct, found.start) == (correction.corrected, landmark_map.started)

@@ -33,9 +33,9 @@ CORRELATED = TrackNoise(np.array([1.0, 1.8, 1.2]), np.full(3, 0.15), np.array([0
 @pytest.fixture(scope="module")
 def kernels():
     pytest.importorskip("numba", reason="the extra 'fast' is not installed: there is nothing compiled to compare")
-    asked = Compilation("compiled")
-    gate, in_view = compiled_parts.track_test(asked), compiled_parts.steps_in_view(asked)
-    return gate, in_view, compiled_parts.learning(asked), compiled_parts.images(asked)
+    requested = Compilation("compiled")
+    gate, in_view = compiled_parts.track_test(requested), compiled_parts.steps_in_view(requested)
+    return gate, in_view, compiled_parts.learning(requested), compiled_parts.images(requested)
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_compiled_and_numpy_follow_the_same_landmarks(kernels, flight):
     np.testing.assert_array_equal(ours.weights, theirs.weights)
 
 
-def test_nothing_is_told_by_no_track(kernels, flight):
+def test_nothing_is_learnt_from_no_track(kernels, flight):
     rig, window = flight
     none = followed_in(rig, window).select(np.zeros(TRACKS, dtype=bool))
     for tell in (tracks_in_view.information, kernels[1].information):
@@ -189,7 +189,7 @@ def test_no_track_is_no_row(compiled, flight):
     assert len(result.nis) == len(result.H) == len(result.residuals) == 0
 
 
-def test_numpy_runs_where_nothing_is_said_and_where_it_is_asked_for():
+def test_numpy_runs_where_nothing_is_set_and_where_it_is_requested():
     for compilation in (Compilation(), Compilation("numpy")):
         assert compiled_parts.track_test(compilation) is track_gate.tested
         assert compiled_parts.steps_in_view(compilation) is tracks_in_view.NUMPY
@@ -204,8 +204,8 @@ def test_importing_the_toolkit_and_its_estimators_imports_no_numba():
         "[entry.load() for entry in discover().values()]\n"
         "print('numba' in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.strip() == "False"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert printed.stdout.strip() == "False"
 
 
 def test_what_was_kept_is_compiled_anew_when_any_source_of_its_folder_changes(kernels, tmp_path, monkeypatch):

@@ -69,6 +69,6 @@ def test_compiled_and_gtsam_have_the_same_transition_between_other_states_and_th
     assert ours.factors(1).equals(theirs.factors(1), TOLERANCE)
 
 
-def test_gtsam_preintegrates_where_nothing_is_said_and_where_numpy_is_asked_for():
+def test_gtsam_preintegrates_where_nothing_is_set_and_where_numpy_is_requested():
     for compilation in (Compilation(), Compilation("numpy")):
         assert isinstance(compiled_parts.integrator(NOISE, GRAVITY, compilation), ImuModel)

@@ -149,7 +149,7 @@ def test_a_landmark_that_is_indeterminate_though_held_is_dropped_with_its_sighti
     assert window.add(chain_link(1), NS_PER_S).log == []
 
 
-def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_told_before():
+def test_a_landmark_dropped_with_its_sightings_leaves_to_the_others_what_it_contributed_before():
     """The position that saw it has left, so the prior holds the landmark: it is marginalised, not cut out."""
     window, everything, start = unchained(2 * NS_PER_S), gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(5):

@@ -28,7 +28,7 @@ def recording():
     return replace(blind, prior=start_from_measurements(blind))
 
 
-def test_the_decoupled_filter_that_ran_off_is_said_to_have_diverged(recording, run_estimator):
+def test_the_decoupled_filter_that_ran_off_is_reported_to_have_diverged(recording, run_estimator):
     run = run_estimator("ekf", recording)
     assert score_run(run, "causal", recording, only=["ate_yaw_m"]).values["ate_yaw_m"] > 1.0
     assert run.status == "diverged"

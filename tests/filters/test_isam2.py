@@ -425,8 +425,8 @@ def test_a_landmark_is_linearised_badly_where_its_linear_image_is_off_by_a_share
     before = transform(pose @ rig.T_imu_cam, camera)
     now = transform(pose @ rig.T_imu_cam, camera * np.exp(rng.normal(0.0, 0.1, (200, 1))) + rng.normal(0.0, 0.01, 3))
     linear, there = stereo.predict(before, pose, rig), stereo.predict(now, pose, rig)
-    said_px = linear.uv_px + (linear.d_uv_d_point @ (now - before)[..., None])[..., 0]
-    off = np.linalg.norm((said_px - there.uv_px) @ rig.whitener.T, axis=1)
+    reported_px = linear.uv_px + (linear.d_uv_d_point @ (now - before)[..., None])[..., 0]
+    off = np.linalg.norm((reported_px - there.uv_px) @ rig.whitener.T, axis=1)
     badly = linearisation_error.linearised_badly(now, before, pose, rig)
     np.testing.assert_array_equal(badly, off > linearisation_error.LANDMARK_BEYOND_SIGMA)
     assert 20 < badly.sum() < 180

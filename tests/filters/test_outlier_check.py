@@ -42,7 +42,7 @@ def landmarks_of(scenario: Scenario, seed: int) -> dict[int, np.ndarray]:
     return points
 
 
-def test_errors_of_twenty_pixels_are_told_from_sound_sightings():
+def test_errors_of_twenty_pixels_are_distinguished_from_sound_sightings():
     """Which sightings are wrong is known because their stream of randomness moves no other."""
     sequence = simulate(MISMATCHED, 3)
     struck = (sequence.visible.uv_px != simulate(CLEAN, 3).visible.uv_px).any(axis=1)

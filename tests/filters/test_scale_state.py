@@ -110,7 +110,7 @@ def test_states_and_scale_have_the_covariance_of_gtsams_marginals():
         np.testing.assert_allclose(covs[k], state_cov(motion, tree, k, np.eye(3)), rtol=1e-7, atol=1e-9)
 
 
-def scale_told(run):
+def scale_reported(run):
     """Return the scale and its sigma as the log of a run has them."""
     words = run.log[0].split()
     return 0.01 * float(words[2]), 0.01 * float(words[4])
@@ -120,7 +120,7 @@ def scale_told(run):
 def test_a_planted_scale_is_found_within_its_sigmas_and_the_path_is_as_long_as_it_was(planted, seed, run_estimator):
     sequence = disparity_scale(simulate(replace(DRIVE, duration_s=3.0), seed), planted)
     without, run = run_estimator("batch", sequence), run_estimator("batch", sequence, settings=WITH_SCALE)
-    found, sigma = scale_told(run)
+    found, sigma = scale_reported(run)
     assert 0.0 < sigma < 0.003  # 0.05 m/s over 30 samples of 9 m/s would tell 0.0010, less what the tracks take of it
     assert abs(found - planted) < 3.0 * sigma
     errors_m = [score_run(one, "final", sequence, only=["ate_none_m"]).values["ate_none_m"] for one in (without, run)]
@@ -135,7 +135,7 @@ def test_images_alone_do_not_tell_the_scale(run_estimator):
     sequence = disparity_scale(simulate(replace(DRIVE, duration_s=2.0), 0), 0.01)
     images = replace(sequence, motion=NoSamples(sequence.frames_t_ns), noise=unmeasured_motion())
     known, run = (run_estimator("batch", images, settings=settings) for settings in (Settings(), WITH_SCALE))
-    found, sigma = scale_told(run)
+    found, sigma = scale_reported(run)
     assert sigma > 0.0095 and abs(found) < 0.002
     assert "do not tell" in run.log[0]
     travelled_m = np.linalg.norm(images.truth.T_world_imu[-1, :3, 3] - images.truth.T_world_imu[0, :3, 3])
@@ -143,5 +143,5 @@ def test_images_alone_do_not_tell_the_scale(run_estimator):
     assert np.sqrt(widened) == pytest.approx(0.01 * travelled_m, rel=0.2)
 
 
-def test_what_the_scale_came_to_is_said_with_its_prior():
+def test_what_the_scale_came_to_is_reported_with_its_prior():
     assert "+1.20 +- 0.30 % longer than the rig says (prior 0 +- 1 %)" in ScaleState(0.01).message_of(0.012, 0.003)

@@ -31,18 +31,18 @@ class Listener:
         self.packets: list[Packet] = []
         self._motion = motion_model(setup.noise, setup.gravity_world)
         self._belief = self._motion.initial_belief(setup.prior)
-        self._said: list[Estimate] = []
+        self._reported: list[Estimate] = []
 
     def step(self, packet: Packet) -> Estimate:
         if packet.motion is not None:
             increment = self._motion.integrate(packet.motion, self._belief.bias)
             self._belief = self._belief.predicted(increment.predict(self._belief))
         self.packets.append(packet)
-        self._said.append(self._belief.estimate(packet.frame.t_ns))
-        return self._said[-1]
+        self._reported.append(self._belief.estimate(packet.frame.t_ns))
+        return self._reported[-1]
 
     def finish(self) -> Finished:
-        return Finished(Trajectory.of(self._said), Landmarks.none())
+        return Finished(Trajectory.of(self._reported), Landmarks.none())
 
 
 def thinned(sequence, window):

@@ -25,7 +25,7 @@ SETTINGS = Settings(noise=Noise(match_tracks=False), outliers=POLICIES["none"])
     [(msckf_fej, 10.0), (msckf_slam, 10.0), (fixed_lag, 20.0)],
     ids=["msckf_fej", "msckf_slam", "fixed_lag"],
 )
-def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_told(estimator, rate_hz, oracle):
+def test_the_covariance_is_that_of_the_errors_where_the_noise_of_tracks_is_reported(estimator, rate_hz, oracle):
     messages, white = [], []
     scenario = replace(SCENARIO, camera=replace(SCENARIO.camera, rate_hz=rate_hz))
     for seed in range(3):

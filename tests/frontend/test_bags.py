@@ -264,7 +264,7 @@ def test_poses_of_another_frame_are_moved_to_the_body(asl: Path, tmp_path: Path)
     np.testing.assert_allclose(truth.T_world_imu, expected.T_world_imu, atol=1e-9)
 
 
-def test_topics_are_those_said(asl: Path, tmp_path: Path) -> None:
+def test_topics_are_those_stated(asl: Path, tmp_path: Path) -> None:
     ros = Ros.of("sqlite")
     film = [
         item._replace(topic=item.topic.replace("/cam0/", "/port/").replace("/cam1/", "/starboard/"))
@@ -316,13 +316,13 @@ def test_the_name_of_a_bag_does_not_matter(asl: Path, tmp_path: Path, kind: str)
         ),
     ],
 )
-def test_what_is_missing_is_told_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:
+def test_what_is_missing_is_reported_in_one_line(asl: Path, tmp_path: Path, left_out: str, pattern: str) -> None:
     ros = Ros.of("sqlite")
     film = film_of(asl, ros)
     film = [item for item in [*film, *calibration_of(asl, ros, film[0].t_ns)] if not item.topic.endswith(left_out)]
-    with pytest.raises(DataError, match=pattern) as told:
+    with pytest.raises(DataError, match=pattern) as raised:
         load_sequence(str(ros.write(tmp_path / "bare", film)))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 Edited = Callable[[Ros, list[Item]], list[Item]]
@@ -470,13 +470,13 @@ def with_a_second_imu(ros: Ros, film: list[Item]) -> list[Item]:
         (with_a_second_imu, r"'base_link' and 'cam0'.*or name another Imu with --topics imu=TOPIC \(/imu0\)"),
     ],
 )
-def test_what_does_not_belong_together_is_told_in_one_line(
+def test_what_does_not_belong_together_is_reported_in_one_line(
     asl: Path, tmp_path: Path, edit: Edited, pattern: str
 ) -> None:
     ros = Ros.of("ros1")
-    with pytest.raises(DataError, match=pattern) as told:
+    with pytest.raises(DataError, match=pattern) as raised:
         load_sequence(str(ros.write(tmp_path / "film.bag", edit(ros, bare(ros, asl)))))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_where_images_have_no_stamp_it_is_when_they_were_recorded(asl: Path, tmp_path: Path) -> None:
@@ -533,10 +533,10 @@ def test_a_damaged_bag_is_read_or_refused_in_one_line(asl: Path, tmp_path: Path,
         flipped = content[:place] + bytes([content[place] ^ 0x5A]) + content[place + 1 :]
         for damaged in (content[:place], flipped):
             file.write_bytes(damaged)
-            with pytest.raises(DataError) as told:
+            with pytest.raises(DataError) as raised:
                 load_sequence(str(file))
-            assert "\n" not in str(told.value)
-            assert str(file) in str(told.value)
+            assert "\n" not in str(raised.value)
+            assert str(file) in str(raised.value)
 
 
 def test_an_odometer_of_a_truths_name_is_offered_and_not_taken_unasked(asl: Path, tmp_path: Path) -> None:
@@ -602,8 +602,8 @@ def test_a_bag_that_breaks_off_leaves_nothing_behind(
     broken = ros.image(film[-2].t_ns, "cam1", np.zeros((4, 4), np.uint8), encoding="32FC1")
     path = written(asl, "ros1", tmp_path / "bag", [*film, broken])
     assert main(["compare", str(path), "--estimators", "dead-reckoning", "--out", str(tmp_path / "run")]) == 3
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "/cam1/image_raw: message" in told
+    messages = capsys.readouterr().err
+    assert messages.count("\n") == 1
+    assert "/cam1/image_raw: message" in messages
     assert not (tmp_path / "run").exists()
     assert list(own_cache.glob("images-*")) == []

@@ -41,7 +41,7 @@ def test_images_are_the_default_where_they_are_there(asl: Path) -> None:
     assert load_sequence(str(asl), 5).content_hash() == sequence.content_hash()
 
 
-def test_simulated_tracks_are_those_asked_for(asl: Path) -> None:
+def test_simulated_tracks_are_those_requested(asl: Path) -> None:
     simulated = Frontend(tracks="simulated")
     assert load_sequence(str(asl), 0, simulated).name == "film (simulated stereo)"
     assert is_drawn_from_a_seed(str(asl), simulated)
@@ -231,7 +231,7 @@ def test_the_same_images_in_another_guise_give_the_same_tracks(asl: Path, change
     np.testing.assert_array_equal(after.frames_t_ns, before.frames_t_ns)
 
 
-def test_stamps_out_of_order_are_sorted_and_said(asl: Path) -> None:
+def test_stamps_out_of_order_are_sorted_and_reported(asl: Path) -> None:
     before = load_sequence(str(asl))
     reverse_rows(asl / "mav0/cam0/data.csv")
     after = load_sequence(str(asl))
@@ -239,7 +239,7 @@ def test_stamps_out_of_order_are_sorted_and_said(asl: Path) -> None:
     assert any("out of order" in fact for fact in after.provenance.facts)
 
 
-def test_a_left_image_without_a_right_one_is_said(asl: Path) -> None:
+def test_a_left_image_without_a_right_one_is_reported(asl: Path) -> None:
     lines = (asl / "mav0/cam1/data.csv").read_text().splitlines()
     (asl / "mav0/cam1/data.csv").write_text("\n".join([*lines[:5], *lines[6:]]) + "\n")
     after = load_sequence(str(asl), 0, Frontend(tracks="images"))
@@ -247,7 +247,7 @@ def test_a_left_image_without_a_right_one_is_said(asl: Path) -> None:
     assert any("1 left images have no right one" in fact for fact in after.provenance.facts)
 
 
-def test_a_camera_that_stalled_is_said_and_its_frames_left_out(asl: Path) -> None:
+def test_a_camera_that_stalled_is_reported_and_its_frames_left_out(asl: Path) -> None:
     for camera in (0, 1):
         for path in images(asl, camera)[4:7]:
             shutil.copy(images(asl, camera)[3], path)
@@ -256,7 +256,7 @@ def test_a_camera_that_stalled_is_said_and_its_frames_left_out(asl: Path) -> Non
     assert any("3 of 10 image pairs" in fact and "those of the pair before" in fact for fact in after.provenance.facts)
 
 
-def test_a_truth_that_turns_otherwise_than_the_gyro_is_said(asl: Path) -> None:
+def test_a_truth_that_turns_otherwise_than_the_gyro_is_reported(asl: Path) -> None:
     def stranger() -> bool:
         return any("turns otherwise than the gyro" in fact for fact in load_sequence(str(asl)).provenance.facts)
 
@@ -269,7 +269,7 @@ def test_a_truth_that_turns_otherwise_than_the_gyro_is_said(asl: Path) -> None:
     assert stranger()
 
 
-def test_images_outside_the_time_of_the_imu_are_said(asl: Path) -> None:
+def test_images_outside_the_time_of_the_imu_are_reported(asl: Path) -> None:
     imu = asl / "mav0/imu0/data.csv"
     t_ns = load_sequence(str(asl)).frames_t_ns
     lines = imu.read_text().splitlines()
@@ -361,12 +361,12 @@ def test_a_folder_that_cannot_be_used_is_one_clear_line(
     """From end to end: status 3, one line that names the fault, and nothing written."""
     spoil(asl)
     before = sorted(asl.parent.iterdir())
-    asked = ("--tracks", "images", "--estimators", "dead-reckoning", "--out", str(asl.parent / "run"))
-    assert main(["compare", str(asl), *asked]) == 3
-    told = capsys.readouterr().err
-    assert told.startswith("vislam: error: ")
-    assert told.count("\n") == 1
-    assert re.search(complaint, told)
+    requested = ("--tracks", "images", "--estimators", "dead-reckoning", "--out", str(asl.parent / "run"))
+    assert main(["compare", str(asl), *requested]) == 3
+    messages = capsys.readouterr().err
+    assert messages.startswith("vislam: error: ")
+    assert messages.count("\n") == 1
+    assert re.search(complaint, messages)
     assert sorted(asl.parent.iterdir()) == before
 
 
@@ -374,17 +374,17 @@ def test_there_are_forty_faulty_folders() -> None:
     assert len(LEFT_OUT) + len(USED) + len(REFUSED) >= 40
 
 
-def test_the_commonest_fault_is_the_one_told(asl: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commonest_fault_is_the_one_reported(asl: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images(asl, 0)[0].write_bytes(b"")
     for path in images(asl, 0)[1:]:
         point_to_lfs(path)
     assert main(["compare", str(asl), "--tracks", "images", "--out", str(asl.parent / "run")]) == 3
-    told = capsys.readouterr().err
-    assert "git lfs pull" in told
-    assert "it is empty" not in told
+    messages = capsys.readouterr().err
+    assert "git lfs pull" in messages
+    assert "it is empty" not in messages
 
 
-def test_of_a_recording_with_few_of_its_images_these_are_used_where_asked_for(asl: Path) -> None:
+def test_of_a_recording_with_few_of_its_images_these_are_used_where_requested(asl: Path) -> None:
     for path in images(asl, 1)[2:9]:
         path.unlink()
     sequence = load_sequence(str(asl), 0, Frontend(tracks="images"))

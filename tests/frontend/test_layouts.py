@@ -76,7 +76,7 @@ def test_a_camera_alone_is_no_pair(asl: Path) -> None:
         load_sequence(str(asl))
 
 
-def test_cameras_without_an_imu_are_told_what_to_do(asl: Path) -> None:
+def test_cameras_without_an_imu_are_reported_with_what_to_do(asl: Path) -> None:
     (asl / "mav0/imu0/data.csv").unlink()
     with pytest.raises(DataError, match=r"no imu0.csv of Kalibr's: name the folder that has mav0, or rectify"):
         load_sequence(str(asl))

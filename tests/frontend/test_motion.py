@@ -89,7 +89,7 @@ def test_a_far_point_may_be_off_by_what_its_disparity_leaves_open(rig: Rectified
     assert not rigidity.agrees(*elsewhere, np.arange(TRACKS))[SLIDING]
 
 
-def test_new_tracks_and_too_few_are_not_judged(rig: RectifiedPair) -> None:
+def test_new_tracks_and_too_few_are_not_checked(rig: RectifiedPair) -> None:
     rigidity = Rigidity.of(rig, 2.0)
     *before, last = flown(rig, NOISE_PX, 0.35)
     for shown in before:

@@ -139,7 +139,7 @@ def test_a_right_image_of_another_instant_is_refused_and_the_tracks_go_on(plain:
 
 
 @pytest.mark.parametrize(("late", "which"), [(-1, "after"), (1, "before")])
-def test_of_a_right_camera_that_is_one_pair_late_or_early_the_partner_is_told(
+def test_of_a_right_camera_that_is_one_pair_late_or_early_the_partner_is_reported(
     hasty: Filmed, tmp_path: Path, late: int, which: str
 ) -> None:
     last = len(hasty.images) - 1

@@ -59,7 +59,7 @@ def edited(measured: Measured, edit: Edit) -> Measured:
     return replace(measured, runs=runs)
 
 
-def judged(baseline: Baseline, now: list[Measured], *, speed: bool = True, accept_better: bool = False) -> Check:
+def checked(baseline: Baseline, now: list[Measured], *, speed: bool = True, accept_better: bool = False) -> Check:
     """Judge measurements that were never made against a baseline."""
     every, terms = CaseVerdicts(), CheckTerms(speed, accept_better)
     for (case, before), after in zip(baseline.cases, now, strict=True):
@@ -97,7 +97,7 @@ def gate() -> SimpleNamespace:
         as_measured=as_measured,
         another=as_another_trajectory,
         edited=edited,
-        judged=judged,
+        checked=checked,
         planted=planted,
         seeds=SEEDS,
     )

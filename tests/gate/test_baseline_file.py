@@ -52,7 +52,7 @@ def _run(document):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "expected"),
     [
         (lambda d: d.pop("schema"), "has not the schema vislam.baseline/1"),
         (lambda d: d.update(schema="vislam.baseline/9"), "its schema is 'vislam.baseline/9'"),
@@ -81,24 +81,24 @@ def _run(document):
         (lambda d: _run(d)["causal"].update(ate_se3_m=None), "ate_se3_m"),
     ],
 )
-def test_a_spoilt_baseline_is_told_in_one_line_with_the_place(path, spoil, told):
+def test_a_spoilt_baseline_is_reported_in_one_line_with_the_place(path, spoil, expected):
     document = json.loads(path.read_text())
     spoil(document)
     path.write_text(json.dumps(document))
-    with pytest.raises(BaselineError, match=told) as raised:
+    with pytest.raises(BaselineError, match=expected) as raised:
         load_baseline(path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "null", '{"schema": "vislam.baseline/1"}', "\x00"])
-def test_a_file_that_is_no_baseline_is_told(path, text):
+def test_a_file_that_is_no_baseline_is_reported(path, text):
     path.write_text(text)
     with pytest.raises(BaselineError, match=r"here\.json"):
         load_baseline(path)
 
 
-def test_a_file_cut_anywhere_is_told(path):
+def test_a_file_cut_anywhere_is_reported(path):
     text = path.read_text()
     for end in range(0, len(text) - 2, max(1, len(text) // 60)):
         path.write_text(text[:end])
@@ -106,7 +106,7 @@ def test_a_file_cut_anywhere_is_told(path):
             load_baseline(path)
 
 
-def test_a_file_that_is_not_there_is_told(tmp_path):
+def test_a_file_that_is_not_there_is_reported(tmp_path):
     with pytest.raises(BaselineError, match="is missing; make the baseline with vislam baseline"):
         load_baseline(tmp_path / "missing.json")
 

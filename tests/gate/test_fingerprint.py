@@ -72,7 +72,7 @@ def test_a_twist_recording_and_one_without_truth_have_one():
 def test_a_processor_with_other_instructions_has_the_same_fingerprint():
     """NumPy and OpenBLAS are told to do without their widest instructions, as on an older machine."""
     lesser = {"NPY_DISABLE_CPU_FEATURES": "X86_V4", "OPENBLAS_CORETYPE": "Haswell"}
-    told = [
+    messages = [
         subprocess.run(
             [sys.executable, "-W", "ignore", "-c", _PROGRAM],
             env=os.environ | given,
@@ -83,5 +83,5 @@ def test_a_processor_with_other_instructions_has_the_same_fingerprint():
         ).stdout.split()
         for given in ({}, lesser)
     ]
-    assert told[0] == told[1]
-    assert len(told[0]) == 4
+    assert messages[0] == messages[1]
+    assert len(messages[0]) == 4

@@ -74,9 +74,9 @@ def test_the_same_code_passes_bit_for_bit(vislam: Vislam, capsys: pytest.Capture
     verdicts = json.loads(Path("check.json").read_text())["verdicts"]
     assert {v["sequence"] for v in verdicts} == {"drive", "data-copy"}
     assert all(v["before"] == v["after"] for v in verdicts)
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert "the gate passes" in told.out
+    messages = capsys.readouterr()
+    assert messages.err == ""
+    assert "the gate passes" in messages.out
     assert {path.name for path in Path().iterdir()} == {"root", "base.json", "check.json", "check.xml", "check.md"}
 
 
@@ -102,9 +102,9 @@ def test_what_is_missing_is_1_and_named(vislam: Vislam, capsys: pytest.CaptureFi
     changed(lose)
     Path("root/data-copy").unlink()
     assert vislam(*CHECK) == 1
-    told = " ".join(capsys.readouterr().out.split())
-    assert "drive, oracle: estimator is missing: no estimator is called oracle" in told
-    assert "data-copy: sequence is missing: data-copy: no such file or directory" in told
+    messages = " ".join(capsys.readouterr().out.split())
+    assert "drive, oracle: estimator is missing: no estimator is called oracle" in messages
+    assert "data-copy: sequence is missing: data-copy: no such file or directory" in messages
 
 
 @pytest.mark.parametrize("allowed", [False, True])
@@ -116,9 +116,9 @@ def test_another_release_is_3_in_one_line_unless_allowed(
         assert vislam(*CHECK, "--allow-other-releases") == 0
         return
     assert vislam(*CHECK) == 3
-    told = capsys.readouterr().err
-    assert told.startswith("vislam: error: base.json: made with gtsam 4.2.0, here ")
-    assert told.count("\n") == 1
+    messages = capsys.readouterr().err
+    assert messages.startswith("vislam: error: base.json: made with gtsam 4.2.0, here ")
+    assert messages.count("\n") == 1
 
 
 def test_a_spoilt_baseline_is_3_in_one_line(vislam: Vislam, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,8 +127,8 @@ def test_what_is_timed_is_read_as_what_is_measured(monkeypatch):
     }
     settings = settings_of(changed, "here")
     (measured,) = recordings_of(Case("drive", True, (3,), ("ekf",), 1.0), settings)
-    asked = {"source": "drive", "seed": 3, "truth": None, "duration_s": 1.0, "settings": changes_of(settings)}
-    Timer().prepare(asked)
+    requested = {"source": "drive", "seed": 3, "truth": None, "duration_s": 1.0, "settings": changes_of(settings)}
+    Timer().prepare(requested)
     assert read == [measured]
 
 
@@ -147,7 +147,7 @@ def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("version", "told"),
+    ("version", "expected"),
     [
         ("v9", "--speed-against 'v9' is no revision of this checkout; name one that git log shows, or name a wheel"),
         ("--help", "'--help' is no revision of this checkout"),
@@ -156,15 +156,15 @@ def test_a_revision_is_unpacked_as_it_was(tmp_path, monkeypatch):
         ("empty.whl", "empty.whl brings no code of what runs here"),
     ],
 )
-def test_a_version_that_cannot_be_had_is_told(tmp_path, monkeypatch, capsys, version, told):
+def test_a_version_that_cannot_be_had_is_reported(tmp_path, monkeypatch, capsys, version, expected):
     monkeypatch.chdir(tmp_path)
     subprocess.run(["git", "init", "-q"], check=True)
     zipfile.ZipFile("empty.whl", "w").close()
     Path("base.json").write_text(to_text(baseline_of_a_drive()))
     assert main(["check", "--baseline", "base.json", f"--speed-against={version}"]) == 3
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert told in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert expected in printed
 
 
 def test_a_revision_that_a_shallow_clone_lacks_is_to_be_fetched(tmp_path, monkeypatch):
@@ -193,7 +193,7 @@ def test_speed_goes_with_runs_only(capsys, words):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_version_that_cannot_run_is_told(tmp_path):
+def test_a_version_that_cannot_run_is_reported(tmp_path):
     (tmp_path / "toolkit").mkdir()
     (tmp_path / "toolkit" / "__init__.py").write_text("raise ValueError('of another time')")
     with timers((tmp_path,), ()) as (old, _), pytest.raises(BaselineError, match=r"timed: ValueError: of another time"):

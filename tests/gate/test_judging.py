@@ -22,7 +22,7 @@ def with_values(measured, estimator, key, values):
 
 
 def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
-    check = gate.judged(baseline, gate.as_measured(baseline))
+    check = gate.checked(baseline, gate.as_measured(baseline))
     assert check.passed
     assert check.tests == 3 * 5  # estimators times metrics, on the simulated sequence
     assert {v.finding for v in check.verdicts} == {"same"}
@@ -34,7 +34,7 @@ def test_identical_results_pass_and_every_difference_is_zero(baseline, gate):
 @pytest.mark.parametrize("metric", ["ate_se3_m", "ate_yaw_m", "heldout_reproj_median_px"])
 def test_a_planted_regression_fails_and_nothing_else_does(baseline, gate, metric):
     simulated, recorded = gate.as_measured(baseline)
-    check = gate.judged(baseline, [gate.edited(simulated, gate.planted(5.0, 1, metric=metric)), recorded])
+    check = gate.checked(baseline, [gate.edited(simulated, gate.planted(5.0, 1, metric=metric)), recorded])
     assert findings(check) == [("flight", "two", metric, "regressed")]
     assert check.failures[0].p < 0.05
     assert check.failures[0].change_percent == pytest.approx(5.0, abs=2.0)
@@ -44,7 +44,7 @@ def test_a_planted_regression_fails_and_nothing_else_does(baseline, gate, metric
 def test_an_improvement_fails_unless_it_is_accepted(baseline, gate, accepted, finding):
     simulated, recorded = gate.as_measured(baseline)
     moved = gate.edited(simulated, gate.planted(-10.0, 1))
-    check = gate.judged(baseline, [moved, recorded], accept_better=accepted)
+    check = gate.checked(baseline, [moved, recorded], accept_better=accepted)
     assert check.passed is accepted
     assert [(v.estimator, v.metric, v.finding) for v in check.verdicts if v.finding != "same"] == [
         ("two", "ate_se3_m", finding)
@@ -58,7 +58,7 @@ def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(ba
         for factor in (1.0 + 1e-7, 0.996, 1.004, 1.006)
         for accepted in (False, True)
         for check in [
-            gate.judged(
+            gate.checked(
                 baseline,
                 [gate.edited(simulated, lambda _n, _k, v, f=factor: v * f), recorded],
                 accept_better=accepted,
@@ -80,7 +80,7 @@ def test_a_change_within_the_margin_has_moved_and_is_no_worse_however_certain(ba
 def test_a_change_under_a_few_seeds_is_chance(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     flipped = np.where(np.arange(24) < 3, 1.02, 1.0)  # as a gate that decides otherwise after another rounding
-    assert gate.judged(baseline, [gate.edited(simulated, lambda _n, _k, v: v * flipped), recorded]).passed
+    assert gate.checked(baseline, [gate.edited(simulated, lambda _n, _k, v: v * flipped), recorded]).passed
 
 
 @pytest.mark.parametrize("accepted", [False, True])
@@ -98,7 +98,7 @@ def test_a_metric_that_moves_while_the_poses_do_not_is_another_metric(baseline, 
         gate.edited(one, lambda n, k, v: 0.9 * v if n == "two" and k in edit else v)
         for one in gate.as_measured(baseline)
     ]
-    check = gate.judged(baseline, now, accept_better=accepted)
+    check = gate.checked(baseline, now, accept_better=accepted)
     found = {v.metric for v in check.verdicts if v.finding == "changed metric"}
     assert found == set(changed)
     assert not (found and check.passed)
@@ -108,7 +108,7 @@ def test_noise_alone_raises_an_alarm_no_more_often_than_stated(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     checks = 300
     alarms = sum(
-        not gate.judged(baseline, [gate.edited(simulated, gate.planted(0.0, seed)), recorded]).passed
+        not gate.checked(baseline, [gate.edited(simulated, gate.planted(0.0, seed)), recorded]).passed
         for seed in range(checks)
     )
     # 15 are promised at most; three standard deviations above that.
@@ -147,7 +147,7 @@ def consistency_findings(baseline, gate, was, now, **terms):
     moved = now * scatter * np.exp(0.02 * rng.standard_normal(scatter.size))
     after = with_values(simulated, "two", "nees_pose_mean", tuple(moved.tolist()))
     of_then = replace(baseline, cases=((baseline.cases[0][0], before), baseline.cases[1]))
-    return findings(gate.judged(of_then, [after, recorded], **terms))
+    return findings(gate.checked(of_then, [after, recorded], **terms))
 
 
 @pytest.mark.parametrize(
@@ -172,7 +172,7 @@ def test_a_recording_shows_any_change_and_fails_beyond_its_bound(
     finding = accepted if accept_better else finding
     moved = gate.another(recorded)
     changed = gate.edited(moved, lambda n, key, v: v * factor if (n, key) == ("two", metric) else v)
-    check = gate.judged(baseline, [simulated, changed], accept_better=accept_better)
+    check = gate.checked(baseline, [simulated, changed], accept_better=accept_better)
     one = next(v for v in check.verdicts if (v.sequence, v.estimator, v.metric) == ("data/drive_small", "two", metric))
     assert one.finding == finding
     assert check.passed == (finding not in ("regressed", "moved"))
@@ -180,7 +180,7 @@ def test_a_recording_shows_any_change_and_fails_beyond_its_bound(
 
 def test_a_recording_that_rounds_otherwise_is_the_same(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
-    check = gate.judged(baseline, [simulated, gate.edited(recorded, lambda _n, _k, v: v * (1.0 + 1e-8))])
+    check = gate.checked(baseline, [simulated, gate.edited(recorded, lambda _n, _k, v: v * (1.0 + 1e-8))])
     assert {v.finding for v in check.verdicts} == {"same"}
 
 
@@ -188,14 +188,14 @@ def test_a_missing_estimator_fails(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     left = {name: one for name, one in simulated.runs.items() if name != "two"}
     gone = replace(simulated, runs=left, absent={"two": "no estimator is called two"})
-    check = gate.judged(baseline, [gone, recorded])
+    check = gate.checked(baseline, [gone, recorded])
     assert findings(check) == [("flight", "two", "estimator", "missing")]
     assert check.failures[0].words == "no estimator is called two"
 
 
 def test_a_missing_sequence_fails(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
-    check = gate.judged(baseline, [simulated, replace(recorded, runs={}, unreadable="no such file")])
+    check = gate.checked(baseline, [simulated, replace(recorded, runs={}, unreadable="no such file")])
     assert findings(check) == [("data/drive_small", "", "sequence", "missing")]
 
 
@@ -207,14 +207,14 @@ def test_a_missing_metric_fails(baseline, gate, gone):
         del values["ate_yaw_m"]
     else:
         values["ate_yaw_m"] = (None, *values["ate_yaw_m"][1:])
-    check = gate.judged(baseline, [with_series(simulated, "two", outputs={"causal": values}), recorded])
+    check = gate.checked(baseline, [with_series(simulated, "two", outputs={"causal": values}), recorded])
     assert findings(check) == [("flight", "two", "ate_yaw_m", "missing")]
 
 
 def test_a_missing_kind_of_output_fails(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     final = {"final": simulated.runs["two"].outputs["causal"]}
-    check = gate.judged(baseline, [with_series(simulated, "two", outputs=final), recorded])
+    check = gate.checked(baseline, [with_series(simulated, "two", outputs=final), recorded])
     assert {f[:2] + f[3:] for f in findings(check)} == {("flight", "two", "missing")}
 
 
@@ -222,7 +222,7 @@ def test_a_missing_kind_of_output_fails(baseline, gate):
 def test_a_run_that_ended_well_and_no_longer_does_fails(baseline, gate, status):
     simulated, recorded = gate.as_measured(baseline)
     changed = with_series(simulated, "two", status=("ok", status, *("ok",) * 22), why="left the road")
-    check = gate.judged(baseline, [changed, recorded])
+    check = gate.checked(baseline, [changed, recorded])
     assert findings(check) == [("flight", "two", "status", "regressed")]
     assert check.failures[0].words == f"{status} under seed 1: left the road"
 
@@ -231,8 +231,8 @@ def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     before = with_series(simulated, "two", status=("failed", *("ok",) * 23))
     of_then = replace(baseline, cases=((baseline.cases[0][0], before), baseline.cases[1]))
-    assert findings(gate.judged(of_then, [simulated, recorded])) == [("flight", "two", "status", "moved")]
-    check = gate.judged(of_then, [simulated, recorded], accept_better=True)
+    assert findings(gate.checked(of_then, [simulated, recorded])) == [("flight", "two", "status", "moved")]
+    check = gate.checked(of_then, [simulated, recorded], accept_better=True)
     assert check.passed
     assert check.notes == ("flight: two ends better in 1 runs than before",)
 
@@ -240,7 +240,7 @@ def test_a_run_that_ends_well_now_fails_unless_it_is_accepted(baseline, gate):
 def test_frames_that_got_lost_fail_however_good_the_rest(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     lost = with_values(simulated, "two", COVERAGE, (97.0, *(100.0,) * 23))
-    assert findings(gate.judged(baseline, [lost, recorded])) == [("flight", "two", COVERAGE, "regressed")]
+    assert findings(gate.checked(baseline, [lost, recorded])) == [("flight", "two", COVERAGE, "regressed")]
 
 
 def test_other_measurements_are_not_compared(baseline, gate):
@@ -250,14 +250,14 @@ def test_other_measurements_are_not_compared(baseline, gate):
         hashes=("other", *simulated.hashes[1:]),
         fingerprints=("other", *simulated.fingerprints[1:]),
     )
-    check = gate.judged(baseline, [other, recorded])
+    check = gate.checked(baseline, [other, recorded])
     assert findings(check) == [("flight", "", "sequence", "missing")]
     assert "under seed 0" in check.failures[0].words
 
 
 def test_measurements_rounded_by_another_processor_are_compared_and_noted(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
-    check = gate.judged(baseline, [replace(simulated, hashes=("other", *simulated.hashes[1:])), recorded])
+    check = gate.checked(baseline, [replace(simulated, hashes=("other", *simulated.hashes[1:])), recorded])
     assert check.passed
     assert "last bits" in check.notes[0]
 
@@ -267,18 +267,18 @@ def test_other_arithmetic_than_the_baselines_is_noted_where_both_sides_say_their
     compiled = with_series(simulated, "two", arithmetic="compiled")
     written = replace(baseline, cases=((case, compiled), recorded))
     now = with_series(compiled, "two", arithmetic="numpy")
-    (told,) = (note for note in gate.judged(written, [now, recorded[1]]).notes if "NumPy" in note)
-    assert told.startswith("flight: two ran compiled for the baseline and runs in NumPy here")
-    assert not gate.judged(written, [now, recorded[1]], speed=False).notes
+    (reported,) = (note for note in gate.checked(written, [now, recorded[1]]).notes if "NumPy" in note)
+    assert reported.startswith("flight: two ran compiled for the baseline and runs in NumPy here")
+    assert not gate.checked(written, [now, recorded[1]], speed=False).notes
     for before, after in ((written, compiled), (baseline, now)):
-        assert not gate.judged(before, [after, recorded[1]]).notes
+        assert not gate.checked(before, [after, recorded[1]]).notes
 
 
 @pytest.mark.parametrize(("factor", "finding"), [(1.25, "same"), (1.4, "regressed"), (0.6, "better")])
-def test_speed_is_judged_by_its_ratio_to_the_reference(baseline, gate, factor, finding):
+def test_speed_is_checked_by_its_ratio_to_the_reference(baseline, gate, factor, finding):
     simulated, recorded = gate.as_measured(baseline)
     slower = with_series(simulated, "two", speed=tuple(factor * s for s in simulated.runs["two"].speed))
-    check = gate.judged(baseline, [slower, recorded])
+    check = gate.checked(baseline, [slower, recorded])
     one = next(v for v in check.verdicts if (v.estimator, v.metric) == ("two", "speed"))
     assert (one.finding, check.passed) == (finding, finding != "regressed")
-    assert gate.judged(baseline, [slower, recorded], speed=False).passed
+    assert gate.checked(baseline, [slower, recorded], speed=False).passed

@@ -25,12 +25,12 @@ def failed(baseline, gate):
         replace(worse, runs=worse.runs | {"one": slower}),
         replace(recorded, runs=runs, absent={"three": "it needs <a | b> &\nmore"}),
     ]
-    return gate.judged(baseline, now)
+    return gate.checked(baseline, now)
 
 
 @pytest.fixture
 def passed(baseline, gate):
-    return gate.judged(baseline, gate.as_measured(baseline))
+    return gate.checked(baseline, gate.as_measured(baseline))
 
 
 @pytest.fixture(params=["failed", "passed"])
@@ -120,7 +120,7 @@ def _full(self, *_given, **_named):
     raise OSError(28, "No space left on device")
 
 
-def test_every_kind_of_file_begins_as_it_is_told_to(check):
+def test_every_kind_of_file_begins_as_it_is_set_to(check):
     assert BEGINNINGS.keys() == WRITERS.keys()
     for kind, write in WRITERS.items():
         assert write(check).startswith(BEGINNINGS[kind])

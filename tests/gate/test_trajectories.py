@@ -63,9 +63,9 @@ def failures(vislam: Callable[..., int], *words: str) -> list[tuple[str, str, st
 
 def test_the_same_files_pass_and_need_no_other_word_than_the_folder(vislam, capsys):
     assert failures(vislam) == []
-    told = capsys.readouterr()
-    assert told.err == ""
-    assert "the gate passes" in told.out
+    messages = capsys.readouterr()
+    assert messages.err == ""
+    assert "the gate passes" in messages.out
 
 
 def test_a_baseline_of_trajectories_is_read_back(vislam):
@@ -86,7 +86,7 @@ def test_one_run_is_held_to_the_bound_either_way(vislam, error, finding):
 
 
 @pytest.mark.parametrize(("error", "fails"), [(0.2, False), (0.3, True)])
-def test_repeated_runs_are_judged_by_their_own_spread(vislam, error, fails):
+def test_repeated_runs_are_checked_by_their_own_spread(vislam, error, fails):
     for run in range(5):
         write(Path(f"results/maze/{run}.txt"), stamps(1.1, 2.0 + run), error, seed=10 + run)
     found = failures(vislam)
@@ -111,16 +111,16 @@ def test_keyframes_cover_the_time_between_them_and_a_gap_does_not():
     assert time_coverage_percent(beyond, truth, 5.0) == pytest.approx(100.0)
 
 
-def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_judged(vislam, capsys):
+def test_what_is_missing_or_spoilt_is_named_and_the_rest_is_checked(vislam, capsys):
     Path("results/lap.tum").write_text("1.0 2.0 3.0\n")
     for file in Path("results/maze").iterdir():
         file.unlink()
     write(Path("results/new.tum"), stamps(10.0))
     assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
-    told = " ".join(capsys.readouterr().out.split())
-    assert "lap: sequence is missing: results/lap.tum: 3 columns" in told
-    assert "maze: sequence is missing: no trajectory of it is in results; the baseline has maze/0.txt" in told
-    assert "not in the baseline, and not judged: new" in told
+    messages = " ".join(capsys.readouterr().out.split())
+    assert "lap: sequence is missing: results/lap.tum: 3 columns" in messages
+    assert "maze: sequence is missing: no trajectory of it is in results; the baseline has maze/0.txt" in messages
+    assert "not in the baseline, and not judged: new" in messages
 
 
 def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
@@ -130,7 +130,7 @@ def test_no_character_of_a_name_acts_on_a_terminal(vislam, capsys):
     assert "\x1b" not in capsys.readouterr().out
 
 
-def test_another_clock_is_told_with_both_ranges(vislam, capsys):
+def test_another_clock_is_reported_with_both_ranges(vislam, capsys):
     write(Path("results/lap.tum"), stamps(10.0, 3600.0, 3660.0))
     assert failures(vislam) == [("lap", "sequence", "missing")]
     assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
@@ -148,10 +148,10 @@ def test_exchanged_axes_are_named_where_a_baseline_is_made_and_held(vislam, caps
     rows = [line.split() for line in lap.read_text().splitlines() if not line.startswith("#")]
     lap.write_text("".join(f"{' '.join([t, x, z, y, *rest])}\n" for t, x, y, z, *rest in rows))
     assert failures(vislam) == [("lap", "sequence", "missing")]
-    told = "lap.tum: it fits the truth with y and z exchanged (positions alone), and not as given"
-    assert told in " ".join(capsys.readouterr().out.split())
+    messages = "lap.tum: it fits the truth with y and z exchanged (positions alone), and not as given"
+    assert messages in " ".join(capsys.readouterr().out.split())
     assert vislam(*BASELINE[:-1], "other.json") == 3
-    assert told in capsys.readouterr().err
+    assert messages in capsys.readouterr().err
 
 
 def test_another_truth_is_not_compared_with(vislam, capsys):
@@ -160,12 +160,12 @@ def test_another_truth_is_not_compared_with(vislam, capsys):
     assert "another truth than the baseline's" in " ".join(capsys.readouterr().out.split())
     Path("truth").rename("moved")
     assert failures(vislam) == [("lap", "sequence", "missing"), ("maze", "sequence", "missing")]
-    told = " ".join(capsys.readouterr().out.split())
-    assert "its truth is not at truth/lap.tum, where the baseline had it; name another place with --truth" in told
+    messages = " ".join(capsys.readouterr().out.split())
+    assert "its truth is not at truth/lap.tum, where the baseline had it; name another place with --truth" in messages
     assert failures(vislam, "--truth", "moved") == []
 
 
-def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
+def test_a_scale_that_is_not_observed_is_fitted_where_it_is_requested(vislam):
     t_ns = stamps(10.0)
     poses = truth_at(t_ns)
     poses[:, :3, 3] *= 0.4
@@ -178,7 +178,7 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "told"),
+    ("words", "status", "wanted"),
     [
         (("check", "--trajectories", "nowhere", "--baseline", "base.json"), 3, "nowhere: it is no folder"),
         (("check", "--trajectories", "empty", "--baseline", "base.json"), 3, "no SEQUENCE.tum"),
@@ -214,16 +214,16 @@ def test_a_scale_that_is_not_observed_is_fitted_where_it_is_asked_for(vislam):
         (("baseline", "drive", "--gap", "3"), 2, "--align and --gap go with --trajectories"),
     ],
 )
-def test_trouble_is_told_in_one_line(vislam, capsys, words, status, told):
+def test_trouble_is_reported_in_one_line(vislam, capsys, words, status, wanted):
     Path("empty").mkdir()
     spoilt = json.loads(Path("base.json").read_text())
     spoilt["bounds"]["ate_yaw_m"] = 5.0
     Path("spoilt.json").write_text(json.dumps(spoilt))
     Path("estimators.json").write_text('{"schema": "vislam.baseline/1"}')
     assert vislam(*words) == status
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert told in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert wanted in printed
 
 
 def test_runs_without_a_change_raise_an_alarm_no_more_often_than_stated():

@@ -34,7 +34,7 @@ def compared(t_s: Array, true: Array, estimated: Array) -> Scores:
 
 
 @pytest.mark.parametrize("late_s", [-0.35, -0.02, 0.004, 0.15])
-def test_late_stamps_are_found_and_told_with_what_mending_them_is_worth(late_s: float) -> None:
+def test_late_stamps_are_found_and_reported_with_what_mending_them_is_worth(late_s: float) -> None:
     scores = scored(late_s, sigma_m=1e-4)
     assert scores.values["clock_offset_ms"] == pytest.approx(-1e3 * late_s, abs=0.05)  # five of its standard errors
     assert f"shifted by {-1e3 * late_s:.1f} +- 0.0 ms" in scores.notes["clock_offset_ms"]
@@ -70,14 +70,14 @@ def test_few_pairs_leave_it_open() -> None:
 
 @pytest.mark.parametrize("since_first", [0.0, 0.5])
 @pytest.mark.parametrize("rate", [0.93, 0.995, 1.005, 1.05])
-def test_a_clock_that_runs_fast_or_slow_is_told_with_its_rate(rate: float, since_first: float) -> None:
+def test_a_clock_that_runs_fast_or_slow_is_reported_with_its_rate(rate: float, since_first: float) -> None:
     """Stamps that run fast are those of an earlier place: the estimate is where it was at the time by a right clock."""
     t_s = PERIOD_S * np.arange(300)
     origin_s = since_first * t_s[-1]
     scores = compared(t_s, path(t_s), path(origin_s + (t_s - origin_s) / rate))
-    told = scores.notes["clock_offset_ms"]
-    assert told.startswith("time passes ")
-    assert float(told.split()[2]) == pytest.approx(rate, abs=1e-4)
+    reported = scores.notes["clock_offset_ms"]
+    assert reported.startswith("time passes ")
+    assert float(reported.split()[2]) == pytest.approx(rate, abs=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(10))

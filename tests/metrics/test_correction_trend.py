@@ -38,7 +38,7 @@ def fixes(recording, lean=0.0, seed=0, noise_scale=1.0):
     belief = model.initial_belief(recording.prior)
     d, noise = len(belief.cov), np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
     forwards = 3 if model.layout.velocity is None else model.layout.velocity.start
-    truth, said, nis = belief.moved(rng.multivariate_normal(np.zeros(d), belief.cov), belief.cov), [], []
+    truth, reported, nis = belief.moved(rng.multivariate_normal(np.zeros(d), belief.cov), belief.cov), [], []
     scales = np.where(np.arange(recording.frame_count) < recording.frame_count // 2, 1.0, noise_scale)
     for packet, scale in zip(recording.packets(), scales, strict=True):
         motion = None if packet.motion is None else with_noise_scaled(packet.motion, scale)
@@ -53,8 +53,8 @@ def fixes(recording, lean=0.0, seed=0, noise_scale=1.0):
         gain = np.linalg.solve(S, belief.cov[POSE]).T
         nis.append(float(innovation @ np.linalg.solve(S, innovation)))
         belief = belief.moved(gain @ innovation, belief.cov - gain @ S @ gain.T)
-        said.append(belief.estimate(packet.frame.t_ns))
-    causal = Trajectory.of(said)
+        reported.append(belief.estimate(packet.frame.t_ns))
+    causal = Trajectory.of(reported)
     info = {} if noise_scale == 1.0 else {"motion_noise_scale": scales}
     return Run("fixes", "ok", causal, causal, Landmarks.none(), None, info), np.array(nis) / 6.0
 
@@ -102,12 +102,12 @@ def test_the_limit_is_twice_what_chance_exceeds_once_in_a_million(recording):
 def test_what_corrects_nothing_and_what_holds_its_biases_has_no_trend(recording):
     run, _ = fixes(recording)
     model = motion_model(recording.noise, recording.gravity_world)
-    said, belief = [], model.initial_belief(recording.prior)
+    reported, belief = [], model.initial_belief(recording.prior)
     for packet in recording.packets():
         belief = predicted(belief, model, packet.motion)
-        said.append(belief.estimate(packet.frame.t_ns))
+        reported.append(belief.estimate(packet.frame.t_ns))
     with pytest.raises(Unavailable, match="nothing was corrected"):
-        scored(replace(run, causal=Trajectory.of(said)), recording)
+        scored(replace(run, causal=Trajectory.of(reported)), recording)
     held = run.causal.cov.copy()
     held[:, model.layout.biases] = held[:, :, model.layout.biases] = 0.0
     with pytest.raises(Unavailable, match="holds its biases"):

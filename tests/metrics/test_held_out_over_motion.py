@@ -32,7 +32,7 @@ def scored(recording: Sequence, run: Run) -> held_out_over_motion.Scores:
     return held_out_over_motion.score(Evaluation(run, "causal", recording))
 
 
-def test_an_estimate_better_than_the_motion_is_below_one_and_nothing_is_said(recording, make_run) -> None:
+def test_an_estimate_better_than_the_motion_is_below_one_and_nothing_is_reported(recording, make_run) -> None:
     scores = scored(recording, make_run(recording.frames_t_ns, recording.truth.T_world_imu))
     assert scores.values[RATIO] < 0.9
     assert not scores.notes
@@ -46,7 +46,7 @@ def test_the_motion_alone_is_exactly_itself(recording, make_run) -> None:
     assert not scores.notes
 
 
-def test_an_estimate_that_leaps_for_three_seconds_is_told_with_the_time(recording, make_run) -> None:
+def test_an_estimate_that_leaps_for_three_seconds_is_reported_with_the_time(recording, make_run) -> None:
     poses = recording.truth.T_world_imu.copy()
     leaps = np.zeros((200, 6))
     leaps[98:128, 3] = np.random.default_rng(2).normal(0.0, 2.0, 30)
@@ -56,7 +56,7 @@ def test_an_estimate_that_leaps_for_three_seconds_is_told_with_the_time(recordin
     assert " times at 10-12 s" in scores.notes[RATIO]
 
 
-def test_an_estimate_that_is_worse_all_along_is_told_with_its_standard_error(recording, make_run, perturb) -> None:
+def test_an_estimate_that_is_worse_all_along_is_reported_with_its_standard_error(recording, make_run, perturb) -> None:
     poses = perturb(recording.truth.T_world_imu, 0.02, seed=3)
     scores = scored(recording, make_run(recording.frames_t_ns, poses))
     assert scores.values[RATIO] > 2.0

@@ -68,7 +68,7 @@ def test_a_world_of_its_own_does_not_matter(sequence, make_run):
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_each_block_is_judged_by_its_own_covariance(sequence, make_run, key):
+def test_each_block_is_checked_by_its_own_covariance(sequence, make_run, key):
     """One block stated four times too small in variance shows in its own figure alone."""
     run, cov = drawn(sequence, make_run), np.array(covariance())
     block, others = BLOCKS[key], [other for other in KEYS if other != key]

@@ -125,22 +125,24 @@ def test_a_mirror_image_is_not_fitted_by_a_mirror():
 
 
 @pytest.mark.parametrize(
-    ("factor", "told"), [(1.0 / 0.3048, "0.3048, as if in feet"), (1.06, "0.9434:"), (0.8, "1.25:")]
+    ("factor", "expected"), [(1.0 / 0.3048, "0.3048, as if in feet"), (1.06, "0.9434:"), (0.8, "1.25:")]
 )
-def test_positions_that_fit_at_another_scale_are_remarked_with_it(make_sequence, drive, perturb, score, factor, told):
+def test_positions_that_fit_at_another_scale_are_remarked_with_it(
+    make_sequence, drive, perturb, score, factor, expected
+):
     sequence = make_sequence(drive(400), track_count=3)
     longer = sequence.truth.T_world_imu.copy()
     longer[:, :3, 3] *= factor
     notes = score(sequence, longer).notes
     for key in ("ate_se3_m", "ate_yaw_m"):
-        assert f"once they are multiplied by {told}" in notes[key]
+        assert f"once they are multiplied by {expected}" in notes[key]
     # A scale that explains little of the error is none.
     assert "multiplied" not in score(sequence, perturb(sequence.truth.T_world_imu, 1e-3, seed=1)).notes.get(
         "ate_se3_m", ""
     )
 
 
-def test_on_a_straight_line_the_rotation_error_is_refused_and_said(make_sequence, score):
+def test_on_a_straight_line_the_rotation_error_is_refused_and_reported(make_sequence, score):
     poses = se3(np.eye(3), np.outer(np.arange(50.0), [1.0, 0.5, 0.1]))
     sequence = make_sequence(poses, track_count=3)
     scores = score(sequence, se3_exp(np.array([0.3, 0.0, 0.5, 1.0, 2.0, 3.0])) @ poses)

@@ -110,16 +110,16 @@ def driven(bridge, ids_of_frames, sigma, error, seed=0):
 
     Return what the bridge says at each frame.
     """
-    rng, said, pose, motion = np.random.default_rng(seed), [], np.eye(4), None
+    rng, reported, pose, motion = np.random.default_rng(seed), [], np.eye(4), None
     twist = np.array([0.0, 0.0, 0.1, 8.0, 0.0, 0.0])
     for frame in frames_of(*ids_of_frames):
-        said.append(bridge.added(frame, motion))
+        reported.append(bridge.added(frame, motion))
         bridge.learn(pose)
         twist = twist + sigma * rng.normal(size=6)
         pose = pose @ se3_exp(0.1 * twist)
         measured = (twist + error * rng.normal(size=6))[None]
         motion = TwistMotion(np.array([0.1]), measured[:, 3:], measured[:, :3])
-    return said
+    return reported
 
 
 SIGMA = np.array([0.03, 0.02, 0.01, 0.1, 0.2, 0.3])
@@ -127,12 +127,12 @@ LONG = [[1]] * 600 + [[2]] * 3
 
 
 def test_a_bridge_is_as_sure_as_the_twist_was_seen_to_stay():
-    said = driven(GapBridge(1.0, MEASURED), LONG, SIGMA, 3.0 * SIGMA)
-    assert [kept is not None for kept in said] == [False] * 600 + [True, True, False]
+    reported = driven(GapBridge(1.0, MEASURED), LONG, SIGMA, 3.0 * SIGMA)
+    assert [kept is not None for kept in reported] == [False] * 600 + [True, True, False]
     stated = np.sqrt(2.0 / 0.1) * np.array([0.02] * 3 + [0.2] * 3)
     expected = np.sqrt((598.0 * np.square(SIGMA) + 10.0 * np.square(stated)) / 608.0)
     # Of so many changes the standard deviation is known to three percent.
-    np.testing.assert_allclose(said[600].sigmas, expected, rtol=0.09)
+    np.testing.assert_allclose(reported[600].sigmas, expected, rtol=0.09)
 
 
 def test_at_first_a_bridge_tells_no_more_than_the_twists_that_are_measured():

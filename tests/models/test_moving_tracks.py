@@ -22,7 +22,7 @@ def simulated(scenario: str = "drive") -> Sequence:
     return simulate(replace(scenarios[scenario], duration_s=4.0), 1)
 
 
-def judged(sequence: Sequence) -> tuple[BoolArray, LeftOut]:
+def checked(sequence: Sequence) -> tuple[BoolArray, LeftOut]:
     """Return which sightings (N,) of a sequence are left out, and the counts."""
     assert sequence.prior is not None
     left, counts = without_moving_tracks(sequence, sequence.prior)
@@ -63,7 +63,7 @@ def long_tracks(sequence: Sequence, frames: int) -> list[Array]:
 
 def test_of_sound_sightings_as_many_are_left_out_as_the_probability_says():
     """Two tests each, at one in a thousand: of 9000 sightings 18, and 5 is three standard deviations of that less."""
-    left_out = [judged(simulated(name))[1] for name in ("drive", "drive-imu", "flight")]
+    left_out = [checked(simulated(name))[1] for name in ("drive", "drive-imu", "flight")]
     share = sum(one.sightings for one in left_out) / sum(one.of_sightings for one in left_out)
     assert 0.0003 < share < 0.004
     assert sum(one.undecided_frames for one in left_out) == 0
@@ -74,7 +74,7 @@ def test_vehicles_are_left_out_and_what_stands_is_not():
     for name in ("drive", "drive-imu", "flight"):
         standing = simulated(name)
         among = moving_objects(standing, dose=0.5, seed=1)
-        out, _ = judged(among)
+        out, _ = checked(among)
         where = np.searchsorted(keys(standing), keys(among), sorter=np.argsort(keys(standing)))
         before_px = standing.observations.uv_px[np.argsort(keys(standing))[where]]
         off_px = np.abs(among.observations.uv_px - before_px).max(axis=1)
@@ -84,9 +84,9 @@ def test_vehicles_are_left_out_and_what_stands_is_not():
         assert out[visible & (off_px == 0.0)].mean() < 0.02
 
 
-def test_a_frame_is_judged_by_what_was_seen_until_then():
+def test_a_frame_is_checked_by_what_was_seen_until_then():
     among = moving_objects(simulated(), dose=0.3, seed=1)
-    whole, part = judged(among)[0], judged(among.truncated(25))[0]
+    whole, part = checked(among)[0], checked(among.truncated(25))[0]
     np.testing.assert_array_equal(whole[among.observations.frame < 25], part)
     assert part.any()
 
@@ -102,8 +102,8 @@ def test_held_out_tracks_stay_whatever_they_do():
 def test_a_bad_sighting_spoils_no_other_of_its_track():
     sequence = simulated("flight")
     bad = np.array([rows[6] for rows in long_tracks(sequence, 15)[:8]])
-    out, _ = judged(shifted(sequence, bad, np.full(bad.size, 25.0)))
-    clean, _ = judged(sequence)
+    out, _ = checked(shifted(sequence, bad, np.full(bad.size, 25.0)))
+    clean, _ = checked(sequence)
     assert out[bad].all()
     # Beside these, what chance leaves out: hardly any of them is tested from another sighting than before.
     assert (out != clean).sum() <= bad.size + 2
@@ -114,7 +114,7 @@ def test_a_track_refused_in_three_frames_running_stays_out():
     tracks = long_tracks(sequence, 15)[:8]
     for frames, stays_out in ((2, False), (3, True)):
         bad = np.concatenate([rows[6 : 6 + frames] for rows in tracks])
-        out, _ = judged(shifted(sequence, bad, np.full(bad.size, 25.0)))
+        out, _ = checked(shifted(sequence, bad, np.full(bad.size, 25.0)))
         assert out[bad].all()
         later = np.concatenate([rows[6 + frames :] for rows in tracks])
         assert out[later].mean() == 1.0 if stays_out else out[later].mean() < 0.05
@@ -126,15 +126,15 @@ def test_what_creeps_shows_over_some_frames(monkeypatch):
     tracks = [rows[:12] for rows in long_tracks(sequence, 12)[:10]]
     creeping = shifted(sequence, np.concatenate(tracks), np.tile(2.0 * np.arange(12.0), len(tracks)))
     last = np.concatenate([rows[8:] for rows in tracks])
-    assert judged(creeping)[0][last].mean() > 0.6
+    assert checked(creeping)[0][last].mean() > 0.6
     monkeypatch.setattr(moving_tracks, "EARLY_FRAMES", 1)
-    assert judged(creeping)[0][last].mean() < 0.3
+    assert checked(creeping)[0][last].mean() < 0.3
 
 
 def test_tracks_that_agree_on_another_motion_than_was_measured_are_kept():
     """A wheel of the wrong size: the speed is off by twenty standard deviations, and nine tracks in ten agree on it."""
     sequence = linear_unit(simulated(), dose=1.1)
-    out, counts = judged(sequence)
+    out, counts = checked(sequence)
     assert out.mean() < 0.03
     assert counts.undecided_frames == 0
 
@@ -144,7 +144,7 @@ def test_a_convoy_is_not_taken_for_the_motion_where_odometry_excludes_it():
     sequence = simulated()
     ids = np.unique(sequence.observations.track_id)
     struck = np.isin(sequence.observations.track_id, ids[np.random.default_rng(2).uniform(size=ids.size) < 0.6])
-    out, _ = judged(as_one_vehicle(sequence, struck))
+    out, _ = checked(as_one_vehicle(sequence, struck))
     visible = ~is_held_out(sequence.observations.track_id)
     assert out[visible & ~struck].mean() < 0.02
     assert out[visible & struck].mean() > 0.5
@@ -154,7 +154,7 @@ def test_where_fewer_than_half_agree_none_is_refused():
     sequence = simulated()
     struck = np.flatnonzero(sequence.observations.frame == 20)
     off_px = np.random.default_rng(0).choice([-1.0, 1.0], struck.size) * np.linspace(20.0, 200.0, struck.size)
-    out, counts = judged(shifted(sequence, struck, off_px))
+    out, counts = checked(shifted(sequence, struck, off_px))
     assert counts.undecided_frames >= 1
     assert out[struck].mean() < 0.05
 
@@ -162,5 +162,5 @@ def test_where_fewer_than_half_agree_none_is_refused():
 def test_frames_without_tracks_are_no_hindrance():
     sequence = simulated()
     dark = (sequence.observations.frame > 10) & (sequence.observations.frame < 20)
-    out, _ = judged(replace(sequence, observations=sequence.observations.select(~dark)))
+    out, _ = checked(replace(sequence, observations=sequence.observations.select(~dark)))
     assert out.mean() < 0.005

@@ -160,16 +160,16 @@ def test_a_world_far_looser_than_the_steps_in_it_has_covariances():
     np.testing.assert_allclose(covs[:, range(9), range(9)], np.tile(expected[:, None], 9), rtol=1e-4)
 
 
-@pytest.mark.parametrize("told", [1e-7, 1e-12, 0.0])
-def test_a_landmark_at_infinity_leaves_the_states_their_covariances(told):
+@pytest.mark.parametrize("wanted", [1e-7, 1e-12, 0.0])
+def test_a_landmark_at_infinity_leaves_the_states_their_covariances(wanted):
     """Its depth in metres is told by next to nothing, of which GTSAM refuses it; or by nothing at all."""
     rng, poses = np.random.default_rng(4), np.tile(np.eye(4), (STATES, 1, 1))
     near, far = _walking_states(0.1), _walking_states(0.1)
     turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    in_metres = turned @ np.diag([1.0, 1.0, told]) @ turned.T
+    in_metres = turned @ np.diag([1.0, 1.0, wanted]) @ turned.T
     for k in range(0, STATES, 5):
         of_pose, of_landmark = rng.standard_normal((3, 6)), rng.standard_normal((3, 3))
-        if told < 1e-10:  # two directions of the landmark, and nothing of a third
+        if wanted < 1e-10:  # two directions of the landmark, and nothing of a third
             near.add(linear_factor([(X(k), of_pose), (L(0), of_landmark @ turned[:, :2])], np.zeros(3)))
         else:
             near.add(linear_factor([(X(k), of_pose), (L(0), of_landmark)], np.zeros(3)))

@@ -83,7 +83,7 @@ def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[s
 
 
 @pytest.mark.parametrize(
-    "said",
+    "expected",
     [
         'read "/home/somebody/drive.npz"',
         "<module '/Users/somebody/my filters.py'>",
@@ -93,15 +93,17 @@ def test_no_path_of_one_machine_is_kept(source: Path, machine_paths: Callable[[s
         json.dumps(r"C:\Users\somebody"),
     ],
 )
-def test_the_path_of_another_machine_is_recognised(said: str, machine_paths: Callable[[str], list[str]]) -> None:
-    assert len(machine_paths(f"text {said} text")) == 1
+def test_the_path_of_another_machine_is_recognised(expected: str, machine_paths: Callable[[str], list[str]]) -> None:
+    assert len(machine_paths(f"text {expected} text")) == 1
 
 
-@pytest.mark.parametrize("said", ["https://example.org/home/page.html", "runs/tmp/figure.png", "and/or", "../home/x"])
+@pytest.mark.parametrize(
+    "expected", ["https://example.org/home/page.html", "runs/tmp/figure.png", "and/or", "../home/x"]
+)
 def test_an_address_or_a_path_inside_the_project_is_no_machines(
-    said: str, machine_paths: Callable[[str], list[str]]
+    expected: str, machine_paths: Callable[[str], list[str]]
 ) -> None:
-    assert machine_paths(f"text {said} text") == []
+    assert machine_paths(f"text {expected} text") == []
 
 
 @pytest.mark.parametrize("page", [*SOURCES, NOTEBOOKS / "README.md"], ids=lambda page: page.name)
@@ -151,5 +153,5 @@ def _one_processor() -> Iterator[None]:
 def test_it_runs_where_no_real_recording_is(source: Path, execution: ModuleType, kernel: KernelManager) -> None:
     run("%reset -f", kernel)
     executed = execution.execute(source, kernel)  # raises where a cell fails
-    said = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
-    assert "the real" not in said
+    reported = "".join(o.get("text", "") for cell in executed.cells for o in cell.get("outputs", []))
+    assert "the real" not in reported

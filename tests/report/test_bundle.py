@@ -76,13 +76,13 @@ def test_the_same_run_gives_the_same_bytes(bundle: Path, tmp_path: Path) -> None
 
 
 def test_a_bundle_is_reproduced_anywhere(bundle: Path, reproduce) -> None:
-    status, told, _ = reproduce(str(bundle), "--out", "here")
+    status, messages, _ = reproduce(str(bundle), "--out", "here")
     assert status == 0
-    assert "run.zip: reproduced" in told
+    assert "run.zip: reproduced" in messages
     assert Path("here/metrics.json").is_file()
 
 
-def test_a_result_that_is_another_one_is_told(bundle: Path, reproduce, tmp_path: Path) -> None:
+def test_a_result_that_is_another_one_is_reported(bundle: Path, reproduce, tmp_path: Path) -> None:
     def change(contents: dict[str, bytes]) -> None:
         metrics = json.loads(contents["metrics.json"])
         metrics["runs"][0]["metrics"]["ate_se3_m"] *= 1.01
@@ -93,15 +93,15 @@ def test_a_result_that_is_another_one_is_told(bundle: Path, reproduce, tmp_path:
         contents["metrics.json"], contents["manifest.json"] = (json.dumps(d).encode() for d in (metrics, manifest))
         with_hashes(contents)
 
-    status, told, _ = reproduce(str(edited(bundle, tmp_path / "other.zip", change)))
+    status, messages, _ = reproduce(str(edited(bundle, tmp_path / "other.zip", change)))
     assert status == 1
     for word in ("versions.numpy", "sequence.hash", "ate_se3_m", "not reproduced"):
-        assert word in told
+        assert word in messages
     assert not list(tmp_path.glob("runs*"))
 
 
 @pytest.mark.parametrize(
-    ("edit", "told"),
+    ("edit", "expected"),
     [
         (lambda c: c.update({"metrics.json": b"{}"}), "metrics.json is not as it was when the bundle was made"),
         (lambda c: c.pop("metrics.json"), "metrics.json is missing"),
@@ -113,21 +113,21 @@ def test_a_result_that_is_another_one_is_told(bundle: Path, reproduce, tmp_path:
         ),
     ],
 )
-def test_a_damaged_bundle_is_told_in_one_line(bundle: Path, reproduce, tmp_path: Path, edit, told: str) -> None:
-    status, _, said = reproduce(str(edited(bundle, tmp_path / "bad.zip", edit)))
+def test_a_damaged_bundle_is_reported_in_one_line(bundle: Path, reproduce, tmp_path: Path, edit, expected: str) -> None:
+    status, _, reported = reproduce(str(edited(bundle, tmp_path / "bad.zip", edit)))
     assert status == 3
-    assert told in said
-    assert said.count("\n") == 1
+    assert expected in reported
+    assert reported.count("\n") == 1
 
 
-def test_what_is_no_bundle_is_told_in_one_line(bundle: Path, reproduce, tmp_path: Path) -> None:
+def test_what_is_no_bundle_is_reported_in_one_line(bundle: Path, reproduce, tmp_path: Path) -> None:
     (tmp_path / "cut.zip").write_bytes(bundle.read_bytes()[:-200])
     (tmp_path / "text.zip").write_text("hello")
     for name in ("cut.zip", "text.zip", "nowhere.zip"):
-        status, _, said = reproduce(name)
+        status, _, reported = reproduce(name)
         assert status == 3
-        assert name in said
-        assert said.count("\n") == 1
+        assert name in reported
+        assert reported.count("\n") == 1
 
 
 def test_every_byte_that_is_flipped_is_found_or_harmless(bundle: Path, tmp_path: Path) -> None:

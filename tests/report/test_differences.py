@@ -66,7 +66,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, without_pixels, audited_once)
 
 
 @pytest.fixture
-def told(runs: Path, capsys) -> Callable[..., dict]:
+def messages(runs: Path, capsys) -> Callable[..., dict]:
     def tell(before: str, after: str) -> dict:
         assert main(["diff", str(runs / before), str(runs / after), "--json"]) == 0
         found = json.loads(capsys.readouterr().out)
@@ -81,8 +81,8 @@ def by_metric(found: dict) -> dict[str, dict]:
 
 
 @pytest.mark.parametrize("name", ["one", "seeds"])
-def test_a_run_does_not_differ_from_itself(told, runs, name: str, capsys) -> None:
-    found = told(name, name)
+def test_a_run_does_not_differ_from_itself(messages, runs, name: str, capsys) -> None:
+    found = messages(name, name)
     assert found["same_results"]
     assert not any(one["moved"] for one in found["metrics"])
     assert found["settings"] == found["data"] == found["environment"] == found["ends"] == []
@@ -97,8 +97,8 @@ def test_what_differs_at_the_end_of_a_long_text_is_shown() -> None:
     assert "+changed" in diff_text(Differences(("a", "b"), (), (revision,), (), (), (), 0, paired=False))
 
 
-def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(told, runs, capsys) -> None:
-    found = told("seeds", "louder")
+def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(messages, runs, capsys) -> None:
+    found = messages("seeds", "louder")
     assert "settings.noise.motion_scale" in {one["name"] for one in found["settings"]}
     assert "versions.numpy" in {one["name"] for one in found["environment"]}
     metrics = by_metric(found)
@@ -110,13 +110,13 @@ def test_a_setting_is_named_and_what_it_moves_is_beyond_chance(told, runs, capsy
     assert metrics["total_s"]["p"] is None
     assert not found["same_results"]
     assert main(["diff", str(runs / "seeds"), str(runs / "louder")]) == 0
-    told_in_words = capsys.readouterr().out
-    assert "beyond chance" in told_in_words
-    assert "paired by seed" in told_in_words
+    reported_in_words = capsys.readouterr().out
+    assert "beyond chance" in reported_in_words
+    assert "paired by seed" in reported_in_words
 
 
-def test_other_recordings_are_independent_draws_and_may_be_chance(told) -> None:
-    found = told("seeds", "others")
+def test_other_recordings_are_independent_draws_and_may_be_chance(messages) -> None:
+    found = messages("seeds", "others")
     assert not found["paired"]
     assert {"name": "ekf causal", "before": "3 of 3 ok", "after": "2 of 3 ok"} in found["ends"]
     tested = [one for one in found["metrics"] if one["p"] is not None]
@@ -124,17 +124,17 @@ def test_other_recordings_are_independent_draws_and_may_be_chance(told) -> None:
     assert not any(one["beyond_chance"] for one in tested)
 
 
-def test_one_run_tells_nothing_of_chance(told) -> None:
-    found = told("one", "seeds")
+def test_one_run_tells_nothing_of_chance(messages) -> None:
+    found = messages("one", "seeds")
     assert all(one["p"] is None for one in found["metrics"])
     assert {"name": "dead-reckoning causal", "before": "ok", "after": "3 of 3 ok"} in found["ends"]
     assert {one["output"] for one in found["metrics"]} == {"causal"}  # the final answer repeats it
 
 
-def test_what_is_no_run_is_told_in_one_line(runs, capsys) -> None:
+def test_what_is_no_run_is_reported_in_one_line(runs, capsys) -> None:
     assert main(["diff", str(runs / "one"), str(runs)]) == 3
     assert main(["diff", str(runs / "one"), str(runs / "one"), "--columns", "ate_se_m"]) == 2
-    said = capsys.readouterr().err
-    assert "is not a run directory" in said
-    assert "did you mean ate_se3_m?" in said
-    assert said.count("\n") == 2
+    printed = capsys.readouterr().err
+    assert "is not a run directory" in printed
+    assert "did you mean ate_se3_m?" in printed
+    assert printed.count("\n") == 2

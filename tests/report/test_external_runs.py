@@ -217,8 +217,8 @@ def test_another_scale_is_remarked_on_without_a_truth(tmp_path: Path, recording:
     truth = truth_of(recording)
     scaled = Trajectory(truth.t_ns, se3(truth.T_world_imu[:, :3, :3], scale * truth.positions))
     run = read_as_run(tmp_path, scaled, replace(recording, truth=None))
-    told = [re.search(r"its steps are (\S+) \+- (\S+) times as long", entry) for entry in run.log]
-    (found,) = [match for match in told if match] or [None]
+    reported = [re.search(r"its steps are (\S+) \+- (\S+) times as long", entry) for entry in run.log]
+    (found,) = [match for match in reported if match] or [None]
     assert (found is None) == (scale == 1.0)
     if found is not None:
         assert float(found[1]) == pytest.approx(scale, rel=0.02)  # the noise of the tracks lengthens vision's steps

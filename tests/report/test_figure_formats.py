@@ -27,7 +27,7 @@ def test_a_figure_is_of_its_format_and_the_same_every_time(tmp_path, kind: Figur
     assert one == two
 
 
-def test_fourteen_estimators_are_told_apart_and_both_outputs_keep_one_colour() -> None:
+def test_fourteen_estimators_are_distinguished_and_both_outputs_keep_one_colour() -> None:
     names = [f"e{i}" for i in range(14)]
     comparison = cast(Any, SimpleNamespace(runs=[SimpleNamespace(estimator=name) for name in names]))
     for output in ("causal", "final"):

@@ -109,12 +109,12 @@ def test_a_comparison_of_failures_draws_nothing(comparison: Comparison, draw: ob
     assert list(draw(broken)) == []
 
 
-def test_the_bound_is_drawn_where_it_was_asked_for(comparison_of: ComparisonOf, run_estimator) -> None:
+def test_the_bound_is_drawn_where_it_was_requested(comparison_of: ComparisonOf, run_estimator) -> None:
     sequence = simulate(replace(DRIVE, duration_s=1.0), 0)
     usual = comparison_of(sequence, tuple(run_estimator(name, sequence) for name in ("dead-reckoning", "ekf")))
     assert list(against_bound.draw(usual)) == []
-    asked = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
-    (drawn,) = against_bound.draw(asked)
+    requested = replace(usual, settings=Settings(metrics=Metrics(bound=True)))
+    (drawn,) = against_bound.draw(requested)
     position = drawn.figure.axes[0]
     lines = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in position.get_lines()}
     assert "thin: stated" in [text.get_text() for text in drawn.figure.legends[0].get_texts()]
@@ -124,5 +124,5 @@ def test_the_bound_is_drawn_where_it_was_asked_for(comparison_of: ComparisonOf, 
 
 
 def test_a_recording_without_a_bound_has_no_such_figure(without_truth: Comparison) -> None:
-    asked = replace(without_truth, settings=Settings(metrics=Metrics(bound=True)))
-    assert list(against_bound.draw(asked)) == []
+    requested = replace(without_truth, settings=Settings(metrics=Metrics(bound=True)))
+    assert list(against_bound.draw(requested)) == []

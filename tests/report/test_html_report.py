@@ -54,17 +54,17 @@ def row(case: Json, estimator: str) -> Json:
 
 
 def test_every_number_is_that_of_metrics_json(page: str, run_directory: Path) -> None:
-    told = json.loads((run_directory / "metrics.json").read_text())
+    reported = json.loads((run_directory / "metrics.json").read_text())
     (case,) = embedded(page)["cases"]
-    by_line = {(run["estimator"], run["output"]): run for run in told["runs"]}
+    by_line = {(run["estimator"], run["output"]): run for run in reported["runs"]}
     for one in case["rows"]:
         run = by_line[one["estimator"], "causal" if one["output"] == "both" else one["output"]]
         assert one["metrics"] == run["metrics"]
         assert one["notes"] == run["notes"]
         assert one["status"] == run["status"]
-    assert case["sequence"] == told["sequence"]
+    assert case["sequence"] == reported["sequence"]
     shown = {column["key"] for column in embedded(page)["columns"]}
-    assert {key for run in told["runs"] for key in run["metrics"]} <= shown
+    assert {key for run in reported["runs"] for key in run["metrics"]} <= shown
 
 
 def test_outputs_that_agree_have_one_line(case: Json) -> None:
@@ -246,7 +246,7 @@ def test_a_directory_in_the_way_is_refused(run_directory: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "text", "expected"),
     [
         ("report.json", None, "has no report.json: an earlier version wrote it, or that was removed; repeat it"),
         ("manifest.json", None, "missing"),
@@ -257,37 +257,37 @@ def test_a_directory_in_the_way_is_refused(run_directory: Path, tmp_path: Path) 
         ("landmarks/late.csv", "track_id,x_m,y_m,z_m\n1,two,3,4\n", "late.csv"),
     ],
 )
-def test_a_damaged_run_directory_is_told_in_one_line(
-    run_directory: Path, tmp_path: Path, name: str, text: str | None, told: str
+def test_a_damaged_run_directory_is_reported_in_one_line(
+    run_directory: Path, tmp_path: Path, name: str, text: str | None, expected: str
 ) -> None:
     shutil.copytree(run_directory, tmp_path / "run")
     (tmp_path / "run" / name).unlink()
     if text is not None:
         (tmp_path / "run" / name).write_text(text)
-    with pytest.raises(DataError, match=re.escape(told)):
+    with pytest.raises(DataError, match=re.escape(expected)):
         read_run(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "expected"),
     [
         (lambda d: d["runs"].pop(), "does not have the runs of metrics.json"),
         (lambda d: d["maps"][0].update(estimator="nobody"), "has the map of a run it does not have"),
     ],
 )
-def test_a_report_of_other_runs_is_told(
-    run_directory: Path, tmp_path: Path, spoil: Callable[[Json], object], told: str
+def test_a_report_of_other_runs_is_reported(
+    run_directory: Path, tmp_path: Path, spoil: Callable[[Json], object], expected: str
 ) -> None:
     shutil.copytree(run_directory, tmp_path / "run")
     report = tmp_path / "run" / "report.json"
     document = json.loads(report.read_text())
     spoil(document)
     report.write_text(json.dumps(document))
-    with pytest.raises(DataError, match=told):
+    with pytest.raises(DataError, match=expected):
         read_run(tmp_path / "run")
 
 
-def test_what_is_no_run_directory_is_told(tmp_path: Path) -> None:
+def test_what_is_no_run_directory_is_reported(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(DataError, match=path.name):
             read_run(path)

@@ -201,7 +201,7 @@ def test_legends_of_fourteen_estimators_stand_outside_the_data(fourteen: Compari
     assert {text.get_text() for text in legend.get_texts()} >= set(fourteen.estimators)
 
 
-def test_few_figures_come_first_and_all_when_asked(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_figures_come_first_and_all_when_requested(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
     def named(name: str) -> Callable[[Comparison], Iterator[NamedFigure]]:
         return lambda _: iter([NamedFigure(name, "", Figure())])
 

@@ -109,12 +109,12 @@ def test_a_document_without_any_one_of_its_fields_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("document", [None, 3, [], {}, {"runs": [3]}, {"schema": 3}, "text"])
-def test_what_is_no_document_is_told(name: str, document: object) -> None:
+def test_what_is_no_document_is_reported(name: str, document: object) -> None:
     assert "has not the schema vislam." in refused(name, document)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_document_cut_anywhere_is_told(name: str, tmp_path: Path) -> None:
+def test_a_document_cut_anywhere_is_reported(name: str, tmp_path: Path) -> None:
     text = (OLD / name).read_text()
     for end in range(0, len(text) - 2, max(1, len(text) // 40)):
         (tmp_path / name).write_text(text[:end])
@@ -123,8 +123,8 @@ def test_a_document_cut_anywhere_is_told(name: str, tmp_path: Path) -> None:
 
 
 def test_the_published_schemas_are_those_of_the_records() -> None:
-    told = "docs/schemas differs from the records: python -m toolkit.report.schemas docs/schemas renews it"
-    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), told
+    reported = "docs/schemas differs from the records: python -m toolkit.report.schemas docs/schemas renews it"
+    assert {path.name: path.read_text() for path in SCHEMAS.iterdir()} == schema_files(), reported
 
 
 @pytest.mark.parametrize("name", RECORDS)
@@ -150,7 +150,7 @@ def _second_run(document: Document) -> Document:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "wanted"),
     [
         (lambda d: _second_run(d)["metrics"].pop("ate_se3_m"), "runs[1]: metrics.ate_se3_m is missing"),
         (lambda d: _second_run(d)["notes"].clear(), "is null, and notes does not say why"),
@@ -170,41 +170,41 @@ def _second_run(document: Document) -> Document:
         (lambda d: d.pop("runs"), "the document: lacks runs"),
     ],
 )
-def test_broken_metrics_are_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+def test_broken_metrics_are_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
     document = old("metrics.json")
     spoil(document)
-    assert told in refused("metrics.json", document)
+    assert wanted in refused("metrics.json", document)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "wanted"),
     [
         (lambda d: d["runs"][0]["nees"]["pose"].pop(), "runs[0].nees: pose has 11 entries, t_s has 12"),
         (lambda d: d["runs"][0]["rotation"].pop(), "runs[0].rotation: expected list of length 3, got 2"),
         (lambda d: d["steps"][0]["t_s"].pop(), "steps[0]: step_ms has 12 entries, t_s has 11"),
     ],
 )
-def test_a_broken_report_is_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+def test_a_broken_report_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
     document = old("report.json")
     spoil(document)
-    assert told in refused("report.json", document)
+    assert wanted in refused("report.json", document)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "told"),
+    ("spoil", "wanted"),
     [
         (lambda d: d.update(passed=False), "the document: passed does not fit failures"),
         (lambda d: d.update(failures=1), "the document: failures does not count the verdicts that fail"),
         (lambda d: d["verdicts"][0].update(fails=True), "verdicts[0]: fails does not fit the finding 'same'"),
     ],
 )
-def test_a_broken_check_is_refused_with_the_place(spoil: Callable[[Document], object], told: str) -> None:
+def test_a_broken_check_is_refused_with_the_place(spoil: Callable[[Document], object], wanted: str) -> None:
     document = old("check.json")
     spoil(document)
-    assert told in refused("check.json", document)
+    assert wanted in refused("check.json", document)
 
 
-def test_a_frame_missing_over_seeds_is_told() -> None:
+def test_a_frame_missing_over_seeds_is_reported() -> None:
     document = old("report-over-seeds.json")
     document["runs"][0]["position_rms_m"].pop()
     assert "runs[0].position_rms_m has 5 entries, t_s has 6" in refused("report-over-seeds.json", document)

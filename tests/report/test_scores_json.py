@@ -51,7 +51,7 @@ def test_key_order_is_stable(document: dict[str, Any]) -> None:
         assert list(run["metrics"]) == list(describe())
 
 
-def test_what_the_audit_could_not_judge_is_told(comparison: Comparison, document: dict[str, Any]) -> None:
+def test_what_the_audit_could_not_judge_is_reported(comparison: Comparison, document: dict[str, Any]) -> None:
     assert comparison.undecided
     assert document["undecided"] == comparison.undecided
 
@@ -68,7 +68,7 @@ def test_path_is_the_true_one_and_null_without_truth(document: dict[str, Any], w
     assert blind.sequence.path_m is None
 
 
-def test_the_verdict_on_the_stated_uncertainty_is_told_with_its_figures(
+def test_the_verdict_on_the_stated_uncertainty_is_reported_with_its_figures(
     comparison: Comparison, rescored: Rescored
 ) -> None:
     timid = rescored(comparison, lambda row: Scores(row.scores.values | {"nees_pose_mean": 0.1}, {}))
@@ -89,15 +89,15 @@ def test_small_innovations_behind_a_gate_that_refused_many_are_no_timid_estimato
     def mark(accepted: float) -> str:
         one = replace(comparison.lines[0].outcomes[0].outputs["causal"], nis_dof=900.0)
         values = {"nis_mean": 0.4, "gate_accepted_percent": accepted}
-        judged = consistency_of([replace(one, scores=Scores(values, {}))])
-        assert judged is not None
-        return judged.verdict
+        checked = consistency_of([replace(one, scores=Scores(values, {}))])
+        assert checked is not None
+        return checked.verdict
 
     assert mark(95.0) == "timid"
     assert mark(76.0) == "heavy-tailed"
 
 
-def test_a_run_whose_tracks_turn_its_state_one_way_is_told_with_trend_and_limit(
+def test_a_run_whose_tracks_turn_its_state_one_way_is_reported_with_trend_and_limit(
     comparison: Comparison, rescored: Rescored
 ) -> None:
     trend = {"correction_trend": 5.25, "correction_trend_limit": 4.0, "nees_pose_mean": 1.0}
@@ -125,15 +125,15 @@ def test_who_explains_withheld_tracks_worse_than_the_motion_is_named(
         found = {"heldout_over_motion": 3.0 if is_first else 0.9}
         return Scores(row.scores.values | found, {"heldout_over_motion": harm} if is_first else {})
 
-    told = [line for line in note_lines(rescored(comparison, given)) if "withheld tracks worse" in line]
-    assert told == [f"{comparison.lines[0].estimator} {harm}"] * len(told)
-    assert told
+    reported = [line for line in note_lines(rescored(comparison, given)) if "withheld tracks worse" in line]
+    assert reported == [f"{comparison.lines[0].estimator} {harm}"] * len(reported)
+    assert reported
 
 
-def test_a_gate_that_refuses_much_is_told_with_its_share(comparison: Comparison, rescored: Rescored) -> None:
+def test_a_gate_that_refuses_much_is_reported_with_its_share(comparison: Comparison, rescored: Rescored) -> None:
     def words(accepted: float) -> list[str]:
-        told = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
-        return [line for line in note_lines(told) if "outlier gate" in line]
+        reported = rescored(comparison, lambda row: Scores(row.scores.values | {"gate_accepted_percent": accepted}, {}))
+        return [line for line in note_lines(reported) if "outlier gate" in line]
 
     assert words(81.0) == []
     (line,) = words(55.0)

@@ -70,7 +70,7 @@ def test_pairs_and_coverage_that_all_rows_share_stand_above_the_table(shared_by_
     assert "pairs" not in as_text(comparison_table(same))
 
 
-def test_pairs_that_differ_are_told_with_columns_that_leave_them_out(
+def test_pairs_that_differ_are_reported_with_columns_that_leave_them_out(
     shared_by_all: Callable[..., Comparison], rescored: Rescored
 ) -> None:
     same = shared_by_all(pairs=120.0, coverage_percent=100.0)
@@ -192,7 +192,7 @@ def test_diverged_and_failed_runs_are_explained(comparison: Comparison) -> None:
         assert "the solve did not converge" in text
 
 
-def test_audit_start_and_facts_are_told(comparison: Comparison) -> None:
+def test_audit_start_and_facts_are_reported(comparison: Comparison) -> None:
     for text in (comparison_text(comparison), report_text(comparison, {})):
         words = " ".join(text.split())
         assert comparison.findings[0].detail in words
@@ -224,7 +224,7 @@ def test_a_recording_without_image_features_says_so(comparison: Comparison) -> N
         assert "can only integrate the measured motion" in text
 
 
-def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(
+def test_remarks_are_reported_once_and_those_on_the_vertical_beside_the_table(
     comparison: Comparison, rescored: Rescored
 ) -> None:
     def remarked(row: Row) -> Scores:
@@ -232,10 +232,10 @@ def test_remarks_are_told_once_and_those_on_the_vertical_beside_the_table(
         notes = {"ate_yaw_m": "tilted", "reproj_median_px": "half of them", "reproj_rmse_px": "half of them"}
         return Scores(values, notes)
 
-    told = rescored(replace(comparison, outcomes=comparison.outcomes[:1]), remarked)
-    assert "ate_yaw_m: tilted" in comparison_text(told)
-    assert "half of them" not in comparison_text(told)
-    report = report_text(told, {})
+    messages = rescored(replace(comparison, outcomes=comparison.outcomes[:1]), remarked)
+    assert "ate_yaw_m: tilted" in comparison_text(messages)
+    assert "half of them" not in comparison_text(messages)
+    report = report_text(messages, {})
     assert "- reproj_median_px, reproj_rmse_px: half of them" in report
     assert report.count("tilted") == 1
 

@@ -210,7 +210,7 @@ def test_images_for_which_there_is_no_room_are_refused_before_any_work(
     assert not list(tmp_path.iterdir())
 
 
-def test_how_much_is_to_be_made_is_said_before_it_is(
+def test_how_much_is_to_be_made_is_reported_before_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stopped(*_: object) -> None:

@@ -166,7 +166,7 @@ def test_the_prior_errs_as_its_covariance_says() -> None:
     assert abs(np.mean(errors) - 15.0) < 5.0 * np.sqrt(30.0 / 200)
 
 
-def test_outliers_are_as_many_as_asked_and_stay_in_the_image() -> None:
+def test_outliers_are_as_many_as_requested_and_stay_in_the_image() -> None:
     struck = replace(DRIVE, camera=replace(DRIVE.camera, outlier_rate=0.1))
     clean, dirty = simulate(DRIVE, 6).observations.uv_px, simulate(struck, 6).observations.uv_px
     moved_px = np.linalg.norm((dirty - clean)[:, [0, 2]], axis=1)

@@ -61,7 +61,7 @@ def test_a_landmark_is_followed_by_one_track_at_a_time() -> None:
     assert np.unique(pairs, axis=1).shape == pairs.shape
 
 
-def test_tracks_end_by_chance_as_often_as_asked() -> None:
+def test_tracks_end_by_chance_as_often_as_requested() -> None:
     seen = np.ones((400, 150), dtype=bool)  # nothing ever leaves the view
     camera = replace(FLIGHT.camera, loss_per_frame=0.04)
     tracks = follow(seen, camera, np.random.default_rng(5))

@@ -39,15 +39,15 @@ def test_white_errors_are_not(white: Sequence, white_fit: Fit) -> None:
     assert any("are white" in line and "should win" in line for line in card_lines(card))
 
 
-def test_a_scale_and_strays_are_told(exact: Sequence, walking: Sequence) -> None:
+def test_a_scale_and_strays_are_reported(exact: Sequence, walking: Sequence) -> None:
     short = walking.truncated(70)
     off = disparity_scale(persistent_mismatch(short, 0.2, 4), 0.03)
     card = card_of(off, fit_track_noise(off))
     assert card.scale is not None and card.scale.value == pytest.approx(1.0 / 1.03, abs=0.01)
     # A mismatch in the last sighting of a track, or of one too short, does not show.
     assert 0.07 < card.at_odds < 0.25
-    told = " ".join(card_lines(card))
-    assert "short against the measured motion" in told and "mismatches that last" in told
+    messages = " ".join(card_lines(card))
+    assert "short against the measured motion" in messages and "mismatches that last" in messages
 
 
 def test_intervals_without_a_common_track_are_counted(walking: Sequence, walking_fit: Fit) -> None:
@@ -70,8 +70,8 @@ def test_the_command_prints_the_card_and_writes_it(tmp_path: Path, capsys: pytes
     assert main(["card", "drive", "--max-frames", "50", "--json", str(target)]) == 0
     record = read_card(target)
     assert json.loads(target.read_text(encoding="utf-8"))["schema"] == "vislam.card/1"
-    said = capsys.readouterr().out
-    assert all(line in said for line in record.words)
+    printed = capsys.readouterr().out
+    assert all(line in printed for line in record.words)
 
 
 def test_the_command_refuses_a_recording_without_tracks_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -93,7 +93,7 @@ def test_a_report_has_the_card_where_the_noise_was_fitted(walking: Sequence) -> 
     assert any("causal answers know it too early" in fact for fact in report.words.facts)
 
 
-def test_a_report_has_no_card_that_nobody_asked_for(walking: Sequence) -> None:
+def test_a_report_has_no_card_that_nobody_requested(walking: Sequence) -> None:
     comparison = run(Plan((walking.truncated(20),), ("dead-reckoning",), workers=1))[0]
     assert comparison.card is None
     assert '"card"' not in to_line(report_document(comparison))

@@ -47,8 +47,8 @@ def test_white_noise_comes_out_white(white_fit: Fit) -> None:
 
 
 def test_the_settings_put_the_fitted_noise_on_the_rig_and_say_so(walking: Sequence) -> None:
-    asked = settings_of({"noise": {"tracks": "fitted", "track_fit_s": 6.0}}, "test").noise
-    prepared = prepare(Recording(walking, noise=asked))
+    requested = settings_of({"noise": {"tracks": "fitted", "track_fit_s": 6.0}}, "test").noise
+    prepared = prepare(Recording(walking, noise=requested))
     noise = prepared.sequence.rig.track_noise
     # 350 tracks.
     assert noise is not None and noise.offset_px[1] == pytest.approx(OFFSET_PX, rel=0.2)
@@ -57,8 +57,8 @@ def test_the_settings_put_the_fitted_noise_on_the_rig_and_say_so(walking: Sequen
 
 
 def test_noise_that_comes_out_white_leaves_the_recordings_own(white: Sequence) -> None:
-    asked = settings_of({"noise": {"tracks": "fitted"}}, "test").noise
-    prepared = prepare(Recording(white.truncated(60), noise=asked)).sequence
+    requested = settings_of({"noise": {"tracks": "fitted"}}, "test").noise
+    prepared = prepare(Recording(white.truncated(60), noise=requested)).sequence
     assert prepared.rig.track_noise is None
     assert np.array_equal(prepared.rig.cov_uv_px2, white.rig.cov_uv_px2)
     assert "fitted to all that is used" in prepared.provenance.facts[-1]

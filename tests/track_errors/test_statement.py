@@ -34,7 +34,7 @@ def test_white_tracks_contradict_the_settings_own_noise_and_the_facts_say_so(whi
     assert not any("scatter" in fact for fact in facts)
 
 
-def test_without_sightings_nothing_is_said(white: Sequence) -> None:
+def test_without_sightings_nothing_is_reported(white: Sequence) -> None:
     none = np.empty(0, dtype=np.int64)
     assert contradicted(PLANTED, replace(white, observations=Observations(none, none, np.empty((0, 3))))) is None
 

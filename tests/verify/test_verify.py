@@ -72,7 +72,7 @@ PLANTS = {
     "no pose": "T = T[:3]",
 }
 # By plant: the promise that it breaks, and what is told of that.
-TOLD = {
+REPORTED = {
     "look-ahead through the base of an array": (
         CAUSAL,
         "its answer to frame 0 is another one where the packets from frame 2 on are withheld",
@@ -125,10 +125,10 @@ def failed(capsys) -> dict[str, dict[str, str]]:
 @pytest.mark.usefixtures("only_runs")
 @pytest.mark.parametrize("kind", PLANTS)
 def test_what_is_planted_is_named_with_what_to_do(newcomer, capsys, kind: str) -> None:
-    promise, told = TOLD[kind]
+    promise, messages = REPORTED[kind]
     assert main(["verify", str(newcomer(PLANTS[kind])), "--json"]) == 1
     found = failed(capsys)
-    assert told in found[promise]["found"]
+    assert messages in found[promise]["found"]
     assert found[promise]["remedy"]
 
 
@@ -136,7 +136,7 @@ def test_what_is_planted_is_named_with_what_to_do(newcomer, capsys, kind: str) -
 @pytest.mark.parametrize("kind", ["covariance not positive definite", "NaN in a covariance", "a scaled rotation"])
 def test_nothing_else_is_called_broken(newcomer, capsys, kind: str) -> None:
     main(["verify", str(newcomer(PLANTS[kind])), "--json"])
-    assert list(failed(capsys)) == [TOLD[kind][0]]
+    assert list(failed(capsys)) == [REPORTED[kind][0]]
 
 
 def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -> None:
@@ -144,9 +144,9 @@ def test_a_sound_estimator_in_a_file_passes_all(newcomer, capsys, monkeypatch) -
     monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     monkeypatch.setattr(verification, "_NEES_DURATION_S", 3.0)
     assert main(["verify", str(newcomer("pass"))]) == 0
-    told = capsys.readouterr().out
-    assert "my-filter keeps every promise" in told
-    assert told.count("  passed") == 12
+    messages = capsys.readouterr().out
+    assert "my-filter keeps every promise" in messages
+    assert messages.count("  passed") == 12
 
 
 @pytest.mark.usefixtures("only_runs")
@@ -169,7 +169,7 @@ def test_it_may_be_a_module_of_another_package(newcomer, capsys, monkeypatch) ->
     assert list(failed(capsys)) == [COVARIANCES]
 
 
-def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
+def test_who_dies_of_a_fault_is_reported_with_that_fault(newcomer, monkeypatch) -> None:
     some = ("2 s without sight", "a camera 20 ms late")
     monkeypatch.setattr(verification, "PLANTED_FAULTS", {name: verification.PLANTED_FAULTS[name] for name in some})
     path = newcomer("assert len(packet.frame.track_ids), 'no sightings'")
@@ -180,7 +180,7 @@ def test_who_dies_of_a_fault_is_told_of_which(newcomer, monkeypatch) -> None:
     assert "AssertionError: no sightings" in found["2 s without sight (drive)"]
 
 
-def test_too_sure_and_too_timid_are_told_apart_from_honest() -> None:
+def test_too_sure_and_too_timid_are_distinguished_from_honest() -> None:
     rng = np.random.default_rng(0)
     # Poses of a run share one error in the worst case: a chi-square of 6 over 6 each, over eight runs.
     alarms = sum(bool(inconsistency((rng.chisquare(6, 8) / 6.0).tolist())) for _ in range(2000))
@@ -197,7 +197,7 @@ def test_a_covariance_with_units_far_apart_is_sound() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "text", "told"),
+    ("word", "text", "expected"),
     [
         ("nowhere.py", None, "nowhere.py: there is no such file"),
         ("mine.py", "def build(setup)\n", "mine.py, line 1: it cannot be imported (SyntaxError"),
@@ -209,14 +209,14 @@ def test_a_covariance_with_units_far_apart_is_sound() -> None:
         (".", None, "no estimator is called ."),
     ],
 )
-def test_what_cannot_be_loaded_is_told_in_one_line(tmp_path, monkeypatch, capsys, word, text, told) -> None:
+def test_what_cannot_be_loaded_is_reported_in_one_line(tmp_path, monkeypatch, capsys, word, text, expected) -> None:
     monkeypatch.chdir(tmp_path)
     if text is not None:
         Path(word).write_text(text)
     assert main(["verify", word]) == 5
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert told in said
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert expected in printed
 
 
 def test_a_pipe_is_no_estimators_file_and_is_not_waited_for(tmp_path, monkeypatch, capsys) -> None:

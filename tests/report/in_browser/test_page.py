@@ -82,11 +82,11 @@ def test_a_missing_value_is_a_dash_with_its_reason(page: Page, single: Path) -> 
     assert "the run gave no trajectory" in page.find(".hint").text
 
 
-def test_trouble_is_told_in_words(page: Page, single: Path) -> None:
+def test_trouble_is_reported_in_words(page: Page, single: Path) -> None:
     page.open(single)
-    told = page.find(".trouble").text
-    assert "astray diverged" in told
-    assert "broken failed" in told
+    reported = page.find(".trouble").text
+    assert "astray diverged" in reported
+    assert "broken failed" in reported
     assert [one.text for one in page.all(".status.bad")] == ["diverged", "failed"]
 
 
@@ -187,7 +187,7 @@ def test_a_hostile_name_runs_nothing(page: Page, run_called: Callable[[str], Pat
     assert page.run("return document.querySelectorAll('img').length") == 0
 
 
-def test_faults_that_could_not_be_judged_stand_together_by_their_reason(page: Page, single: Path) -> None:
+def test_faults_that_could_not_be_checked_stand_together_by_their_reason(page: Page, single: Path) -> None:
     page.open(single)
-    told = [entry.get_attribute("textContent") for entry in page.all(".findings li")]
-    assert told[-1] == "not decidable time-offset, twist-lag: too little change of rotation"
+    reported = [entry.get_attribute("textContent") for entry in page.all(".findings li")]
+    assert reported[-1] == "not decidable time-offset, twist-lag: too little change of rotation"

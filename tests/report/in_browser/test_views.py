@@ -40,7 +40,7 @@ def test_views_answer_to_the_keyboard(page: Page, single: Path, view: str, key: 
     assert page.picture(canvas) == before
 
 
-def test_images_of_the_recording_are_coloured_by_the_estimator_asked_for(
+def test_images_of_the_recording_are_coloured_by_the_estimator_requested(
     page: Page, run_directory: Path, tmp_path: Path
 ) -> None:
     """A grey image with two sightings: blue by one estimator, red by the other."""
@@ -48,8 +48,8 @@ def test_images_of_the_recording_are_coloured_by_the_estimator_asked_for(
     (shown / "frames").mkdir()
     (shown / "frames/1.jpg").write_bytes(cv2.imencode(".jpg", np.full((120, 200), 128, np.uint8))[1].tobytes())
     document = json.loads((shown / "report.json").read_text())
-    told = (("late", "final", [0, 0]), ("astray", "causal", [9, None]))
-    off = [{"estimator": name, "output": output, "off_px": px} for name, output, px in told]
+    reported = (("late", "final", [0, 0]), ("astray", "causal", [9, None]))
+    off = [{"estimator": name, "output": output, "off_px": px} for name, output, px in reported]
     frame = {
         "t_s": 1.0,
         "image": "frames/1.jpg",
@@ -107,7 +107,7 @@ def test_views_answer_to_the_pointer_and_the_buttons(page: Page, single: Path, v
     assert page.picture(canvas) != dragged
 
 
-def test_the_wheel_zooms_only_where_it_is_asked_to(page: Page, single: Path) -> None:
+def test_the_wheel_zooms_only_where_that_is_requested(page: Page, single: Path) -> None:
     page.open(single)
     element = page.into_view("canvas[data-view='top']")
     before = page.picture("canvas[data-view='top']")
@@ -144,18 +144,18 @@ def test_one_cursor_moves_every_figure(page: Page, single: Path) -> None:
     before = [page.picture(figure) for figure in figures]
     page.press(".scrubber input", *[Keys.PAGE_UP] * 3)
     assert all(page.picture(figure) != picture for figure, picture in zip(figures, before, strict=True))
-    told = page.find(".readout").text
-    assert told.endswith(" m")
-    assert float(told.split(" s")[0]) > 0.0
-    assert page.find(".scrubber input").get_attribute("aria-valuetext") == told
+    reported = page.find(".readout").text
+    assert reported.endswith(" m")
+    assert float(reported.split(" s")[0]) > 0.0
+    assert page.find(".scrubber input").get_attribute("aria-valuetext") == reported
 
 
 def test_pointing_at_a_chart_reads_every_line_there(page: Page, single: Path) -> None:
     page.open(single)
     ActionChains(page.driver).move_to_element(page.into_view("canvas[data-chart='Position error']")).perform()
     page.settle()
-    told = page.find(".hint").text
-    assert all(name in told for name in ("steady", "astray", "late final"))
+    reported = page.find(".hint").text
+    assert all(name in reported for name in ("steady", "astray", "late final"))
     assert page.find(".readout").text != "0.0 s, 0 m"
 
 
