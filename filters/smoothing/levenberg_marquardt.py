@@ -49,11 +49,16 @@ _FREE_SHARE, _LEAST_PART = 1e-5, 0.1
 
 @dataclass(frozen=True)
 class Stopping:
-    """When to stop: a decrease of the error that is small, in itself or relative to it, or too many iterations."""
+    """When to stop: a decrease of the error that is small, in itself or relative to it, or too many iterations.
+
+    ``at_overshoot`` ends a solve that needs no end at the first step that raises the error after one that lowered it,
+    where steps are taken here: to damp it until it lowers the error, too, takes an elimination each time.
+    """
 
     relative_decrease: float = 1e-5
     max_iterations: int = 50
     decrease: float = _LEAST_DECREASE
+    at_overshoot: bool = False
 
 
 class Beside(Protocol):
@@ -110,7 +115,7 @@ def solve(
         return _solved(_LandmarkSolver(mixed, start, beside), start, error, stopping, advance)
     if ordering is None:
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(mixed.whole)
-    in_metres = _GraphSolver(mixed, ordering)
+    in_metres = _GraphSolver(mixed, ordering, stopping.at_overshoot)
     solver = _ImageSolver(in_metres, landmarks) if isinstance(landmarks, FirstImages) else in_metres
     return _solved(solver, start, error, stopping, advance)._replace(overshot=in_metres.overshot)
 
@@ -188,10 +193,10 @@ class _Damped(NamedTuple):
 class _GraphSolver:
     """Takes the steps of a solve of factors alone: GTSAM's optimizer does, where none of them is Python's."""
 
-    def __init__(self, graph: MixedGraph, ordering: gtsam.Ordering) -> None:
-        self._graph, self._ordering = graph, ordering
-        # Whether a step raised the error.
-        self.overshot = False
+    def __init__(self, graph: MixedGraph, ordering: gtsam.Ordering, ends_at_overshoot: bool = False) -> None:
+        self._graph, self._ordering, self._ends_at_overshoot = graph, ordering, ends_at_overshoot
+        # Whether a step raised the error, and whether one lowered it.
+        self.overshot, self._lowered = False, False
         self._held: dict[float, gtsam.GaussianFactorGraph] = {}
 
     def started(self, values: gtsam.Values, error: float) -> _OfGtsam | _Damped:
@@ -240,8 +245,9 @@ class _GraphSolver:
                 there = taken(here.reached, step)
                 error = self._graph.error(there)
                 if error <= here.error:
+                    self._lowered = True
                     return _Damped(there, error, max(damping / _DAMPING_FACTOR, least_damping))
-                if error - here.error < _NEXT_TO_NOTHING * here.error:
+                if error - here.error < _NEXT_TO_NOTHING * here.error or (self._ends_at_overshoot and self._lowered):
                     break
             damping *= _DAMPING_FACTOR
         return here._replace(held_back=False)

@@ -8,7 +8,8 @@ import pytest
 
 from filters.smoothing import levenberg_marquardt
 from filters.smoothing.landmark_steps import FirstImages
-from filters.smoothing.levenberg_marquardt import Stopping, solve
+from filters.smoothing.levenberg_marquardt import Solution, Stopping, solve
+from filters.smoothing.mixed_graph import MixedGraph
 from filters.smoothing.robust_loss import Squares
 from filters.smoothing.track_chain import ChainedFactors, ChainedSightings
 from toolkit.geometry import Array, se3_exp, transform
@@ -264,3 +265,34 @@ def test_the_images_of_a_graph_are_those_of_its_frames():
     found = FirstImages.in_graph(graph, DRIVE.rig)
     np.testing.assert_array_equal(found.track_ids, images.track_ids)
     np.testing.assert_array_equal(found.first, images.first)
+
+
+def errors_tried(stopping, monkeypatch) -> tuple[list[float], Solution]:
+    """Return the errors a solve of the bent drive with a Python factor looks at, and its answer."""
+    graph, start, _ = bent_drive(0)
+    here = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    graph.add(gtsam.CustomFactor(here, [X(0)], pose_error))
+    tried, error = list[float](), MixedGraph.error
+    monkeypatch.setattr(MixedGraph, "error", lambda self, values: tried.append(error(self, values)) or tried[-1])
+    return tried, solve(graph, start, stopping)
+
+
+def pose_error(_factor: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+    """Return how far the first pose is from the origin, (6,), with its derivative at the origin."""
+    if H is not None:
+        H[0] = np.eye(6)
+    return np.asarray(gtsam.Pose3.Logmap(values.atPose3(X(0))))
+
+
+def test_a_solve_that_needs_no_end_ends_at_the_first_step_that_raises_the_error_after_one_that_lowered_it(monkeypatch):
+    # Held back from the first, it lowers the error until damping has become small.
+    monkeypatch.setattr(levenberg_marquardt, "_FIRST_DAMPING", 100.0)
+    with monkeypatch.context() as counting:
+        tried, solution = errors_tried(Stopping(1e-4, 60, at_overshoot=True), counting)
+    with monkeypatch.context() as counting:
+        longer, patient = errors_tried(Stopping(1e-4, 60), counting)
+    assert min(tried) == solution.error == tried[-2] < tried[-1]
+    assert tried[:-1] == sorted(tried[:-1], reverse=True)
+    assert longer[: len(tried)] == tried
+    assert patient.error < solution.error
+    assert solution.overshot
