@@ -59,6 +59,20 @@ def test_a_disparity_that_is_off_is_reported_on_a_shaken_imu() -> None:
     assert "% shorter than the IMU's" in reported["vision-scale"]
 
 
+@pytest.mark.parametrize(
+    ("plant", "dose", "said"),
+    [
+        (faults.shifted_right, -1.0, "the right image's columns are -0.98"),
+        (faults.rolled_right, 0.01, "rolled about its optical axis by +0.0099"),
+    ],
+)
+def test_a_right_image_whose_windows_want_different_calibrations_is_told(
+    plant: faults.Fault, dose: float, said: str
+) -> None:
+    """Windows part by what the image bends: with that scatter for an error the shift hid behind a baseline."""
+    assert said in warnings_of(audit(plant(part(GORE, 0, 250), dose, 0)))["miscalibration"]
+
+
 def test_twists_whose_axes_are_turned_at_first_are_reported_of_that_part() -> None:
     """The first 8 s of 03: velocities and rates of rotation alike are turned by 0.07 rad, and not from 15 s on."""
     reported = warnings_of(audit(part("ucsd/03.npz", 0, 80)))

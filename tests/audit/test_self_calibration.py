@@ -237,7 +237,7 @@ def sure(unknown: int, value: float) -> SelfCalibration:
         (1, 0.012, "K"),
         (2, 2.0, "K"),
         (3, 5.0, "K"),
-        (4, 0.015, "the baseline"),
+        (4, 0.015, "the baseline, the rectification of the pair"),
         (6, 0.006, "the rotation of T_imu_cam"),
         (11, 0.0008, "the clocks of the camera and the IMU"),
     ],

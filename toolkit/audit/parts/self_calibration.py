@@ -146,11 +146,13 @@ def _fitted(at: _At, kind: MotionKind) -> tuple[_Adjusted, Array]:
     It is that of a rectified pair, unless a step of all unknowns from where that settled wants the right image's.
     """
     rectified, prior = _adjusted(at, kind, _RECTIFIED), PRIOR[kind]
-    cov = _cov(rectified.all_reduced, prior)
     right = _step(rectified.all_reduced, rectified.at.moved_by, prior)[RIGHT]
-    if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(cov)[RIGHT])).any():
+    # Windows of a pair that is not rectified want different calibrations: their scatter is no chance here.
+    by_parts, _ = _cov_of_parts(rectified.all_reduced, prior, COMMON)
+    if rectified.settled and (np.abs(right) > RIGHT_SIGMAS[kind] * np.sqrt(np.diag(by_parts)[RIGHT])).any():
         found = _adjusted(rectified.at, kind, COMMON)
         return found, _cov(found.all_reduced, prior)
+    cov = _cov(rectified.all_reduced, prior)
     cov[:_RECTIFIED], cov[:, :_RECTIFIED] = 0.0, 0.0
     cov[:_RECTIFIED, :_RECTIFIED] = _cov(rectified.all_reduced, prior, _RECTIFIED)
     return rectified, cov
@@ -188,24 +190,30 @@ def _information(all_reduced: list[Reduced], prior: Array) -> Array:
 
 
 def _cov(all_reduced: list[Reduced], prior: Array, free: int = COMMON) -> Array:
-    """Return the covariance of the first unknowns, so many, robust to errors that last.
+    """Return the covariance of the first unknowns, so many, robust also to errors that stay the same in a window.
 
-    Errors may stay the same along a track, for a second or in a window. It is no less than that of errors that are all
-    independent, for few parts can look too calm; and windows, of which there are two to six, count only where they
-    scatter more than is chance. Source: Liang & Zeger, "Longitudinal data analysis using generalized linear models"
-    (1986), the sandwich.
+    Windows, of which there are two to six, count only where they scatter more than is chance.
+    """
+    cov, inverse = _cov_of_parts(all_reduced, prior, free)
+    by_window = np.array([reduced.gradients[:, :free].sum(axis=0) for reduced in all_reduced]) @ inverse
+    dof = len(all_reduced) - 1
+    if dof == 0:
+        return cov
+    scatter = np.sum((by_window - by_window.mean(axis=0)) ** 2, axis=0) * (dof + 1) / dof
+    beyond = scatter > np.diag(cov) * chdtri(dof, LEVEL) / dof
+    return np.asarray(cov + np.diag(np.where(beyond, np.maximum(scatter - np.diag(cov), 0.0), 0.0)))
+
+
+def _cov_of_parts(all_reduced: list[Reduced], prior: Array, free: int) -> tuple[Array, Array]:
+    """Return the covariance robust to errors that stay the same along a track or for a second, and the usual one.
+
+    It is no less than that of errors that are all independent, for few parts can look too calm. Source: Liang & Zeger,
+    "Longitudinal data analysis using generalized linear models" (1986), the sandwich.
     """
     inverse = np.linalg.inv(_information(all_reduced, prior)[:free, :free])
     gradients = np.concatenate([reduced.gradients[:, :free] for reduced in all_reduced])
     cov = inverse @ (gradients.T @ gradients + np.diag(prior[:free] ** -2.0)) @ inverse
-    cov = cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))
-    by_window = np.array([reduced.gradients[:, :free].sum(axis=0) for reduced in all_reduced]) @ inverse
-    dof = len(all_reduced) - 1
-    if dof == 0:
-        return np.asarray(cov)
-    scatter = np.sum((by_window - by_window.mean(axis=0)) ** 2, axis=0) * (dof + 1) / dof
-    beyond = scatter > np.diag(cov) * chdtri(dof, LEVEL) / dof
-    return np.asarray(cov + np.diag(np.where(beyond, np.maximum(scatter - np.diag(cov), 0.0), 0.0)))
+    return np.asarray(cov + np.diag(np.maximum(np.diag(inverse) - np.diag(cov), 0.0))), np.asarray(inverse)
 
 
 def _windows(sequence: Sequence, camera: CameraMotion, w_bias: Array, fewest: int = 1) -> list[Window]:
