@@ -84,9 +84,9 @@ compilation.find_spec = lambda name: name
 Path(sys.argv[1]).touch()
 while not all(Path(path).exists() for path in "ab"):
     time.sleep(0.01)
-asked = compilation.Compilation("auto")
-asked.share(["one", "other"])
-print(*(asked.module(name).compiled for name in ["one", "other"]))
+requested = compilation.Compilation("auto")
+requested.share(["one", "other"])
+print(*(requested.module(name).compiled for name in ["one", "other"]))
 """
 
 

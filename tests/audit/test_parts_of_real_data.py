@@ -60,17 +60,17 @@ def test_a_disparity_that_is_off_is_reported_on_a_shaken_imu() -> None:
 
 
 @pytest.mark.parametrize(
-    ("plant", "dose", "said"),
+    ("plant", "dose", "expected"),
     [
         (faults.shifted_right, -1.0, "the right image's columns are -0.98"),
         (faults.rolled_right, 0.01, "rolled about its optical axis by +0.0099"),
     ],
 )
-def test_a_right_image_whose_windows_want_different_calibrations_is_told(
-    plant: faults.Fault, dose: float, said: str
+def test_a_right_image_whose_windows_want_different_calibrations_is_reported(
+    plant: faults.Fault, dose: float, expected: str
 ) -> None:
     """Windows part by what the image bends: with that scatter for an error the shift hid behind a baseline."""
-    assert said in warnings_of(audit(plant(part(GORE, 0, 250), dose, 0)))["miscalibration"]
+    assert expected in warnings_of(audit(plant(part(GORE, 0, 250), dose, 0)))["miscalibration"]
 
 
 def test_twists_whose_axes_are_turned_at_first_are_reported_of_that_part() -> None:

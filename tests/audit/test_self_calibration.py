@@ -169,20 +169,20 @@ SOUND_UNTIL = {RIGHT_SHIFT: 0.05, RIGHT_ROLL: 0.002}
 @pytest.mark.parametrize("unknown", SOUND_UNTIL)
 def test_the_right_image_counts_beyond_what_sound_recordings_have_and_is_doubted_before(unknown: int) -> None:
     rig, limit = recorded(FLIGHT, 0).rig, SOUND_UNTIL[unknown]
-    (told,) = wrong(sure(unknown, 1.01 * limit), rig, "imu")
-    assert told.check == "the rectification of the pair"
+    (answer,) = wrong(sure(unknown, 1.01 * limit), rig, "imu")
+    assert answer.check == "the rectification of the pair"
     assert wrong(sure(unknown, 0.98 * limit), rig, "imu") == []
     assert "right" in (doubtful(sure(unknown, 0.98 * limit), rig, "imu") or "")
 
 
 def test_a_right_image_that_hardly_any_parallax_shows_is_not_decidable() -> None:
     known = np.full(COMMON, 1e-6)
-    for unknown, error, said in ((RIGHT_SHIFT, 0.12, "shifted by 0.5 px"), (RIGHT_ROLL, 0.0021, "rolled by 0.010 rad")):
+    for unknown, error, why in ((RIGHT_SHIFT, 0.12, "shifted by 0.5 px"), (RIGHT_ROLL, 0.0021, "rolled by 0.010 rad")):
         cov = np.diag(np.where(np.arange(COMMON) == unknown, error, known) ** 2)
-        assert said in (hidden(SelfCalibration(np.zeros(COMMON), cov, 1), "imu") or "")
+        assert why in (hidden(SelfCalibration(np.zeros(COMMON), cov, 1), "imu") or "")
 
 
-TOLD = [
+REPORTED = [
     (faults.rolled_right, 0.01, FLIGHT, 8.0, "rolled about its optical axis by +0.01"),
     (faults.rolled_right, -0.01, DRIVE_IMU, 12.0, "rolled about its optical axis by -0.0"),
     (faults.rolled_right, 0.01, DRIVE, 12.0, "rolled about its optical axis by +0.0"),
@@ -192,15 +192,15 @@ TOLD = [
 ]
 
 
-@pytest.mark.parametrize("plant, dose, scenario, duration_s, said", TOLD)
-def test_a_right_image_that_is_not_rectified_is_told(
-    plant: faults.Fault, dose: float, scenario: Scenario, duration_s: float, said: str
+@pytest.mark.parametrize("plant, dose, scenario, duration_s, why", REPORTED)
+def test_a_right_image_that_is_not_rectified_is_reported(
+    plant: faults.Fault, dose: float, scenario: Scenario, duration_s: float, why: str
 ) -> None:
     for seed in (31, 32):
         sound = recorded(scenario, seed, duration_s)
         assert "miscalibration" not in {finding.fault for finding in audit(sound).findings}
         found = {finding.fault: finding.detail for finding in audit(plant(sound, dose, seed)).findings}
-        assert said in found["miscalibration"]
+        assert why in found["miscalibration"]
 
 
 @pytest.mark.parametrize("scenario", [FLIGHT, FLIGHT_REALISTIC, DRIVE_IMU], ids=lambda scenario: scenario.name)

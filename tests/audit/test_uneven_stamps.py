@@ -46,7 +46,7 @@ def test_frames_that_are_lost_or_stamped_rightly_are_not_accused(scenario: str, 
 
 @pytest.mark.parametrize("frames", [100, 101])
 @pytest.mark.parametrize("scenario", SCENARIOS_OF)
-def test_every_other_frame_late_is_told_whichever_steps_are_more_and_where_frames_are_lost(
+def test_every_other_frame_late_is_reported_whichever_steps_are_more_and_where_frames_are_lost(
     scenario: str, frames: int
 ) -> None:
     """Of long and short steps that alternate the median is either; and a lost frame is no unevenness."""
@@ -54,9 +54,9 @@ def test_every_other_frame_late_is_told_whichever_steps_are_more_and_where_frame
     for sequence in (late, with_frames_lost(late)):
         found = uneven_stamps.check(Evidence(sequence))
         assert isinstance(found, Symptom)
-        told = re.search(r"follows (\S+) \+- (\S+),", found.detail)
-        assert told is not None
-        assert -0.25 < float(told[1]) < 0.1
+        reported = re.search(r"follows (\S+) \+- (\S+),", found.detail)
+        assert reported is not None
+        assert -0.25 < float(reported[1]) < 0.1
 
 
 def test_the_motion_follows_all_of_the_steps_where_stamps_are_right() -> None:

@@ -351,7 +351,9 @@ def test_stamps_that_went_through_single_precision_are_named(course: Course, tmp
 
 
 @pytest.mark.parametrize("epoch", [False, True])
-def test_a_few_nanoseconds_since_the_start_are_told_by_their_unit(course: Course, tmp_path: Path, epoch: bool) -> None:
+def test_a_few_nanoseconds_since_the_start_are_reported_by_their_unit(
+    course: Course, tmp_path: Path, epoch: bool
+) -> None:
     frames = course["time_stamps"].size
     course["time_stamps"] = (1.3e18 * epoch + 1e8 * np.arange(frames))[None]
     with pytest.raises(DataError, match="look like nanoseconds: divide by 1e9"):

@@ -23,15 +23,15 @@ def build(setup):
 
 class Still:
     def __init__(self, setup):
-        self.setup, self.said = setup, []
+        self.setup, self.answers = setup, []
 
     def step(self, packet):
-        self.said.append(Estimate(packet.frame.t_ns, self.setup.prior.T_world_imu))
-        return self.said[-1]
+        self.answers.append(Estimate(packet.frame.t_ns, self.setup.prior.T_world_imu))
+        return self.answers[-1]
 
     def finish(self):
         set_to = (f"{sorted(self.setup.options.items())}", f"lag {self.setup.settings.window.lag_s}")
-        return Finished(Trajectory.of(self.said), Landmarks.none(), log=set_to)
+        return Finished(Trajectory.of(self.answers), Landmarks.none(), log=set_to)
 '''
 
 

@@ -551,7 +551,7 @@ def test_an_odometer_of_a_truths_name_is_offered_and_not_taken_unasked(asl: Path
 
 
 @pytest.mark.parametrize(("kept", "pattern"), [(0.5, "damaged or truncated"), (0.0, "it is empty")])
-def test_images_that_cannot_be_used_are_told_with_their_topic(
+def test_images_that_cannot_be_used_are_reported_with_their_topic(
     asl: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], kept: float, pattern: str
 ) -> None:
     """In every command: they are unpacked into a folder that nobody knows."""
@@ -565,10 +565,10 @@ def test_images_that_cannot_be_used_are_told_with_their_topic(
     path = ros.write(tmp_path / "film.bag", [*film, *images_of(asl, cut)])
     for words in (("check-data", str(path)), ("tracks", str(path), "--out", str(tmp_path / "stills"))):
         assert main(words) == 3
-        told = capsys.readouterr().err
-        assert f"{path}: /cam0/image_raw/compressed: 10 of 10 image pairs cannot be used" in told
-        assert pattern in told
-        assert str(tmp_path) not in told.replace(str(path), "")
+        printed = capsys.readouterr().err
+        assert f"{path}: /cam0/image_raw/compressed: 10 of 10 image pairs cannot be used" in printed
+        assert pattern in printed
+        assert str(tmp_path) not in printed.replace(str(path), "")
 
 
 def test_an_empty_image_is_left_out_and_named(asl: Path, tmp_path: Path) -> None:
@@ -588,9 +588,9 @@ def test_a_compression_that_the_library_does_not_know_is_no_damage(asl: Path, tm
     path.write_bytes(path.read_bytes().replace(b"compression=none", b"compression=lzma"))
     with pytest.raises(
         DataError, match=r"rosbags does not read such a bag \(Compression 'lzma' is not supported"
-    ) as told:
+    ) as refusal:
         load_sequence(str(path))
-    assert "copy it again" not in str(told.value)
+    assert "copy it again" not in str(refusal.value)
 
 
 def test_a_bag_that_breaks_off_leaves_nothing_behind(

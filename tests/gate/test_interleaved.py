@@ -177,7 +177,7 @@ def test_a_revision_that_a_shallow_clone_lacks_is_to_be_fetched(tmp_path, monkey
         unpacked("HEAD~1").__enter__()
 
 
-def test_outside_of_a_checkout_and_without_git_a_wheel_is_asked_for(tmp_path, monkeypatch):
+def test_outside_of_a_checkout_and_without_git_a_wheel_is_requested(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     with pytest.raises(BaselineError, match=r"HEAD: no checkout; stand in one, or name a wheel \(fatal: not a git"):

@@ -136,11 +136,11 @@ def test_another_clock_is_reported_with_both_ranges(vislam, capsys):
     assert "0 of its poses meet the truth in time; it covers" in " ".join(capsys.readouterr().out.split())
 
 
-def test_one_pose_is_told_as_that_and_no_clock_is_blamed(vislam, capsys):
+def test_one_pose_is_reported_as_that_and_no_clock_is_blamed(vislam, capsys):
     write(Path("results/lap.tum"), stamps(10.0)[:1])
     assert failures(vislam) == [("lap", "sequence", "missing")]
-    told = " ".join(capsys.readouterr().out.split())
-    assert "lap.tum: it has one pose, and errors are of two and more; write the whole trajectory" in told
+    reported = " ".join(capsys.readouterr().out.split())
+    assert "lap.tum: it has one pose, and errors are of two and more; write the whole trajectory" in reported
 
 
 def test_exchanged_axes_are_named_where_a_baseline_is_made_and_held(vislam, capsys):

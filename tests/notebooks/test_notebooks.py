@@ -31,7 +31,7 @@ def audited_once():
     # All that neither loading nor auditing looks at is left at its default.
     unread = {"start": "measurements", "noise": DEFAULTS.noise, "tracks": DEFAULTS.tracks, "card": False}
     audited = cache(recording.audited_recording)
-    recording.audited_recording = lambda asked, progress=None: audited(replace(asked, **unread))
+    recording.audited_recording = lambda requested, progress=None: audited(replace(requested, **unread))
 
 audited_once()
 """

@@ -34,7 +34,7 @@ class Newcomer:
     def __init__(self, setup):
         self.model = motion_model(setup.noise, setup.gravity_world)
         self.belief = self.model.initial_belief(setup.prior)
-        self.said = []
+        self.answers = []
         self.pose = np.eye(4)
 
     def step(self, packet):
@@ -42,11 +42,11 @@ class Newcomer:
         k = packet.index
         T, cov = self.belief.T_world_imu.copy(), self.belief.cov.copy()
         # PLANT
-        self.said.append(Estimate(packet.frame.t_ns, T, cov))
-        return self.said[-1]
+        self.answers.append(Estimate(packet.frame.t_ns, T, cov))
+        return self.answers[-1]
 
     def finish(self):
-        return Finished(Trajectory.of(self.said), Landmarks.none())
+        return Finished(Trajectory.of(self.answers), Landmarks.none())
 '''
 FINITE, ROTATIONS, STAMPS, CAUSAL, SAME, LATER, UNTOUCHED = (name for name, _, _ in verification._OF_A_RUN)
 COVARIANCES, HONEST, RUNS = verification._COVARIANCE, verification._NEES, "it runs to the end"
