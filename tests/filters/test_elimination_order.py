@@ -14,7 +14,7 @@ from toolkit.models.factors import L, StereoFactors, X
 from toolkit.models.motion import motion_model, state_keys
 from toolkit.sequence import Sequence, StereoFrame
 from toolkit.simulation import DRIVE, FLIGHT, simulate
-from toolkit.simulation.standstill import standstill
+from toolkit.simulation.faults import standstill
 
 Problem = tuple[gtsam.NonlinearFactorGraph, list[StereoFrame]]
 

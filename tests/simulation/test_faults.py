@@ -12,14 +12,14 @@ from toolkit.geometry import se3_inverse, so3_exp
 from toolkit.models.stereo import triangulate
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, check_runnable
-from toolkit.simulation import SCENARIOS, clock_faults, faults, simulate, standstill, track_faults
+from toolkit.simulation import SCENARIOS, faults, simulate, track_faults
 from toolkit.track_noise import CHANNELS
 
 INJECTORS = {
     name: function
-    for module in (faults, clock_faults, standstill, track_faults)
+    for module in (faults, track_faults)
     for name, function in getmembers(module, isfunction)
-    if function.__module__ == module.__name__ and not name.startswith("_")
+    if function.__module__.startswith(module.__name__) and not name.startswith("_")
 }
 # What an estimator is not given without a repair or a refusal first.
 NOT_RUNNABLE = {"nan_span", "clock_jump", "zero_intrinsics", "negative_focal"}

@@ -9,7 +9,7 @@ import numpy as np
 
 from toolkit.geometry import BoolArray, IntArray
 from toolkit.sequence import Observations, Sequence
-from toolkit.simulation.spans import ns, span_s
+from toolkit.simulation.faults.parts import ns, span_s
 
 
 def camera_clock(sequence: Sequence, dose: float = 0.02, seed: int = 0) -> Sequence:

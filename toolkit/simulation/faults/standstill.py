@@ -10,7 +10,7 @@ from toolkit.geometry import BoolArray, IntArray
 from toolkit.measured_motion import TwistNoise, TwistSamples
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Observations, Sequence, Truth
-from toolkit.simulation.spans import ns, span_s
+from toolkit.simulation.faults.parts import ns, span_s
 
 
 def standstill(sequence: Sequence, dose: float = 10.0, seed: int = 0) -> Sequence:

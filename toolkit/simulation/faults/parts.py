@@ -1,7 +1,10 @@
-"""Where in a recording a fault strikes: times in seconds after its first frame."""
+"""What several faults share: where in a recording they strike, and edits of it."""
+
+from dataclasses import replace
 
 import numpy as np
 
+from toolkit.geometry import Array
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
@@ -16,3 +19,8 @@ def span_s(sequence: Sequence, length_s: float, seed: int) -> tuple[float, float
 def ns(seconds: float) -> int:
     """Return seconds as whole nanoseconds."""
     return round(seconds * NS_PER_S)
+
+
+def with_pixels(sequence: Sequence, uv_px: Array) -> Sequence:
+    """Return the sequence with other pixels (N, 3) of its sightings."""
+    return replace(sequence, observations=replace(sequence.observations, uv_px=uv_px))
