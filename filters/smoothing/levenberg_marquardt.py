@@ -52,13 +52,15 @@ class Stopping:
     """When to stop: a decrease of the error that is small, in itself or relative to it, or too many iterations.
 
     ``at_overshoot`` ends a solve that needs no end at the first step that raises the error after one that lowered it,
-    where steps are taken here: to damp it until it lowers the error, too, takes an elimination each time.
+    where steps are taken here: to damp it until it lowers the error, too, takes an elimination each time. A solve that
+    has used up its iterations has converged all the same where the last gained no more than a share ``enough``.
     """
 
     relative_decrease: float = 1e-5
     max_iterations: int = 50
     decrease: float = _LEAST_DECREASE
     at_overshoot: bool = False
+    enough: float = 0.0
 
 
 class Beside(Protocol):
@@ -150,14 +152,15 @@ def _solved(
     stopping: Stopping,
     advance: Callable[[int], None],
 ) -> Solution:
-    here = solver.started(start, error)
+    here, enough = solver.started(start, error), False
     for iteration in range(1, stopping.max_iterations + 1):
         advance(iteration - 1)
         before, here = here.error, solver.advanced(here)
         little = before - here.error <= max(stopping.relative_decrease * here.error, stopping.decrease)
         if little and not here.held_back:
             return Solution(here.values(), here.error, iteration, converged=True)
-    return Solution(here.values(), here.error, stopping.max_iterations, converged=False)
+        enough = before - here.error <= stopping.enough * here.error and not here.held_back
+    return Solution(here.values(), here.error, stopping.max_iterations, converged=enough)
 
 
 class _OfGtsam(NamedTuple):

@@ -287,3 +287,13 @@ def test_a_gyro_that_turns_too_fast_is_reported_with_the_ratio(
     assert match is not None
     # The noise of the camera's rotation lowers the ratio by up to 1.5 %.
     assert float(match[1]) == pytest.approx(dose, abs=0.015 + 3.0 * float(match[2]))
+
+
+@pytest.mark.parametrize("every", [4, 5])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_frames_without_a_sighting_now_and_then_leave_too_little_to_compare_and_no_warning_of_numpy(every: int) -> None:
+    """No stretch of intervals is long enough for the specific force between its holes."""
+    sequence = simulate(replace(SCENARIOS["drive-imu"], duration_s=8.0), 0)
+    seen = sequence.observations.frame % every != 0
+    findings = audit(replace(sequence, observations=sequence.observations.select(seen))).findings
+    assert "conflict" not in {finding.fault for finding in findings}

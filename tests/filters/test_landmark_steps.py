@@ -125,6 +125,14 @@ def test_stopped_before_its_end_it_has_not_converged():
     assert solution.iterations == 2
 
 
+def test_a_solve_whose_last_iteration_gained_little_enough_has_converged_without_an_end():
+    graph, start, sightings = drive(2)
+    for enough, converged in ((1e-3, False), (10.0, True)):
+        solution = solve(graph, start, Stopping(0.0, 2, enough=enough), landmarks=sightings)
+        assert solution.iterations == 2
+        assert solution.converged == converged
+
+
 def bent_drive(seed: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FirstImages]:
     """Return 200 m straight ahead, told by five tracks a frame and a vague twist, and a start that turns by 0.4 rad."""
     rng, count = np.random.default_rng(seed), 200

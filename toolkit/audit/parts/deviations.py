@@ -81,6 +81,8 @@ def sustained(deviation: Deviation, sigmas: float, least: float) -> list[Span]:
     Those are what white noise makes of them, or in a long recording what they scatter by in the quieter half of either
     of its halves, if that is more. ``least`` is the smallest deviation that counts, in its unit.
     """
+    if deviation.t_s.size < LEAST_IN_STRETCH:
+        return []
     stretches = _stretches(deviation)
     if not stretches.centre_s.size:
         return []
@@ -169,7 +171,9 @@ def _specific_force(sequence: Sequence, camera: CameraMotion, found: "Fallen") -
     t_s = (middle_ns[:-1][rows] - frames_t_ns[0]) / NS_PER_S
     value = (np.diff(smooth, axis=0) / h_s)[rows]
     bend = np.abs(np.diff(fallen, n=2, axis=0))[rows[rows < len(fallen) - 2]]
-    sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * np.median(bend, axis=0) / np.sqrt(6.0)
+    # Where no stretch is long enough, nothing tells how much the velocities scatter.
+    bent_mps = np.median(bend, axis=0) if len(bend) else np.full(3, np.inf)
+    sigma_mps = _MEDIAN_ERROR * MAD_TO_SIGMA * bent_mps / np.sqrt(6.0)
     noise = np.sqrt(2.0) * sigma_mps / np.median(h_s)
     return Deviation("specific force", "m/s^2", t_s, value - _around(t_s, value), noise, telescopes=True)
 
