@@ -13,6 +13,7 @@ from toolkit.audit.parts.placement import is_excluded, is_there, way_gone
 from toolkit.audit.parts.robust import Scalar
 from toolkit.geometry import Array, se3, so3_exp
 from toolkit.sequence import Observations, Sequence
+from toolkit.simulation import SCENARIOS, simulate
 
 Make = Callable[..., Sequence]
 PlantIn = Callable[[str, Sequence], Sequence]
@@ -119,6 +120,15 @@ def test_a_wall_that_comes_ever_nearer_is_not_taken_for_a_doubling(clean_recordi
     uv_px = np.column_stack([left, left - disparity, np.full(left.size, 200.0)])
     nearing = replace(clean, observations=Observations(frame, track_id, uv_px))
     assert "doubled-disparity" not in {f.fault for f in audit(nearing).findings}
+
+
+@pytest.mark.parametrize("seed", [1, 3, 15])
+def test_a_drive_seen_once_a_second_is_not_taken_for_a_doubling(seed: int) -> None:
+    """From one frame to the next it comes half the way to what it sees, and few of the tracks live on."""
+    drive = SCENARIOS["drive-imu"]
+    camera = replace(drive.camera, rate_hz=1.0, max_tracks=15, loss_per_frame=0.3)
+    sequence = simulate(replace(drive, camera=camera, duration_s=10.0, varied=True), seed)
+    assert "doubled-disparity" not in {f.fault for f in audit(sequence).findings}
 
 
 def test_a_parked_vehicle_that_repeats_its_pixels_is_not_stale(clean_recording: Make) -> None:

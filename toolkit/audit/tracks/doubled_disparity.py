@@ -2,7 +2,7 @@
 
 A tracker that adds the disparity to a guess that holds it already does that to every track it has just detected.
 To an estimator such points are half as far away, so the camera moves half as fast. No motion does the same: it
-would have to halve the depth of near and far points alike, in one interval, and then stop.
+would have to halve the depth of near and far points alike, and of the new ones alone, in one interval, and then stop.
 """
 
 from dataclasses import replace
@@ -22,13 +22,21 @@ LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
 # Share of the tracks detected in a frame. Measured: 0.96 to 1 where they are doubled, at most 0.22 in any other
 # frame of the real recordings and 0.40 in simulated ones, where few and far points begin a track.
 LEAST_SHARE, LEAST_TRACKS = 0.8, 6
+# What the inverse of the ratio is at infinity, halfway between that of doubled tracks, a half, and that of any motion.
+BETWEEN = 0.75
+# Share of them that must be seen a third time, or that they stay so is not known.
+LEAST_SEEN_AGAIN = 0.5
 
 
 def check(evidence: Evidence) -> Symptom | None:
     """Count the doubled tracks; halve the disparity of every sighting of theirs but the first."""
     observations = evidence.sequence.observations
-    begun = _beginnings(observations)
-    bad_frames = [k for k in np.unique(begun.frame).tolist() if _is_doubled(begun.select(begun.frame == k))]
+    begun, older = _beginnings(observations)
+    bad_frames = [
+        k
+        for k in np.unique(begun.frame).tolist()
+        if _is_doubled(begun.select(begun.frame == k)) and not _nearer(older.ratio[older.frame == k])
+    ]
     if not bad_frames:
         return None
     tracks = begun.track_id[np.isin(begun.frame, bad_frames) & (begun.first_ratio > LEAST_RATIO)]
@@ -45,22 +53,32 @@ def check(evidence: Evidence) -> Symptom | None:
 
 
 class _Beginnings(NamedTuple):
-    """Tracks (T,), the frame of their first sighting, and the disparities' ratios, second to first and third to second.
+    """Tracks (T,), frame and disparity (px) of their first sighting, and ratios, second to first and third to second.
 
     Only tracks whose first ratio is known; a second ratio that is not is NaN.
     """
 
     track_id: IntArray
     frame: IntArray
+    first_px: Array
     first_ratio: Array
     second_ratio: Array
 
     def select(self, rows: BoolArray) -> "_Beginnings":
         """Return the tracks of a mask (T,)."""
-        return _Beginnings(self.track_id[rows], self.frame[rows], self.first_ratio[rows], self.second_ratio[rows])
+        return _Beginnings(
+            self.track_id[rows], self.frame[rows], self.first_px[rows], self.first_ratio[rows], self.second_ratio[rows]
+        )
 
 
-def _beginnings(observations: Observations) -> _Beginnings:
+class _Older(NamedTuple):
+    """Ratios (n,) of disparities of tracks that are not new, and the frames (n,) before."""
+
+    frame: IntArray
+    ratio: Array
+
+
+def _beginnings(observations: Observations) -> tuple[_Beginnings, _Older]:
     order = by_track(observations)
     track_id, frame = observations.track_id[order], observations.frame[order]
     disparity = disparity_px(observations.uv_px)[order]
@@ -69,8 +87,10 @@ def _beginnings(observations: Observations) -> _Beginnings:
     ratio = np.full(track_id.size + 1, np.nan)
     np.divide(disparity[1:], disparity[:-1], out=ratio[: follows.size], where=follows)
     first = np.flatnonzero(np.diff(track_id, prepend=-1))
-    begun = _Beginnings(track_id[first], frame[first], ratio[first], ratio[first + 1])
-    return begun.select(np.isfinite(begun.first_ratio))
+    begun = _Beginnings(track_id[first], frame[first], disparity[first], ratio[first], ratio[first + 1])
+    older = np.isfinite(ratio[: track_id.size])
+    older[first] = False
+    return begun.select(np.isfinite(begun.first_ratio)), _Older(frame[older], ratio[: track_id.size][older])
 
 
 def _doubles(ratio: Array) -> BoolArray:
@@ -79,8 +99,31 @@ def _doubles(ratio: Array) -> BoolArray:
 
 def _is_doubled(begun: _Beginnings) -> bool:
     """Say whether nearly all of the tracks double once and stay so."""
-    doubled, goes_on = _doubles(begun.first_ratio), _doubles(begun.second_ratio)
-    return bool(doubled.size >= LEAST_TRACKS and doubled.mean() >= LEAST_SHARE and goes_on.mean() < LEAST_SHARE)
+    doubled, again = _doubles(begun.first_ratio), np.isfinite(begun.second_ratio)
+    if doubled.size < LEAST_TRACKS or doubled.mean() < LEAST_SHARE or again.mean() < LEAST_SEEN_AGAIN:
+        return False
+    stays = float(np.median(begun.second_ratio[again])) < LEAST_RATIO
+    return stays and _far_ones_double(begun)
+
+
+def _far_ones_double(begun: _Beginnings) -> bool:
+    """Say whether the tracks double wherever they are, as no motion has it: it leaves those at infinity as they are.
+
+    By a camera that comes t nearer, the inverse of the ratio is 1 - t d / (f b), a line in the disparity d; the line
+    through the medians of either half, of those farther and those nearer, tells it where d is none.
+    """
+    order = np.argsort(begun.first_px)
+    (far_px, far), (near_px, near) = (
+        (float(np.median(begun.first_px[half])), float(np.median(1.0 / begun.first_ratio[half])))
+        for half in np.array_split(order, 2)
+    )
+    slope = min((near - far) / (near_px - far_px), 0.0) if near_px > far_px else 0.0
+    return far - slope * far_px < BETWEEN
+
+
+def _nearer(ratio: Array) -> bool:
+    """Say whether a camera has come so much nearer, in few frames a second, that tracks which are not new double."""
+    return ratio.size >= LEAST_TRACKS and float(np.median(ratio)) > LEAST_RATIO
 
 
 def _halved(observations: Observations, tracks: IntArray) -> Observations:
