@@ -2,7 +2,7 @@
 
 A tracker that adds the disparity to a guess that holds it already does that to every track it has just detected.
 To an estimator such points are half as far away, so the camera moves half as fast. No motion does the same: it
-would have to halve the depth of near and far points alike, and of the new ones alone, in one interval, and then stop.
+would have to halve the depth of near and far points alike, in one interval, and then stop.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ LEAST_RATIO, LARGEST_RATIO = np.sqrt(2.0), np.sqrt(8.0)
 # frame of the real recordings and 0.40 in simulated ones, where few and far points begin a track.
 LEAST_SHARE, LEAST_TRACKS = 0.8, 6
 # What the inverse of the ratio is at infinity, halfway between that of doubled tracks, a half, and that of any motion.
-BETWEEN = 0.75
+MOST_AT_INFINITY = 0.75
 # Share of them that must be seen a third time, or that they stay so is not known.
 LEAST_SEEN_AGAIN = 0.5
 
@@ -31,12 +31,8 @@ LEAST_SEEN_AGAIN = 0.5
 def check(evidence: Evidence) -> Symptom | None:
     """Count the doubled tracks; halve the disparity of every sighting of theirs but the first."""
     observations = evidence.sequence.observations
-    begun, older = _beginnings(observations)
-    bad_frames = [
-        k
-        for k in np.unique(begun.frame).tolist()
-        if _is_doubled(begun.select(begun.frame == k)) and not _nearer(older.ratio[older.frame == k])
-    ]
+    begun = _beginnings(observations)
+    bad_frames = [k for k in np.unique(begun.frame).tolist() if _is_doubled(begun.select(begun.frame == k))]
     if not bad_frames:
         return None
     tracks = begun.track_id[np.isin(begun.frame, bad_frames) & (begun.first_ratio > LEAST_RATIO)]
@@ -71,14 +67,7 @@ class _Beginnings(NamedTuple):
         )
 
 
-class _Older(NamedTuple):
-    """Ratios (n,) of disparities of tracks that are not new, and the frames (n,) before."""
-
-    frame: IntArray
-    ratio: Array
-
-
-def _beginnings(observations: Observations) -> tuple[_Beginnings, _Older]:
+def _beginnings(observations: Observations) -> _Beginnings:
     order = by_track(observations)
     track_id, frame = observations.track_id[order], observations.frame[order]
     disparity = disparity_px(observations.uv_px)[order]
@@ -88,9 +77,7 @@ def _beginnings(observations: Observations) -> tuple[_Beginnings, _Older]:
     np.divide(disparity[1:], disparity[:-1], out=ratio[: follows.size], where=follows)
     first = np.flatnonzero(np.diff(track_id, prepend=-1))
     begun = _Beginnings(track_id[first], frame[first], disparity[first], ratio[first], ratio[first + 1])
-    older = np.isfinite(ratio[: track_id.size])
-    older[first] = False
-    return begun.select(np.isfinite(begun.first_ratio)), _Older(frame[older], ratio[: track_id.size][older])
+    return begun.select(np.isfinite(begun.first_ratio))
 
 
 def _doubles(ratio: Array) -> BoolArray:
@@ -118,12 +105,7 @@ def _far_ones_double(begun: _Beginnings) -> bool:
         for half in np.array_split(order, 2)
     )
     slope = min((near - far) / (near_px - far_px), 0.0) if near_px > far_px else 0.0
-    return far - slope * far_px < BETWEEN
-
-
-def _nearer(ratio: Array) -> bool:
-    """Say whether a camera has come so much nearer, in few frames a second, that tracks which are not new double."""
-    return ratio.size >= LEAST_TRACKS and float(np.median(ratio)) > LEAST_RATIO
+    return far - slope * far_px < MOST_AT_INFINITY
 
 
 def _halved(observations: Observations, tracks: IntArray) -> Observations:
