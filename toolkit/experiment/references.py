@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from toolkit.audit.truth.truth_mismatch import steps_beside_camera
+from toolkit.audit.parts.windows import steps_beside_camera
 from toolkit.datasets.trajectories.belonging import (
     Reference,
     backwards,

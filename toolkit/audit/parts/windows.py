@@ -1,0 +1,121 @@
+"""What the camera moves and turns by, from the stereo tracks alone, beside what a trajectory does in the same time.
+
+Over windows of time both are chained from frame to frame, in the axes that the camera has where each window begins.
+What they differ by is told by the median over the windows, with its standard error and what chance makes of as many.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from toolkit.audit.parts.alignment import chained
+from toolkit.audit.parts.intervals import LEAST_INTERVALS, is_comparable, moved_by
+from toolkit.audit.parts.robust import Scalar, chance_sigmas, median_error
+from toolkit.geometry import Array, BoolArray, IntArray, interpolate_poses, se3_inverse, so3_log
+from toolkit.models.camera_motion import CameraMotion, camera_motion
+from toolkit.resampling import NS_PER_S
+from toolkit.sequence import Sequence, Truth
+
+# Long enough that the noise of single frames hardly counts, short enough that five seconds hold ten of them.
+WINDOW_S = 0.5
+LEAST_WINDOWS = 4
+# What is chance less often than this, by Student's t of as many windows, counts ...
+LEVEL = 1e-3
+# ... beyond what sound recordings at hand have; chosen with them in view.
+SYSTEMATIC = 0.06
+# A scale is the difference where little is left of it after scaling; while a vehicle stands there is only noise.
+MOST_SCALED_OFF = 0.25
+# A truth's noise feigns motion of what hardly moves (m, rad over a window).
+LEAST_MOVED_M, LEAST_TURNED_RAD = 0.02, 0.03
+
+
+def steps_beside_camera(sequence: Sequence, trajectory: Truth) -> Scalar | None:
+    """Return how many times as long as the camera's own a trajectory's steps are, where that factor alone parts them.
+
+    None where it is chance or no more than sound recordings have, or where the tracks do not tell.
+    """
+    camera = camera_motion(sequence)
+    if not is_comparable(sequence) or camera.known.sum() < LEAST_INTERVALS:
+        return None
+    both = windows(sequence, camera, trajectory)
+    moved = moving(both.displaced_m, LEAST_MOVED_M)
+    if moved.sum() < LEAST_WINDOWS:
+        return None
+    scale, only_longer = longer(*both.displaced_m[:, moved])
+    if not only_longer or abs(scale.value - 1.0) < SYSTEMATIC + scale.by_chance:
+        return None
+    return Scalar(1.0 / scale.value, scale.error / scale.value**2)
+
+
+class Windows(NamedTuple):
+    """What the camera and the truth (2, ...) move (2, M, 3) m and turn (2, M, 3) rad by over M windows, in the axes
+    that the camera has where each begins."""
+
+    displaced_m: Array
+    turned_rad: Array
+
+
+def windows(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Windows:
+    """Return both over windows in which every interval of the camera is known and the truth has poses close by."""
+    t_ns = sequence.frames_t_ns
+    window_ns = max(round(WINDOW_S * NS_PER_S), int(np.median(np.diff(t_ns))))
+    edges = np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, window_ns))
+    begin, end = np.array(list(pairwise(np.unique(edges).tolist())), dtype=int).reshape(-1, 2).T
+    unknown = np.concatenate([[0], np.cumsum(~camera.known)])
+    near = _has_truth(truth, t_ns, 2 * window_ns)
+    usable = (unknown[begin] == unknown[end]) & near[begin] & near[end]
+    begin, end = begin[usable], end[usable]
+    path = chained(moved_by(camera, sequence))
+    true = [
+        interpolate_poses(truth.t_ns, truth.T_world_imu, t_ns[k]) @ sequence.rig.T_imu_cam if k.size else path[k]
+        for k in (begin, end)
+    ]
+    both = np.stack([se3_inverse(path[begin]) @ path[end], se3_inverse(true[0]) @ true[1]])
+    return Windows(both[..., :3, 3], so3_log(both[..., :3, :3]))
+
+
+def _has_truth(truth: Truth, t_ns: IntArray, apart_ns: int) -> BoolArray:
+    """Say of stamps (N,) whether they lie within the truth's and between two of them that are no farther apart."""
+    after = np.clip(np.searchsorted(truth.t_ns, t_ns, side="left"), 1, truth.t_ns.size - 1)
+    close = truth.t_ns[after] - truth.t_ns[after - 1] <= apart_ns
+    return np.asarray(close & (t_ns >= truth.t_ns[0]) & (t_ns <= truth.t_ns[-1]))
+
+
+def moving(both: Array, least: float) -> BoolArray:
+    """Say in which windows (M,) the truth does enough, of what camera and truth do (2, M, 3).
+
+    Where it stands and the camera seems to move, a vehicle fills the view as often as the truth is wrong.
+    """
+    return np.asarray(np.linalg.norm(both[1], axis=1) > least)
+
+
+class Compared(NamedTuple):
+    """A median over some windows with its standard error, and beyond which distance it is no chance."""
+
+    value: float
+    error: float
+    by_chance: float
+
+
+def compared(each: Array) -> Compared:
+    """Return the median of what windows (M,) show; of few windows neither its error by the median nor the mean's is
+    sure, so the larger one counts."""
+    error = max(float(median_error(each[:, None])[0]), float(np.std(each)) / np.sqrt(each.size))
+    return Compared(float(np.median(each)), error, chance_sigmas(each.size, LEVEL) * error)
+
+
+def off_by(both: Array) -> Compared:
+    """Return the share by which the two of (2, M, 3) differ, of the larger."""
+    return compared(np.linalg.norm(both[0] - both[1], axis=1) / np.linalg.norm(both, axis=2).max(axis=0))
+
+
+def longer(seen: Array, true: Array) -> tuple[Compared, bool]:
+    """Return the ratio of displacements (M, 3) along the true ones, and whether it is all by which they differ."""
+    scale = _ratio(seen, true)
+    return scale, scale.value > 0.0 and off_by(np.stack([seen, scale.value * true])).value < MOST_SCALED_OFF
+
+
+def _ratio(seen: Array, true: Array) -> Compared:
+    """Return the ratio of displacements (M, 3) along the true ones."""
+    return compared((seen * true).sum(axis=1) / (true**2).sum(axis=1))
