@@ -87,7 +87,7 @@ REPORTED = {
     "covariance of another size": (COVARIANCES, "has the shape (5, 5); expected 6 x 6 or 9 x 9"),
     "NaN in a pose": (FINITE, "T_world_imu of its answer to frame 12"),
     "NaN in a covariance": (COVARIANCES, "frame 12 is not finite"),
-    "another random number each run": (SAME, "a second run answers otherwise to frame 0"),
+    "another random number each run": (SAME, "a second run answers otherwise to frame 0: T_world_imu differs by"),
     "the same array every time": (LATER, "its answer to frame 0 changed after it was given"),
     "a scaled rotation": (ROTATIONS, "rotations are none"),
     "no answer now and then": (STAMPS, "answers at"),

@@ -68,14 +68,20 @@ def answers(build: Build, sequence: Sequence) -> Iterator[Estimate | None]:
 
 def arrays_of(value: object) -> Iterator[Array]:
     """Yield every array in a value of toolkit.estimate or toolkit.sequence."""
+    for _, array in _named_arrays(value, ""):
+        yield array
+
+
+def _named_arrays(value: object, name: str) -> Iterator[tuple[str, Array]]:
+    """Yield every array with the name of the innermost field that has it."""
     if isinstance(value, np.ndarray):
-        yield value
+        yield name, value
     elif isinstance(value, tuple):
         for item in value:
-            yield from arrays_of(item)
+            yield from _named_arrays(item, name)
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
-            yield from arrays_of(getattr(value, field.name))
+            yield from _named_arrays(getattr(value, field.name), field.name)
 
 
 def copies_of(value: object) -> tuple[Array, ...]:
@@ -127,11 +133,11 @@ def difference(one: Estimate | Finished | None, other: Estimate | Finished | Non
     """Say how two answers differ in any bit; nothing where they are the same."""
     if (one is None) != (other is None):
         return "one run answers and the other does not"
-    for left, right in zip_longest(arrays_of(one), arrays_of(other)):
-        if left is None or right is None or left.shape != right.shape:
-            return "other fields or shapes"
-        if not np.array_equal(left, right, equal_nan=True):
-            return f"an array of shape {left.shape} differs by {_largest(left, right):.3g}"
+    pairs = list(zip_longest(_named_arrays(one, ""), _named_arrays(other, "")))
+    if any(left is None or right is None or left[1].shape != right[1].shape for left, right in pairs):
+        return "other fields or shapes"
+    if differing := [_where(name, left, right) for (name, left), (_, right) in pairs if not _same(left, right)]:
+        return "; ".join(differing)
     if isinstance(one, Estimate) and isinstance(other, Estimate):
         return _difference_of_info(one, other)
     return ""
@@ -143,6 +149,17 @@ def _difference_of_info(one: Estimate, other: Estimate) -> str:
         np.array_equal(value, theirs[key], equal_nan=True) for key, value in ours.items()
     )
     return "" if same else "its diagnostics (info) differ"
+
+
+def _same(left: Array, right: Array) -> bool:
+    return np.array_equal(left, right, equal_nan=True)
+
+
+def _where(name: str, left: Array, right: Array) -> str:
+    """Say which array differs, by how much at most, in how many of its numbers and from which place on."""
+    places = np.argwhere((left != right) & ~(np.isnan(left) & np.isnan(right)))
+    first, most = ", ".join(map(str, places[0].tolist())), _largest(left, right)
+    return f"{name} differs by {most:.3g} at most, in {len(places)} of {left.size} numbers, the first [{first}]"
 
 
 def _largest(left: Array, right: Array) -> float:
