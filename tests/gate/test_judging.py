@@ -178,6 +178,16 @@ def test_a_recording_shows_any_change_and_fails_beyond_its_bound(
     assert check.passed == (finding not in ("regressed", "moved"))
 
 
+def test_a_recording_that_moved_down_is_told_in_shares_of_the_smaller_for_so_it_is_judged(baseline, gate):
+    """6 % less in the table is 6.38 % of the smaller, of which 5 % is allowed."""
+    simulated, recorded = gate.as_measured(baseline)
+    changed = gate.edited(gate.another(recorded), lambda n, key, v: v * 0.94 if (n, key) == ("two", "ate_se3_m") else v)
+    check = gate.checked(baseline, [simulated, changed])
+    (one,) = (v for v in check.verdicts if v.finding == "moved")
+    assert one.change_percent == pytest.approx(-6.0, abs=0.01)
+    assert one.message.endswith("6.38 % of the smaller, and 5 % is allowed")
+
+
 def test_a_recording_that_rounds_otherwise_is_the_same(baseline, gate):
     simulated, recorded = gate.as_measured(baseline)
     check = gate.checked(baseline, [simulated, gate.edited(recorded, lambda _n, _k, v: v * (1.0 + 1e-8))])

@@ -212,7 +212,8 @@ def judge_recorded(
             finding = "moved"
     message = "" if finding == "same" else f"{before:.7g} became {after:.7g}"
     if finding in FAILURES:
-        by = f"{100.0 * worse:.3g} % worse" if finding == "regressed" else f"{100.0 * _distance(before, after):.3g} %"
+        moved = f"{100.0 * _distance(before, after):.3g} % of the smaller"
+        by = f"{100.0 * worse:.3g} % worse" if finding == "regressed" else moved
         message += f", {by}, and {criterion.percent:g} % is allowed"
     return Verdict(
         where.sequence, where.estimator, where.output, where.metric, finding, message,
