@@ -185,7 +185,7 @@ def test_a_recording_that_moved_down_is_told_in_shares_of_the_smaller_for_so_it_
     check = gate.checked(baseline, [simulated, changed])
     (one,) = (v for v in check.verdicts if v.finding == "moved")
     assert one.change_percent == pytest.approx(-6.0, abs=0.01)
-    assert one.message.endswith("6.38 % of the smaller, and 5 % is allowed")
+    assert one.words.endswith("6.38 % of the smaller, and 5 % is allowed")
 
 
 def test_a_recording_that_rounds_otherwise_is_the_same(baseline, gate):
