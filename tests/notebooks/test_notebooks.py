@@ -149,6 +149,7 @@ def _one_processor() -> Iterator[None]:
         os.sched_setaffinity(0, every)
 
 
+@pytest.mark.notebooks
 @each
 def test_it_runs_where_no_real_recording_is(source: Path, execution: ModuleType, kernel: KernelManager) -> None:
     run("%reset -f", kernel)
