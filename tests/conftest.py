@@ -238,16 +238,16 @@ def _audited(_audit: Callable[..., Audit], requested: Recording, _changed_ns: in
 
 
 def _is_beginning(requested: Recording, scenario: Scenario) -> bool:
-    """Say whether no more is run of a simulation than its beginning that decides every fault."""
-    decided = 0 if scenario.audited_s is None else scenario.audited_s * scenario.camera.rate_hz
-    return requested.part == WHOLE and requested.max_frames is not None and requested.max_frames <= decided
+    """Say whether no more is run of a simulation than its beginning that tells as much as the whole."""
+    enough = 0 if scenario.audited_s is None else scenario.audited_s * scenario.camera.rate_hz
+    return requested.part == WHOLE and requested.max_frames is not None and requested.max_frames <= enough
 
 
 @pytest.fixture(scope="module")
 def audited_once() -> Iterator[None]:
     """Load and audit each built-in recording, and each file, once for all tests of a worker that run some of it.
 
-    As outside of tests, what decides every fault is audited of a simulation of which no more is run.
+    As outside of tests, what tells as much as the whole is audited of a simulation of which no more is run.
     """
 
     def remembered(requested: Recording, progress: Progress = SILENT) -> Audit:

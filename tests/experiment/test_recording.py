@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toolkit.audit import Audit
+from toolkit.audit import Audit, Finding
 from toolkit.datasets import load_sequence
 from toolkit.errors import DataError
 from toolkit.experiment import Plan, recording
@@ -15,6 +15,8 @@ from toolkit.sequence import Sequence
 from toolkit.settings import DEFAULTS, Noise, SettingsError, TrackUse, settings_of
 from toolkit.simulation import DRIVE, SCENARIOS, faults, simulate
 from toolkit.simulation.track_faults import moving_objects
+
+FOUND = Finding("time-gap", 1, repaired=False, detail="a gap", blocking=False)
 
 
 def messages(source: str, **noise: float) -> tuple[np.ndarray, MotionNoise]:
@@ -89,32 +91,40 @@ def test_frames_and_seconds_cut_a_recording_and_the_whole_is_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("requested", "undecided", "audited_s"),
+    ("requested", "findings", "audited_s"),
     [
-        (Recording("drive", max_frames=7), {}, [30]),
-        (Recording("flight", max_frames=7), {}, [40]),
-        (Recording("drive", part=Part(30.0, 40.0)), {}, [40]),
-        (Recording("drive"), {}, [60]),
-        (Recording("drive", max_frames=7), {"lever-arm": "too little rotation"}, [30, 60]),
-        (Recording("drive"), {"lever-arm": "too little rotation"}, [60]),
-        (Recording("drive-realistic", max_frames=7), {}, [60]),  # its tracks err otherwise than it states
+        (Recording("drive", max_frames=7), (), [40]),
+        (Recording("flight", max_frames=7), (), [20]),
+        (Recording("drive", part=Part(30.0, 50.0)), (), [50]),
+        (Recording("drive"), (), [60]),
+        (Recording("drive", max_frames=7), (FOUND,), [40, 60]),
+        (Recording("drive"), (FOUND,), [60]),
+        (Recording("drive-realistic", max_frames=7), (), [60]),  # its tracks err otherwise than it states
     ],
 )
-def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_that_tells_too_little(
-    requested: Recording, undecided: dict[str, str], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
+def test_a_simulation_is_audited_as_far_as_it_is_run_and_whole_where_something_is_found(
+    requested: Recording, findings: tuple[Finding, ...], audited_s: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths_s: list[float] = []
+    undecided = {"lever-arm": "too little rotation"}
 
     def messages(sequence: Sequence, _keep: frozenset[str]) -> Audit:
         lengths_s.append(sequence.duration_s)
-        return Audit(sequence, (), undecided)
+        return Audit(sequence, findings, undecided)
 
     monkeypatch.setattr(recording, "audit", messages)
     prepared = prepare(requested)
     assert lengths_s == audited_s
-    assert (prepared.whole.duration_s, prepared.undecided) == (60.0, undecided)
+    assert (prepared.whole.duration_s, prepared.findings, prepared.undecided) == (60.0, findings, undecided)
     prepare(replace(requested, source=prepared.whole))  # as a recording of somebody's own
     assert lengths_s[-1] == 60.0
+
+
+@pytest.mark.parametrize("name", [name for name, scenario in SCENARIOS.items() if scenario.audited_s is not None])
+def test_the_beginning_of_a_simulation_leaves_no_more_undecided_than_the_whole(name: str) -> None:
+    beginning, whole = (prepare(Recording(name, max_frames=frames)) for frames in (7, None))
+    assert beginning.findings == whole.findings == ()
+    assert beginning.undecided.keys() <= whole.undecided.keys()
 
 
 def test_a_part_is_what_lies_between_its_times_thinned_and_is_reported() -> None:

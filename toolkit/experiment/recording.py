@@ -140,8 +140,8 @@ def _of_part(finding: Finding, sequence: Sequence) -> Finding:
 def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audit:
     """Load a recording and audit it whole: slow faults (a bias, a lag) show better so. Raises as :func:`prepare`.
 
-    A simulation whose errors are as it states them is audited as far as it is run, but so far at least as decides every
-    fault; only where something is found there, or cannot be decided, is it audited whole.
+    A simulation whose errors are as it states them is audited as far as it is run, but so far at least as tells as much
+    as the whole of it; only where something is found there is it audited whole.
     """
     sequence = _loaded(recording, progress)
     # The audit looks for what is not finite: what NumPy would say of it on the way says nothing more.
@@ -150,13 +150,11 @@ def audited_recording(recording: Recording, progress: Progress = SILENT) -> Audi
         found = audit(beginning, recording.keep)
         if beginning is sequence:
             return found
-        if not found.findings and not found.undecided:
-            return replace(found, sequence=sequence)
-        return audit(sequence, recording.keep)
+        return audit(sequence, recording.keep) if found.findings else replace(found, sequence=sequence)
 
 
 def _to_audit(sequence: Sequence, recording: Recording) -> Sequence:
-    """Return a recording; of a simulation, where its scenario says what decides, that much and what is run of it."""
+    """Return a recording; of a simulation, where its scenario says what tells enough, that and what is run of it."""
     scenario = SCENARIOS.get(recording.source) if isinstance(recording.source, str) else None
     if scenario is None or scenario.audited_s is None:
         return sequence
