@@ -499,6 +499,35 @@ def test_a_folder_of_bags_without_metadata_is_its_only_bag_or_names_them(asl: Pa
         load_images(str(path))
 
 
+def split(asl: Path, folder: Path, names: tuple[str, str] = ("film_0.bag", "film_1.bag")) -> Path:
+    """Write a recording in two parts, as ROS 1 does, with the calibration beside them."""
+    ros = Ros.of("ros1")
+    film = sorted(film_of(asl, ros), key=lambda one: one.t_ns)
+    written(asl, "ros1", folder, film[: len(film) // 2])
+    (folder / "film.bag").rename(folder / names[0])
+    ros.write(folder / names[1], film[len(film) // 2 :])
+    return folder
+
+
+def test_a_bag_that_was_split_is_read_whole_by_its_folder_and_in_part_by_a_name(asl: Path, tmp_path: Path) -> None:
+    bag = load_sequence(str(split(asl, tmp_path / "bag")))
+    assert bag.content_hash() == load_sequence(str(asl)).content_hash()
+    alone = load_sequence(str(tmp_path / "bag/film_0.bag"))
+    assert 0 < alone.frame_count < bag.frame_count
+    remark = "read alone; film_1.bag beside it may go on: name the folder for all"
+    assert remark in alone.provenance.facts
+    assert remark not in bag.provenance.facts
+
+
+def test_bags_of_ros_1_that_are_no_parts_of_one_recording_are_not_joined(asl: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        DataError, match=r"holds 2 bags: drive.bag, film_0.bag; name one of them, or, if they are parts"
+    ):
+        load_images(str(split(asl, tmp_path / "two", ("film_0.bag", "drive.bag"))))
+    with pytest.raises(DataError, match=r"film_1.bag: begins .* s before film_0.bag ends, so both are no parts of one"):
+        load_images(str(split(asl, tmp_path / "turned", ("film_1.bag", "film_0.bag"))))
+
+
 def test_without_the_library_a_bag_is_recognised_and_the_extra_named(
     asl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

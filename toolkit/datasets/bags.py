@@ -74,7 +74,8 @@ def load_from_images(path: Path, frontend: Frontend, progress: Progress) -> Reco
     finally:
         spool.close()
     check_frame_count(path, tracks.t_ns.size)
-    facts = (*facts_of(tracks, len(read.pairs)), *read.remarks, *read.chosen.facts, *read.mounted.facts)
+    remarks = (*bag_reader.parts_beside(path), *read.remarks)
+    facts = (*facts_of(tracks, len(read.pairs)), *remarks, *read.chosen.facts, *read.mounted.facts)
     sequence = Recording(
         name=path.resolve().stem,
         rig=rig_of(read.mounted.pair, read.mounted.T_imu_left),

@@ -6,15 +6,18 @@ Formats: http://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, and the fol
 """
 
 import importlib.util
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 from toolkit.errors import DataError, VislamError, printable
 from toolkit.files.reading import is_regular, open_input
+from toolkit.resampling import NS_PER_S
 
 Kind = Literal["ros1", "mcap", "sqlite", "folder"]
 _MAGIC: dict[bytes, Kind] = {b"#ROSBAG V": "ros1", b"\x89MCAP0\r\n": "mcap"}
@@ -28,6 +31,8 @@ _TF, _OLD_TF, _TF_DEFINITION = (
     "geometry_msgs/TransformStamped[] transforms",
 )
 _ENDINGS = (".mcap", ".db3", ".bag")
+# How rosbag record --split ends the names of the parts.
+_PART = re.compile(r"_(\d+)$")
 # What the library says of a storage, a compression or a version of bags that it does not know.
 _NOT_SUPPORTED = "not supported"
 # What writes the missing index, by kind of bag.
@@ -104,28 +109,38 @@ def _of_rosbag2(metadata: Path) -> bool:
 
 
 def _files_alone(folder: Path) -> list[Path]:
-    """Return the bags in a folder that holds nothing else but YAML files; none where it does."""
+    """Return the bags in a folder that holds nothing else but YAML files and folders of them; none where it does."""
     files = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     bags = [path for path in files if path.suffix in _ENDINGS and is_regular(path) and kind_of(path) is not None]
-    return bags if all(path in bags or path.suffix == ".yaml" for path in files) else []
+    return bags if all(path in bags or _of_calibration(path) for path in files) else []
+
+
+def _of_calibration(path: Path) -> bool:
+    """Say whether a path is what calibration consists of: a YAML file, or a folder of such files alone."""
+    return path.suffix == ".yaml" or (path.is_dir() and all(inside.suffix == ".yaml" for inside in path.iterdir()))
 
 
 class Bag:
-    """An open bag."""
+    """An open bag, of which each reader reads a part; one where it is whole."""
 
-    def __init__(self, path: Path, kind: Kind, reader: Any) -> None:
+    def __init__(self, path: Path, kind: Kind, readers: Sequence[Any]) -> None:
         self.path = path
-        self._reader = reader
+        self._readers = readers
         self._kind = kind
         self._of_ros1 = kind == "ros1"
         with _guarded(path, kind):
-            self._connections = list(reader.connections)
+            self._connections = [connection for reader in readers for connection in reader.connections]
             self.topics = tuple(self._topic(name) for name in sorted({c.topic for c in self._connections}))
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the messages of some topics in the order of recording; raises DataError where one is damaged."""
-        connections = [connection for connection in self._connections if connection.topic in topics]
-        coming = iter(self._reader.messages(connections)) if connections else iter(())
+        for reader in self._readers:
+            with _guarded(self.path, self._kind):
+                connections = [connection for connection in reader.connections if connection.topic in topics]
+            yield from self._messages(reader, connections) if connections else ()
+
+    def _messages(self, reader: Any, connections: Sequence[Any]) -> Iterator[Message]:
+        coming = iter(reader.messages(connections))
         while True:
             with _guarded(self.path, self._kind):
                 found = next(coming, None)
@@ -171,29 +186,65 @@ def opened(path: Path) -> Iterator[Bag]:
         raise DataError(f"{path}: is no bag of ROS 1 or 2 and no MCAP")
     if importlib.util.find_spec("rosbags") is None:
         raise DataError(f'{path}: bags are read with the package rosbags; pip install "vislam-toolkit[bags]"')
+    paths = [path]
     if kind == "folder" and not _of_rosbag2(path / _METADATA):
-        path = _only(path)
-        kind = kind_of(path)
+        paths = _parts(path)
+        path = paths[0] if len(paths) == 1 else path
+        kind = kind_of(paths[0])
         assert kind is not None
-    with _guarded(path, kind):
-        reader = _reader(kind)(path)
-        reader.open()
-    try:
-        yield Bag(path, kind, reader)
-    finally:
-        reader.close()
+    with ExitStack() as closing:
+        readers = []
+        for part in paths:
+            with _guarded(part, kind):
+                readers.append(_reader(kind)(part))
+                readers[-1].open()
+                closing.callback(readers[-1].close)
+        _check_order(paths, readers)
+        yield Bag(path, kind, readers)
 
 
-def _only(folder: Path) -> Path:
-    """Return the one bag in a folder without metadata.yaml; raises DataError where there are several."""
+def _parts(folder: Path) -> list[Path]:
+    """Return the one bag in a folder without metadata.yaml, or the parts of one that ROS 1 has split, in their order.
+
+    Raises DataError where there are several that are no such parts.
+    """
     bags = _files_alone(folder)
-    if len(bags) > 1:
-        names = printable(", ".join(bag.name for bag in bags))[:200]
+    if len(bags) == 1:
+        return bags
+    names, kinds = printable(", ".join(bag.name for bag in bags))[:200], {kind_of(bag) for bag in bags}
+    if kinds != {"ros1"}:
         raise DataError(
             f"{folder}: holds {len(bags)} bags and no {_METADATA} that joins them: {names}; name one of them, or run "
             "ros2 bag reindex on the folder"
         )
-    return bags[0]
+    places = {int(found[1]): bag for bag in bags if (found := _PART.search(bag.stem))}
+    if sorted(places) != list(range(len(bags))):
+        raise DataError(
+            f"{folder}: holds {len(bags)} bags: {names}; name one of them, or, if they are parts of one recording, let "
+            "their names end in _0, _1 and so on, as rosbag record --split does"
+        )
+    return [places[place] for place in range(len(bags))]
+
+
+def parts_beside(path: Path) -> tuple[str, ...]:
+    """Return a remark on what lies beside one part of a bag that ROS 1 has split; none where nothing does."""
+    if path.is_dir() or path.suffix != ".bag" or _PART.search(path.stem) is None:
+        return ()
+    others = [one.name for one in path.parent.glob("*.bag") if one.name != path.name and _PART.search(one.stem)]
+    if not others:
+        return ()
+    return (f"read alone; {printable(', '.join(sorted(others)))[:200]} beside it may go on: name the folder for all",)
+
+
+def _check_order(parts: Sequence[Path], readers: Sequence[Any]) -> None:
+    """Raise DataError where a part of a bag begins before the one ahead of it ends."""
+    for (before, earlier), (part, later) in pairwise(zip(parts, readers, strict=True)):
+        if later.message_count and later.start_time < earlier.end_time:
+            overlap_s = (earlier.end_time - later.start_time) / NS_PER_S
+            raise DataError(
+                f"{part}: begins {overlap_s:.3g} s before {before.name} ends, so both are no parts of one recording; "
+                "name one of them"
+            )
 
 
 def _reader(kind: Kind) -> Any:
