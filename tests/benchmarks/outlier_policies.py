@@ -1,6 +1,6 @@
 """Which outlier policy is best over clean and struck recordings, for filters and smoothers together.
 
-    python tests/benchmarks/outlier_policies.py [--seeds 5] [--policies robust,gate,classic] [--out policies.json]
+    python tests/benchmarks/outlier_policies.py [--seeds 5] [--first-seed 400] [--policies robust,gate,classic]
     python tests/benchmarks/outlier_policies.py --recordings 03.npz kitti00 0027.npz=gt/0027.tum
 
 Simulated: every policy on the same recordings, so differences are paired over the seeds. A figure is the mean of
@@ -29,13 +29,13 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.alignment import fit_yaw
 from toolkit.sequence import Sequence as Recording
 from toolkit.settings import POLICIES, Outliers, Settings
-from toolkit.simulation import DRIVE, FLIGHT, Scenario, simulate
+from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, simulate
 
 FILTERS = ("ekf", "ekf-slam", "riekf", "msckf-fej", "msckf-slam")
 SMOOTHERS = ("fixed-lag", "smart", "isam2", "batch")
-SCENARIOS = {"flight": (FLIGHT, 5.0), "drive": (DRIVE, 8.0)}
+SCENARIOS = {"flight": (FLIGHT, 5.0), "drive": (DRIVE, 8.0), "drive-imu": (DRIVE_IMU, 8.0)}
 RATES = (0.0, 0.02, 0.3)
-FIRST_SEED, REFERENCE = 400, "classic"
+REFERENCE = "classic"
 RECORDED_METRICS = ("ate_se3_m", "heldout_reproj_median_px", "heldout_reproj_rmse_px")
 # What a run without an answer counts for: log RMSE above that of the reference.
 NO_ANSWER = float(np.log(10.0))
@@ -97,7 +97,7 @@ def with_error(values: Array) -> str:
 def simulated(options: argparse.Namespace) -> None:
     """Print differences for every scenario and rate, then over all of them."""
     policies = [REFERENCE, *(policy for policy in options.policies if policy != REFERENCE)]
-    estimators, seeds = options.estimators, range(FIRST_SEED, FIRST_SEED + options.seeds)
+    estimators, seeds = options.estimators, range(options.first_seed, options.first_seed + options.seeds)
     everything: dict[str, list[Array]] = {}
     reported: dict[str, dict[str, list[float]]] = {}
     for scene in options.scenarios:
@@ -145,6 +145,7 @@ def main() -> None:
     """Measure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first-seed", type=int, default=400)
     parser.add_argument("--policies", type=lambda text: text.split(","), default=list(CANDIDATES))
     parser.add_argument("--estimators", type=lambda text: text.split(","), default=[*FILTERS, *SMOOTHERS])
     parser.add_argument("--scenarios", type=lambda text: text.split(","), default=list(SCENARIOS))
