@@ -11,7 +11,8 @@ The table has, for each estimator and model, the geometric mean over drives of t
 mean over seeds of either), and the figures of 0027. ``<model>`` is ``white``, ``correlated`` with the settings'
 parameters, ``correlated:white,walk,offset`` with others, in px, or ``fitted``; ``+scale`` behind it gives the
 disparities a scale of 1 %, ``+open`` bridges no gap between tracks, ``+still`` leaves out what moves, ``+full`` has
-white tracks count in full however correlated their residuals are.
+white tracks count in full however correlated their residuals are, ``+robust`` and the other outlier policies' names
+are the policy.
 
     python tests/benchmarks/real_tracks.py pairs results.jsonl white white+scale
 
@@ -46,7 +47,7 @@ from toolkit.models.gap_bridge import gaps
 from toolkit.models.noise import twist_noise
 from toolkit.runner import run
 from toolkit.sequence import Sequence
-from toolkit.settings import Noise, Settings, TrackUse
+from toolkit.settings import POLICIES, Noise, Outliers, Settings, TrackUse
 from toolkit.track_noise import CHANNELS
 
 SIGMA_V_MPS, SIGMA_W_RADPS = 0.5, 0.05
@@ -106,6 +107,11 @@ def noise_of(model: str) -> Noise:
     return Noise(**given)
 
 
+def outliers_of(model: str) -> Outliers:
+    """Return the outlier policy that a model names, the default where it names none."""
+    return next((POLICIES[switch] for switch in model.split("+") if switch in POLICIES), Outliers())
+
+
 def prepared(drive: str, seed: int, model: str) -> Prepared:
     """Return a drive as estimators read it under a noise model."""
     source, noise, tracks = drives()[drive], noise_of(model), TrackUse(leave_out_moving="still" in model.split("+"))
@@ -117,7 +123,7 @@ def prepared(drive: str, seed: int, model: str) -> Prepared:
 
 def measured(case: Case, ready: Prepared) -> dict[str, Any]:
     """Run one case and return its line."""
-    settings = Settings(noise=noise_of(case.model))
+    settings = Settings(noise=noise_of(case.model), outliers=outliers_of(case.model))
     began = time.process_time()
     result = run(case.estimator, find(case.estimator).load(), ready.sequence, ready.prior, settings=settings)
     line: dict[str, Any] = {**case._asdict(), "status": result.status, "cpu_s": time.process_time() - began}
