@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
 
-from toolkit.audit.parts.agreement import Agreement, agreement
 from toolkit.audit.parts.alignment import Alignment, alignment
+from toolkit.audit.parts.clocks import TruthClock, truth_clock
 from toolkit.audit.parts.deviations import Fallen, fallen_mps
 from toolkit.audit.parts.intervals import LEAST_INTERVALS, Intervals, compare, is_comparable
-from toolkit.audit.parts.one_step import OneStep, one_step
+from toolkit.audit.parts.one_step import Agreement, OneStep, agreement, one_step, step_correlation
 from toolkit.audit.parts.robust import Scalar
 from toolkit.audit.parts.self_calibration import SelfCalibration, self_calibration
-from toolkit.audit.parts.step_correlation import step_correlation
-from toolkit.audit.parts.truth_clock import TruthClock, truth_clock
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.sequence import Sequence
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from toolkit.audit.parts.edits import keep_frames
 from toolkit.audit.parts.intervals import Intervals, interval_means, moved_by, subdivided
 from toolkit.audit.parts.robust import (
     CAUCHY_SIGMAS,
@@ -24,7 +25,6 @@ from toolkit.audit.parts.robust import (
     slip_stretches,
     spread,
 )
-from toolkit.audit.parts.subsets import keep_frames
 from toolkit.geometry import Array, IntArray, se3_inverse, skew, so3_exp
 from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.models.camera_motion import CameraMotion, camera_motion
