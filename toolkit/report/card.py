@@ -9,7 +9,7 @@ from toolkit.files.documents import number, rounded
 from toolkit.geometry import Array
 from toolkit.report.comparison_table import sequence_line
 from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.records.report import CardRecord
+from toolkit.report.records import CardRecord
 from toolkit.report.table import MISSING, Table, as_text
 from toolkit.sequence import Sequence
 from toolkit.track_errors import Card

@@ -18,7 +18,7 @@ from toolkit.gate.significance import FEWEST_RUNS, ROUNDING, MeanChange, Pairs, 
 from toolkit.geometry import Array
 from toolkit.metrics import Metric, cost, known_metrics
 from toolkit.report.prose import WIDTH, Width, filled
-from toolkit.report.run_files import RunFiles, SeedsFiles
+from toolkit.report.run_directory import RunFiles, SeedsFiles
 from toolkit.report.table import MISSING, Table, as_text, cell
 
 Files = RunFiles | SeedsFiles

@@ -22,8 +22,7 @@ from toolkit.files import documents
 from toolkit.files.reading import open_input
 from toolkit.files.writing import replaced_file, write_text
 from toolkit.report.records import Report
-from toolkit.report.run_directory import MANIFEST
-from toolkit.report.run_files import RunFiles, SeedsFiles, read_run
+from toolkit.report.run_directory import MANIFEST, RunFiles, SeedsFiles, read_run
 
 TRUTH = "truth"
 BUNDLE, LOCK = "bundle.json", "requirements.txt"

@@ -18,9 +18,9 @@ from toolkit.geometry import Array, IntArray
 from toolkit.metrics import known_metrics
 from toolkit.report import curves
 from toolkit.report.html.highlights import highlights
-from toolkit.report.records.report import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
-from toolkit.report.records.scores import ConsistencyMark, RunOverSeeds
-from toolkit.report.run_files import DrawnPath, RunFiles, SeedsFiles
+from toolkit.report.records import CameraFrame, ComponentSeries, DrawnMap, DrawnOverSeeds, DrawnRun, NeesSeries
+from toolkit.report.run_directory import DrawnPath, RunFiles, SeedsFiles
+from toolkit.report.score_records import ConsistencyMark, RunOverSeeds
 
 Json = dict[str, Any]
 Files = RunFiles | SeedsFiles
