@@ -16,7 +16,7 @@ from toolkit.estimate import FARTHEST_M, Trajectory
 from toolkit.geometry import Array, IntArray, se3_inverse, se3_log
 from toolkit.measured_motion import TwistSamples
 from toolkit.models.gating import mahalanobis_squared
-from toolkit.models.predicted_steps import predicted_steps
+from toolkit.models.motion import predicted_steps
 from toolkit.models.state import POSE
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence

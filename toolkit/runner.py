@@ -18,11 +18,20 @@ from pathlib import Path
 
 import numpy as np
 
-from toolkit.answers import checked_estimate, checked_finish
 from toolkit.compilation import Compilation
 from toolkit.divergence import contradiction, gate_collapse
 from toolkit.errors import DataError, EstimatorError
-from toolkit.estimate import Estimate, Finished, Landmarks, Run, Status, Timings, Trajectory
+from toolkit.estimate import (
+    Estimate,
+    Finished,
+    Landmarks,
+    Run,
+    Status,
+    Timings,
+    Trajectory,
+    checked_estimate,
+    checked_finish,
+)
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array
 from toolkit.progress import SILENT, Progress

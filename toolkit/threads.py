@@ -6,9 +6,9 @@ from functools import lru_cache
 
 from threadpoolctl import ThreadpoolController
 
-# Environment variables that set the number of threads of numeric libraries when these are loaded.
 # Of processes side by side: each is a Python with GTSAM of 150 MB and more; beyond one machine there is --scheduler.
 MOST_WORKERS = 1024
+# Environment variables that set the number of threads of numeric libraries when these are loaded.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 

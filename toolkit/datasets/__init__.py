@@ -14,13 +14,13 @@ import re
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import islice
+from numbers import Real
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
-from toolkit.datasets.io.returned import check_types
 from toolkit.datasets.io.unrecognised import why_unrecognised
 from toolkit.discovery import FoundModule, MissingDependency, announced, modules_in
 from toolkit.errors import DataError, ExtensionError, did_you_mean
@@ -28,7 +28,7 @@ from toolkit.estimate import Trajectory
 from toolkit.files.reading import open_input, unreadable
 from toolkit.frontend import ImageRecording
 from toolkit.progress import SILENT, Progress
-from toolkit.sequence import Sequence, check_stated
+from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, check_stated, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Tracks
 
 # So many names of a folder are shown to somebody who asked for one that is not in it.
@@ -193,7 +193,7 @@ def load_sequence(
         if not isinstance(sequence, Sequence):
             file, given = getattr(reader, "__file__", reader), type(sequence).__name__
             raise ExtensionError(f"{source}: load in {file} answered with a {given}; it returns a Sequence")
-        check_types(sequence)
+        _check_types(sequence)
         check_stated(sequence)
     return sequence
 
@@ -323,3 +323,22 @@ def _nearest_source(path: Path, source: str) -> str:
 def _some(names: list[str]) -> str:
     shown = sorted(names, key=lambda name: (name.startswith("."), name))[:_SHOWN]
     return f"{', '.join(shown)}{' and more' if len(names) > len(shown) else ''}" if shown else "nothing in it"
+
+
+def _check_types(sequence: Sequence) -> None:
+    """Raise DataError where a part is of another type, or a table of another length, than whoever loads one returns."""
+    whose = sequence.name if isinstance(sequence.name, str) else "a recording"
+    parts = {"name": str, "rig": StereoRig, "observations": Observations, "provenance": Provenance}
+    found = {part: (getattr(sequence, part), kind) for part, kind in parts.items()}
+    if isinstance(sequence.rig, StereoRig):
+        of_rig = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")
+        found |= {f"rig.{part}": (getattr(sequence.rig, part), Real) for part in of_rig}
+    for part, (value, kind) in found.items():
+        if not isinstance(value, kind):
+            raise DataError(f"{whose}: its {part} is of type {type(value).__name__}, expected {kind.__name__}")
+    for vector in getattr(sequence.motion, "VECTORS", ()):
+        if len(getattr(sequence.motion, vector)) != sequence.motion.t_ns.size:
+            rows, stamps = len(getattr(sequence.motion, vector)), sequence.motion.t_ns.size
+            raise DataError(f"{whose}: motion.{vector} has {rows} rows, and there are {stamps} stamps")
+    if why := why_not_sightings(sequence):
+        raise DataError(f"{whose}: {why}")

@@ -19,7 +19,7 @@ from toolkit.geometry import Array
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable
 from toolkit.models.corrections import Correction, CorrectionTest
-from toolkit.models.predicted_steps import PredictedStep, predicted_steps
+from toolkit.models.motion import PredictedStep, predicted_steps
 from toolkit.models.state import Belief
 
 ORDER = 73

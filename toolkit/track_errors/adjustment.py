@@ -15,8 +15,15 @@ from toolkit.measured_motion import ImuSamples, TwistSamples
 from toolkit.models.camera_motion import CameraMotion, camera_motion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
-from toolkit.track_errors.likelihood import Tailed, linearised, whitened, whitening
-from toolkit.track_errors.tracklets import MOST_SIGHTINGS, Tracklets, middle_of_pair
+from toolkit.track_errors.tracklets import (
+    MOST_SIGHTINGS,
+    Tailed,
+    Tracklets,
+    linearised,
+    middle_of_pair,
+    whitened,
+    whitening,
+)
 
 # Standard deviations of the tie of an interval's motion to its start, rad/s and m/s: far above what tracks leave open.
 _TIE = np.repeat([0.1, 2.0], 3)

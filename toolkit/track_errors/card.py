@@ -18,8 +18,7 @@ from toolkit.models.stereo import disparity_px
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, StereoRig
 from toolkit.track_errors.fit import Fit
-from toolkit.track_errors.likelihood import linearised
-from toolkit.track_errors.tracklets import Tracklets, middle_of_pair
+from toolkit.track_errors.tracklets import Tracklets, linearised, middle_of_pair
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Sightings between which residuals are compared, at most.

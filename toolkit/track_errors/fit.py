@@ -14,8 +14,16 @@ from toolkit.errors import DataError
 from toolkit.geometry import Array, BoolArray, IntArray
 from toolkit.sequence import Sequence, check_runnable
 from toolkit.track_errors.adjustment import Adjusted, adjusted, started
-from toolkit.track_errors.likelihood import Likelihood, Residuals, Tailed, joined, likelihood, linearised
-from toolkit.track_errors.tracklets import Tracklets, tracklets
+from toolkit.track_errors.tracklets import (
+    Likelihood,
+    Residuals,
+    Tailed,
+    Tracklets,
+    joined,
+    likelihood,
+    linearised,
+    tracklets,
+)
 from toolkit.track_noise import CHANNELS, TrackNoise
 
 # Fewer tracks of three sightings cannot tell a noise of seven parameters, or which kind it is.

@@ -9,8 +9,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from toolkit.answers import COV_SIZES, check_state
-from toolkit.estimate import Estimate, Finished, Run
+from toolkit.estimate import COV_SIZES, Estimate, Finished, Run, check_state
 from toolkit.estimator import Build, Estimator, Setup
 from toolkit.geometry import Array, IntArray
 from toolkit.metrics.parts.consistency import POSE_DOF, chi2_quantile
