@@ -1,4 +1,4 @@
-"""What comes out: the state at one instant, trajectories, landmarks, and everything one run produced.
+"""The output of estimators: the state at one instant, trajectories, landmarks, and everything one run produced.
 
 An estimator's answers are checked where the runner receives them: they must have the right types and shapes and belong
 to frames of the sequence. Values are not checked: a pose that is not finite is a result (``diverged``), an array of
@@ -130,9 +130,10 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """What an estimator answers in the end, when it has seen everything.
+    """What an estimator returns at the end, when it has read every packet.
 
-    ``converged`` is False where a solve did not converge; ``log`` tells what was recovered on the way and how.
+    ``converged`` is False where a solve did not converge; ``log`` lists the problems that the estimator recovered from,
+    and how.
     """
 
     trajectory: Trajectory
@@ -156,10 +157,10 @@ class Timings:
 class Run:
     """One estimator on one sequence: both kinds of output, the map, diagnostics per step, cost and status.
 
-    ``causal`` is what was known at each frame and is None for an estimator that answers only at the end.
-    ``timings`` is None for another system's run, read from a file and not made here.
-    ``info`` holds the diagnostics of the causal estimates by name, each (N,), NaN where one was not given.
-    ``arithmetic`` says what computed where an estimator has both, compiled code or NumPy.
+    ``causal`` is what was known at each frame and is None for an estimator that answers only at the end. ``timings`` is
+    None for another system's run, read from a file and not made here. ``info`` holds the diagnostics of the causal
+    estimates by name, each (N,), NaN where one was not given. ``arithmetic`` says whether compiled code or NumPy ran,
+    where the estimator has both.
     """
 
     estimator: str

@@ -96,7 +96,7 @@ def motion_model(noise: MotionNoise, gravity_world: Array) -> MotionModel:
 def integrated(
     model: MotionModel, motions: abc.Sequence[Motion], biases: abc.Sequence[Array]
 ) -> abc.Sequence[Increment]:
-    """Return the motions between frames, each integrated about its own bias (6,): what can be, all at once."""
+    """Return the motions between frames, each integrated about its own bias (6,), all at once where the model can."""
     if isinstance(model, TwistModel | ImuModel) and motions:
         return model.integrate_each(motions, biases)
     return [model.integrate(motion, bias) for motion, bias in zip(motions, biases, strict=True)]
@@ -111,7 +111,7 @@ def state_cov(model: MotionModel, tree: EliminatedGraph, k: int, R_world_imu: Ar
 
 
 def predicted(belief: Belief, model: MotionModel, motion: Motion | None) -> Belief:
-    """Return the belief carried over a measured motion; as it is where there was none, before the first frame."""
+    """Return the belief carried over a measured motion; unchanged where there is none, at the first frame."""
     if motion is None:
         return belief
     return belief.predicted(model.integrate(motion, belief.bias).predict(belief))
@@ -128,7 +128,7 @@ def belief_at(trajectory: Trajectory, row: int, model: MotionModel) -> Belief:
 class PredictedStep(NamedTuple):
     """A step between the rows ``start`` and ``end``: the state at its start, its length and what the motion predicts.
 
-    The belief has no covariance: what the trajectory states may not fit the layout of the state.
+    The belief has no covariance, because that of the trajectory may have another layout.
     """
 
     start: int
