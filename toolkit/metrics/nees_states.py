@@ -7,9 +7,10 @@ may state its pose honestly and its biases not; the error then shows in the pose
 from collections.abc import Callable
 
 from toolkit.geometry import Array
-from toolkit.metrics.parts.consistency import NO_SUCH_BLOCK, bias_errors, layout_of, stated_errors, velocity_errors
+from toolkit.metrics.parts.consistency import stated_errors
 from toolkit.metrics.parts.evaluation import Evaluation
 from toolkit.metrics.parts.scores import Metric, Scores, Unavailable, evaluate
+from toolkit.metrics.parts.state_errors import NO_SUCH_BLOCK, bias_errors, layout_of, velocity_errors
 from toolkit.models.gating import mahalanobis_squared
 
 ORDER = 76
