@@ -1,8 +1,8 @@
 """Units of work on the machines of a Dask cluster, in the place of processes here; the results are the same.
 
-A worker that dies loses the unit it was busy with; the scheduler gives it to another, as often as its configuration
-``distributed.scheduler.allowed-failures`` says, and then it is lost. Every worker is asked for the version of its code,
-whenever it joins: one that runs another would compute something else.
+A worker that dies loses the unit it was busy with; the scheduler gives the unit to another worker, as often as its
+configuration ``distributed.scheduler.allowed-failures`` allows; after that the unit is lost. Every worker reports the
+version of its code when it joins: another version would compute other results.
 """
 
 import re
@@ -122,7 +122,7 @@ def _version() -> Version:
 
 
 def _do(work: Callable[[T, Progress], R], unit: T, version: Version) -> R:
-    """Do a unit of work on a worker, which must run the version of the side that asks."""
+    """Do a unit of work on a worker, which must run the same version as the client."""
     _check_version("that joined", _version(), version)
     return work(unit, SILENT)
 

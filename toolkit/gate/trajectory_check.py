@@ -1,4 +1,4 @@
-"""Hold a folder of trajectories against a baseline, or make the baseline of one."""
+"""Compare a folder of trajectories with a baseline, or make the baseline of one."""
 
 import time
 from collections.abc import Iterable, Iterator, Mapping

@@ -210,6 +210,6 @@ class Chain:
         return np.asarray(in_channels(channels, values[self.before]))
 
     def whitened(self, own: Array, before: Array) -> Array:
-        """Return values (N, 3, ...) in the channels, less the chain's prediction from the sighting before, in sigmas."""
+        """Return values (N, 3, ...) in the channels, less their prediction from the sighting before, in sigmas."""
         shape = (-1, 3) + (1,) * (own.ndim - 2)
         return np.asarray((own - self.carried.reshape(shape) * before) / self.sigma_px.reshape(shape))

@@ -39,7 +39,7 @@ from toolkit.geometry import Array
 from toolkit.models.factors import linear_factor
 from toolkit.models.motion import MotionModel, state_keys
 
-# Accepted relative error of a standard deviation: far below the digits that are printed.
+# Accepted relative error of a standard deviation, which is read to a tenth.
 _MOST_ROUNDED = 0.01
 # A landmark seen by more states than this is eliminated among them and not before.
 _MOST_TIED = 50
