@@ -1,9 +1,8 @@
-"""Where an adjustment of the first frames begins: each unknown by linear equations, so that no motion is too hard.
+"""The first guess for the adjustment of the first frames: each unknown by linear equations, for any motion.
 
-The camera's motion from its own tracks turns as the gyro says but for the gyro's bias; with attitudes free of it,
-velocity and gravity in the first frame are linear in the motion that remains. Source: Qin & Shen, "Robust
-initialization of monocular visual-inertial estimation on aerial robots" (2017), section V; with stereo the scale is
-known.
+The rotation of the camera by its tracks and the gyro's differ by the gyro's bias. With attitudes corrected for it, the
+motion is linear in the velocity and in the gravity in the first frame. Source: Qin & Shen, "Robust initialization of
+monocular visual-inertial estimation on aerial robots" (2017), section V; with stereo the scale is known.
 """
 
 from dataclasses import dataclass
@@ -20,15 +19,15 @@ from toolkit.models.imu import Preintegration, preintegrate, preintegration_para
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence
 
-# Steps for the gyro's bias: the second corrects for what the first neglects.
+# Iterations for the gyro's bias: the second corrects for the linearisation of the first.
 _BIAS_STEPS = 2
 _REWEIGHTINGS, _HUBER = 5, 1.5
 # Median norm of a normal vector of three unit variances.
 _MEDIAN_NORM = 1.54
 # Velocity and gravity are six unknowns, and their scatter needs some intervals more than the two they take.
 _FEWEST_INTERVALS = 6
-# Gravity tells which way is up where so many of its sigmas are within this share of its length; where it is then off
-# by more than both, vision and accelerometer are not of one motion.
+# The direction of gravity is known where this many of its sigmas are within this share of its length. If its length is
+# then wrong by more than both, vision and accelerometer contradict each other.
 _GRAVITY_SHARE, _GRAVITY_SIGMAS = 0.15, 4.0
 
 
@@ -36,7 +35,7 @@ _GRAVITY_SHARE, _GRAVITY_SIGMAS = 0.15, 4.0
 class FirstGuess:
     """Rough states of K frames: poses (K, 4, 4), velocities (K, 3) m/s in the world, and the biases (6,).
 
-    ``contradiction`` says in words why vision and the motion samples cannot be of one motion, if they cannot.
+    ``contradiction`` says why vision and the motion samples cannot be of one motion, if so.
     """
 
     T_world_imu: Array
@@ -87,7 +86,7 @@ def _seen(sequence: Sequence) -> _SeenMotion:
 
 
 def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
-    """Return the rate (3,) rad/s by which the gyro turns faster than the tracks, of all known intervals.
+    """Return the rate (3,) rad/s by which the gyro turns faster than the tracks show, over all known intervals.
 
     A bias b over dt turns by exp(-b dt) on the right, to first order.
     """
@@ -102,7 +101,7 @@ def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """What the IMU alone says of N intervals, in the axes of the first frame.
+    """The motion over N intervals by the IMU alone, in the axes of the first frame.
 
     ``t_s`` (N + 1,), ``attitudes`` (N + 1, 3, 3), and ``gained_mps``, ``gained_m`` (N + 1, 3): velocity and position
     that the specific force has given since the first frame, from rest and without gravity.
@@ -134,7 +133,7 @@ class _Path:
         return np.asarray(self.gained_mps + v_first + self.t_s[:, None] * gravity)
 
     def left(self, seen: _SeenMotion) -> Array:
-        """Return what of the seen translations (M, 3) m, where known, the specific force does not explain."""
+        """Return the known translations of the camera (M, 3) m less those that the specific force explains."""
         seen_m = (self.attitudes[:-1] @ seen.T_before_after[:, :3, 3:])[..., 0]
         return np.asarray((seen_m - np.diff(self.gained_m, axis=0))[seen.known])
 
@@ -148,7 +147,7 @@ class _Path:
 
 
 def _gravity(path: _Path, seen: _SeenMotion, length: float) -> tuple[Array, str | None]:
-    """Return gravity (3,) m/s^2 in the first frame, and why it cannot be so, if it cannot."""
+    """Return gravity (3,) m/s^2 in the first frame, and the contradiction, if there is one."""
     down = -path.gained_mps[-1]
     contradiction = None
     if seen.known.sum() >= _FEWEST_INTERVALS:

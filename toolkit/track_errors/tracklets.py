@@ -22,13 +22,13 @@ from toolkit.models.gating import LEAST_DEPTH_M, LEAST_DISPARITY_PX
 from toolkit.sequence import Sequence, StereoRig, is_left_only
 from toolkit.track_noise import CHANNELS, TrackNoise
 
-# A landmark has three unknowns, and so has a sighting: from the third on a walk can be told from white noise.
+# A landmark has as many unknowns as one sighting has coordinates; with three sightings a walk differs from white noise.
 FEWEST_SIGHTINGS = 3
-# Of longer tracks the first ones are used: they show a walk of twelve steps, and the time taken goes with the square.
+# Longer tracks are cut to their first sightings: these show a walk of twelve steps, and the time grows with the square.
 MOST_SIGHTINGS = 12
-# More tracks in a frame say nothing new about their noise; of more an even share is used.
+# More tracks in a frame give no further information about their noise; an even share of them is used.
 MOST_A_FRAME = 80
-# Of longer recordings stretches of so many frames, evenly spread, are used: an hour is fitted in seconds, too.
+# In longer recordings, stretches of this many frames, evenly spread, are used, so that an hour is fitted in seconds.
 MOST_FRAMES, STRETCH_FRAMES = 1200, 100
 
 
@@ -74,13 +74,13 @@ class Tracklets:
 def tracklets(sequence: Sequence) -> tuple[Tracklets, ...]:
     """Return the tracks an estimator may see, a group for each number of sightings; none where none is long enough."""
     seen = sequence.visible
-    # Disparities are what the noise is told by: a track ends where it lacks the right image.
+    # The fit needs disparities, so a track ends where a sighting lacks the right image.
     seen = seen.select(~is_left_only(seen.uv_px))
     order = np.lexsort((seen.frame, seen.track_id))
     frame, track_id, cdv_px = seen.frame[order], seen.track_id[order], seen.uv_px[order] @ CHANNELS.T
     first = np.flatnonzero(np.diff(track_id, prepend=track_id[:1] - 1) != 0)
     count = _unbroken(frame, track_id, first)
-    # Selected by the first sighting: by all of them, noise of the later ones would decide who stays.
+    # Tracks are selected by their first sighting; a selection by all sightings would depend on the noise of later ones.
     usable = (cdv_px[first, 1] > LEAST_DISPARITY_PX) & (count >= FEWEST_SIGHTINGS)
     usable &= _in_stretches(frame[first], sequence.frame_count)
     frames = min(sequence.frame_count, MOST_FRAMES)
