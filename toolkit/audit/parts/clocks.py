@@ -25,34 +25,34 @@ from toolkit.models.camera_motion import CameraMotion
 from toolkit.resampling import NS_PER_S
 from toolkit.sequence import Sequence, Truth
 
-# How far it is searched for, and the step of the search in intervals.
+# Range of the search, and its step in intervals.
 MOST_S, COARSE_STEP = 0.6, 0.25
-# So many means over an interval at a time: what is computed of them takes a megabyte, however long the recording.
+# Means over an interval that are computed at a time: they take a megabyte, however long the recording.
 MEANS_AT_A_TIME = 10_000
 REFINEMENTS = 5
-# The standard error is that of a jackknife over stretches of the recording, for a corner is one event and not ten
-# intervals, times what was missing: measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
+# The standard error is that of a jackknife over stretches of the recording (a corner is one event and not ten
+# intervals), times this factor, which was measured on 24 simulated drives of 30 and 60 s and 8 flights of 15 s.
 SCATTER = 1.45
 # The unexplained variance must fall to this share of what it is without any offset, lest slow turns fit by chance.
 MOST_UNEXPLAINED = 0.9
-# Rotations of which one is noise differ by the sum of their variances: a gyro's own noise, in a standstill, has some
-# shift at which it differs least. They must differ by less than this share of the sum, without gross mismatches.
+# The difference of two rates of which one is noise has the sum of their variances; a gyro's noise in a standstill also
+# has a shift with the least difference. The variance must be below this share of the sum, without gross mismatches.
 MOST_APART, GROSS_SPREADS = 0.8, 6.0
 # An offset counts beyond so many standard errors and so much (s), a rate where it makes as much at both ends. Sound
 # recordings have 9 +- 2 ms at most (0027), chosen with them in view.
 OFFSET_SIGMAS, LEAST_OFFSET_S = 5.0, 0.02
-# The fit takes in these shares of the intervals about the middle, one after the other, with so many steps each.
+# The fit uses these shares of the intervals about the middle, one after the other, with this many steps each.
 SHARES, STEPS = (0.3, 0.6, 1.0), (2, 1, 3)
 # As many intervals at least, of which the truth may not reach some.
 FEWEST = LEAST_INTERVALS + 10
 # The slope of the truth's rates is taken over this share of a step of the frames to either side.
 SLOPE_STEP = 0.1
-# A clock that is faster or slower by more is none; beyond, other stretches of a motion fit as well.
+# Largest rate; beyond it, other stretches of a motion fit as well.
 MOST_RATE = 0.1
 
 
 def camera_offset(sequence: Sequence, intervals: Intervals, w_imu: Array) -> Scalar | None:
-    """Estimate how much later than its stamps (s) the camera's rotation is, or None where nothing tells."""
+    """Estimate how much later than its stamps (s) the camera's rotation is, or None where it is undetermined."""
     step_s = float(np.median(np.diff(sequence.frames_t_ns))) / NS_PER_S
     gyro = Integral.of(sequence.motion.t_ns, sequence.motion.values[:, 3:])
     candidates = np.append(np.arange(-MOST_S, MOST_S, COARSE_STEP * step_s), 0.0)
@@ -150,7 +150,7 @@ def is_stamped_at_frames(sequence: Sequence) -> bool:
 class TruthClock(NamedTuple):
     """How much later than by their stamps (s) the frames are by the truth's clock, and by what share faster that runs.
 
-    Each is None where nothing tells. ``half_s`` is half of the recording's duration.
+    Each is None where it is undetermined. ``half_s`` is half of the recording's duration.
     """
 
     offset: Scalar | None
@@ -159,14 +159,14 @@ class TruthClock(NamedTuple):
 
     @property
     def runs_otherwise(self) -> bool:
-        """Whether the rate is no chance and parts the clocks."""
+        """Whether the rate is significant and drives the clocks apart."""
         if self.rate is None:
             return False
         return abs(self.rate.value) * self.half_s > max(LEAST_OFFSET_S, OFFSET_SIGMAS * self.rate.error * self.half_s)
 
     @property
     def unseen_s(self) -> float:
-        """How far (s) the clocks may be apart somewhere without showing."""
+        """Undetected difference (s) of the clocks, at most."""
         if self.offset is None or self.rate is None:
             return np.inf
         return max(LEAST_OFFSET_S, OFFSET_SIGMAS * max(self.offset.error, self.rate.error * self.half_s))
@@ -198,7 +198,7 @@ class BesideTruth(NamedTuple):
 
 
 def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> TruthClock | None:
-    """Compare the clocks; None where the truth is no motion, or no other one was measured."""
+    """Compare the clocks; None where the truth does not move, or no motion was measured."""
     beside = BesideTruth.of(sequence, camera, truth)
     if beside is None:
         return None
@@ -208,7 +208,7 @@ def truth_clock(sequence: Sequence, camera: CameraMotion, truth: Truth) -> Truth
 
 
 def rate_of_clock(beside: BesideTruth, offset_s: float) -> Scalar | None:
-    """Return by what share faster the truth's clock runs than the frames'; None where nothing tells.
+    """Return by what share faster the truth's clock runs than the frames'; None where it is undetermined.
 
     ``offset_s`` is, nearly, how much later than by its stamp the middle frame is by the truth's clock. The standard
     error is that of a jackknife over stretches of the recording.
@@ -261,7 +261,8 @@ class _Clocks(NamedTuple):
     def linearised(self, found: Array, rows: IntArray) -> "_Linearised | None":
         """Return the equations of those of the rows that the truth reaches, where these are enough.
 
-        A clock that is fast shows less turning in a second. That a focal length does as well; it counts for nothing.
+        A fast clock shows less rotation in a second, as a wrong focal length does, so this effect is not used for the
+        rate.
         """
         shift_s, apart_s = found[0] + found[1] * self.since_s, SLOPE_STEP * self.step_s
         at_ns = self.frames_t_ns + shift_s * NS_PER_S
@@ -290,9 +291,9 @@ class _Clocks(NamedTuple):
         return (found, at) if at is not None and is_one else None
 
     def fits(self, found: Array, offset_s: float) -> bool:
-        """Say whether the rate explains what the offset alone does not, where it displaces the ends by a step.
+        """Say whether the rate explains residuals that the offset does not, if it displaces the ends by a step or more.
 
-        By less other turns do not fit by chance.
+        With a smaller displacement, other turns cannot fit by chance.
         """
         if abs(found[1]) * self.since_s[-1] < self.step_s:
             return True

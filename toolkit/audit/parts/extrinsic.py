@@ -1,4 +1,4 @@
-"""What camera and motion samples together say of the extrinsic: the camera's position, and its small rotation.
+"""The camera's position and its small rotation against the given extrinsic, from camera and motion samples.
 
 Position: which of two places the camera is at, by the turns of the vehicle. The regression of `alignment` measures it,
 in which the scale and the rotation of the camera may also be a little off, as they are in real recordings. To its
@@ -21,10 +21,10 @@ from toolkit.jackknife import STRETCHES, jackknife_cov
 from toolkit.measured_motion import MotionKind
 from toolkit.sequence import Sequence
 
-# Logarithms of the odds from which the other place is taken, a thousand to one, and from which it is not thought of any
-# more, twenty to one against it: what a file says is right more often than not.
+# Logarithms of the odds at which the other position is accepted (1000 to 1), and at which it is excluded (20 to 1
+# against it): the position in a file is right more often than not.
 LOG_ODDS, LOG_ODDS_AGAINST = float(np.log(1000.0)), float(np.log(20.0))
-# Standard deviations from which on the measured place is not the other one.
+# The other position is excluded where the measured one is this many standard deviations away.
 MOST_SIGMAS = 4.0
 # What sound odometry has, chosen with the recordings at hand in view: velocities of another point along the way of
 # travel (m; 0.4 to 0.9 in ten cars), and velocities that are off by a share for as long as a turn lasts, as the limits
@@ -32,37 +32,37 @@ MOST_SIGMAS = 4.0
 ALONG_TRAVEL_M, SHARE_IN_TURNS = 0.65, 0.02
 # The same of sound recordings beside an IMU (m): 0.06 at most.
 BESIDE_IMU_M = 0.05
-# Axes about which the turn is known worse than this many times the best one are not judged: about its own direction a
-# velocity says nothing, and slip feigns something.
+# Axes about which the error of the rotation is this many times that of the best axis are not judged: a velocity does
+# not determine the rotation about its own direction, and slip would bias it.
 MOST_ERROR_RATIO = 4.0
-# No bound of chance is less (rad): without noise it would be none.
+# Least bound by chance (rad); without noise it would be zero.
 LEAST_BOUND_RAD = 5e-6
 
 
 def way_gone(sequence: Sequence, intervals: Intervals, found: Alignment, way_m: Array) -> Scalar:
-    """Return how far along a way (3,) m from the place given the camera is: 1 is its end."""
+    """Return the camera's position along a vector (3,) m from the given one: 0 is its start, 1 its end."""
     return share_of_way(found.lever_m, found.lever_cov_m2 + _systematic_cov_m2(sequence, intervals), way_m)
 
 
 def share_of_way(lacking_m: Array, cov_m2: Array, way_m: Array) -> Scalar:
-    """Return the same of a place that lacks (3,) m, with its covariance (3, 3), by weighted least squares."""
+    """Return the same for a measured correction (3,) m with its covariance (3, 3), by weighted least squares."""
     weighted = np.linalg.solve(cov_m2, way_m)
     information = float(weighted @ way_m)
     return Scalar(float(weighted @ lacking_m) / information, float(1.0 / np.sqrt(information)))
 
 
 def is_there(share: Scalar) -> bool:
-    """Say whether the camera is at the way's end, and not elsewhere."""
+    """Say whether the camera is at the end of the vector, and not elsewhere."""
     return not is_excluded(share) and _log_odds(share) > LOG_ODDS
 
 
 def is_excluded(share: Scalar) -> bool:
-    """Say whether the camera is not at the way's end."""
+    """Say whether the camera is not at the end of the vector."""
     return abs(share.value - 1.0) > MOST_SIGMAS * share.error or _log_odds(share) < -LOG_ODDS_AGAINST
 
 
 def _log_odds(share: Scalar) -> float:
-    """Return the logarithm of the odds of the way's end against its begin, of normal errors."""
+    """Return the logarithm of the odds of the vector's end against its start, for normal errors."""
     return (share.value - 0.5) / share.error**2
 
 
@@ -72,7 +72,7 @@ def metres(position: Array) -> str:
 
 
 def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:
-    """Return the covariance (3, 3) of the place in sound recordings, without that of its scatter."""
+    """Return the covariance (3, 3) of the systematic error of the position in sound recordings."""
     if intervals.v_mps is None:
         return BESIDE_IMU_M**2 * np.eye(3)
     R_imu_cam = sequence.rig.T_imu_cam[:3, :3]
@@ -88,9 +88,9 @@ def _systematic_cov_m2(sequence: Sequence, intervals: Intervals) -> Array:
 
 
 class Turn(NamedTuple):
-    """Small rotations (m,) rad about m axes that can be judged, their standard errors (m,) rad, and what is no chance.
+    """Small rotations (m,) rad about m axes that can be judged, their standard errors (m,) rad, and bounds by chance.
 
-    ``by_chance_rad`` (m,) is what they are beyond by chance less often than ``robust.LEVEL``.
+    They exceed ``by_chance_rad`` (m,) by chance less often than ``robust.LEVEL``.
     """
 
     rad: Array
@@ -122,7 +122,7 @@ def turn_by_rotations(intervals: Intervals, T_imu_cam: Array) -> Turn:
 def _tested(rad: Array, formal: Array, cov: Array, stretches: float, kind: MotionKind) -> Turn:
     """Return the turn (3,) about axes that can be judged: those of its formal covariance (3, 3).
 
-    The covariance (3, 3) of a few stretches has none of its own.
+    The jackknife covariance (3, 3) of a few stretches is too uncertain to choose the axes.
     """
     variance, axes = np.linalg.eigh(formal)
     error_rad = np.sqrt(np.maximum(np.diag(axes.T @ cov @ axes), variance))

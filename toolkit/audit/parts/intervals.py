@@ -1,4 +1,4 @@
-"""The motion between two frames as the motion samples and as the camera measure it, side by side."""
+"""The motion over each interval between frames, by the motion samples and by the camera."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,9 @@ from toolkit.sequence import Sequence, check_runnable
 
 # With fewer intervals than this the camera's motion is not compared.
 LEAST_INTERVALS = 30
-# Steps in which an IMU's samples are integrated, with the orientation as it is in the middle of each.
+# Longest step (s) in the integration of an IMU's samples, with the orientation in its middle.
 STEP_S = 0.02
-# What a gyro beside odometry reads too much at most, 11 degrees a second; more is another fault, such as wrong axes.
+# Largest bias of a gyro with odometry, 11 degrees a second; more is another fault, such as wrong axes.
 MOST_BIAS_RADPS = 0.2
 
 
@@ -40,7 +40,7 @@ class Intervals(NamedTuple):
 
 
 def compare(sequence: Sequence, camera: CameraMotion) -> Intervals | None:
-    """Put both side by side; None where too few intervals are known, or no motion was measured."""
+    """Return both motions; None where too few intervals are known, or no motion was measured."""
     rows = np.flatnonzero(camera.known)
     if isinstance(sequence.motion, NoSamples) or rows.size < LEAST_INTERVALS:
         return None
@@ -61,7 +61,7 @@ def is_comparable(sequence: Sequence) -> bool:
 class Integral(NamedTuple):
     """Samples (S, d) at stamps (S,), joined by straight lines and level beyond the ends, and their integral up to each.
 
-    Made once, it has the means over any intervals at the cost of these alone.
+    After it is made once, means over intervals cost time only in their number.
     """
 
     t_ns: IntArray
@@ -96,8 +96,8 @@ def interval_means(t_ns: IntArray, values: Array, frames_t_ns: IntArray) -> Arra
 def subdivided(t_ns: IntArray) -> tuple[IntArray, IntArray]:
     """Return stamps (n,) that divide each interval between stamps (K,) into equal parts, and the index (K,) of those.
 
-    Over a part, STEP_S at most, an IMU's force and rate of rotation are taken for constant; over the interval between
-    two frames they are not: what shakes a vehicle several times a second feigns a scale of 8 %.
+    Over a part, STEP_S at most, an IMU's force and rate of rotation are taken as constant. Over the interval between
+    two frames they are not: vibration of several hertz would bias a scale by 8 %.
     """
     parts = max(1, int(np.ceil(np.median(np.diff(t_ns)) / NS_PER_S / STEP_S)))
     index = np.arange(len(t_ns)) * parts
