@@ -42,12 +42,12 @@ def within_budget(
     chosen = track_ids[:0]
     for start, end in pairwise(frame_starts.tolist()):
         rows = slice(start, end)
-        given[rows] = _given(budget, np.isin(track_ids[rows], chosen), ages[rows], parts[rows])
+        given[rows] = _selected(budget, np.isin(track_ids[rows], chosen), ages[rows], parts[rows])
         chosen = track_ids[rows][given[rows]]
     return given
 
 
-def _given(budget: int, kept: BoolArray, ages: IntArray, parts: IntArray) -> BoolArray:
+def _selected(budget: int, kept: BoolArray, ages: IntArray, parts: IntArray) -> BoolArray:
     """Say of each sighting (n,) of one frame whether it is selected; tracks ``kept`` from the last frame always are."""
     column, row, octave = parts.T
     order = np.lexsort((-ages, ~kept, column, row, octave))

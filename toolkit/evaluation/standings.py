@@ -19,7 +19,7 @@ from toolkit.estimate import Status
 from toolkit.evaluation.gathering import Gathered, Item
 from toolkit.evaluation.scoring import COVERAGE, METRICS, Terms, TruthFile, read_truth, score_file
 from toolkit.experiment.statistics import QuantilesOfAll, quantiles_of_all
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import FALSE_ALARM_RATE
 from toolkit.gate.significance import holm
 from toolkit.geometry import Array, IntArray
@@ -248,7 +248,7 @@ def evaluate(
     scored: dict[Item, EvaluatedRun] = {}
     processes = workers if len(gathered.items) >= _WORTH_PROCESSES else 1
     for place, found in results_of(units, processes, _evaluated, progress):
-        if isinstance(found, Lost):
+        if isinstance(found, LostUnit):
             scored |= {item: EvaluatedRun(item, "failed", {}, {}, (found.why,)) for item in units[place].items}
         else:
             scored |= {run.item: run for run in found}

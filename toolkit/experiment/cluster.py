@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 
 from toolkit.errors import VislamError
 from toolkit.experiment.code_version import code_digest, numeric_versions
-from toolkit.experiment.workers import Lost, Needs, Work, nothing_kept
+from toolkit.experiment.workers import LostUnit, Needs, Work, nothing_kept
 from toolkit.progress import SILENT, Progress
 
 T = TypeVar("T")
@@ -54,7 +54,7 @@ class Cluster:
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, _needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there; the scheduler chooses the workers.
 
         An error that the work raises ends everything and is raised here. Raises ClusterError where the scheduler goes
@@ -81,7 +81,9 @@ class Cluster:
         try:
             return future.result()
         except KilledWorker as error:
-            return Lost(f"the workers that tried it ended before they answered ({error.allowed_failures + 1} of them)")
+            return LostUnit(
+                f"the workers that tried it ended before they answered ({error.allowed_failures + 1} of them)"
+            )
         except (CancelledError, CommClosedError, TimeoutError) as error:
             raise ClusterError(f"the scheduler at {self._address} went away; repeat with the same --out") from error
 

@@ -31,7 +31,7 @@ FARTHEST = float(chdtri(6, 1e-6)) / 6.0
 _ROUNDING = 1e-6
 
 
-class Parted(NamedTuple):
+class FarthestPose(NamedTuple):
     """The largest distance of a row from the measured motion alone: time (s), distance, squared Mahalanobis distance.
 
     ``squared`` is divided by its 6 degrees of freedom: 1 on average where both are consistent and independent.
@@ -46,19 +46,20 @@ class Parted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Dispute:
-    """Estimators that rest on the measured motion ``alone``, the ``witnesses``, and the evidence against the motion.
+    """Estimators that do not correct the measured motion, the ``witnesses``, and the evidence against the motion.
 
-    ``parted`` are rows that are too far from it, ``leaning`` estimators whose corrections have a trend.
+    ``uncorrected`` are the former, ``too_far`` the rows that are too far from the motion, ``with_trend`` the estimators
+    whose corrections have a trend.
     """
 
-    alone: tuple[str, ...]
+    uncorrected: tuple[str, ...]
     witnesses: tuple[str, ...]
-    parted: tuple[Parted, ...]
-    leaning: tuple[str, ...]
+    too_far: tuple[FarthestPose, ...]
+    with_trend: tuple[str, ...]
 
     @classmethod
     def of(cls, rows: Iterable[Row]) -> Self:
-        """Compare the rows of a comparison; over seeds no runs are kept, and ``parted`` is empty."""
+        """Compare the rows of a comparison; over seeds no runs are kept, and ``too_far`` is empty."""
         rows = [row for row in rows if row.answered]
         uncorrected = [row for row in rows if row.value(TREND) is None and row.reason(TREND) == NOTHING_CORRECTED]
         others = [row for row in rows if row.estimator not in (one.estimator for one in uncorrected)]
@@ -74,16 +75,16 @@ class Dispute:
     @property
     def disputing(self) -> tuple[str, ...]:
         """Return the witnesses that dispute the measured motion."""
-        parted = {one.row.estimator for one in self.parted}
-        return tuple(name for name in self.witnesses if name in parted or name in self.leaning)
+        too_far = {one.row.estimator for one in self.too_far}
+        return tuple(name for name in self.witnesses if name in too_far or name in self.with_trend)
 
     @property
     def doubts_motion(self) -> bool:
         """Say whether at least half of the witnesses dispute the motion, and others rest on it."""
-        return bool(self.alone and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
+        return bool(self.uncorrected and self.disputing and 2 * len(self.disputing) >= len(self.witnesses))
 
 
-def farthest(row: Row, motion: Trajectory) -> Parted | None:
+def farthest(row: Row, motion: Trajectory) -> FarthestPose | None:
     """Return the largest Mahalanobis distance of a row from a trajectory, or None where a covariance is lacking."""
     other = _trajectory(row)
     if other is None or other.cov is None or motion.cov is None:
@@ -98,7 +99,7 @@ def farthest(row: Row, motion: Trajectory) -> Parted | None:
     k = int(np.argmax(squared))
     t_s = (motion.t_ns[mine][known][k] - motion.t_ns[0]) / NS_PER_S
     distance_m, angle = np.linalg.norm(apart[known][k, POSITION]), np.linalg.norm(apart[known][k, ROTATION])
-    return Parted(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
+    return FarthestPose(row, float(t_s), float(distance_m), float(np.degrees(angle)), float(squared[k]) / 6.0)
 
 
 def _names(rows: Iterable[Row]) -> tuple[str, ...]:

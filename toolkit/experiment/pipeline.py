@@ -20,7 +20,7 @@ from toolkit.experiment.outcome_store import NOWHERE, Conditions, OutcomeStore, 
 from toolkit.experiment.recording import WHOLE, Part, Prepared, Recording, prepare
 from toolkit.experiment.references import check_names, external_runs, reference_runs
 from toolkit.experiment.units import Outcome, Unit, outcome_of, recording_to_prepare, run_unit
-from toolkit.experiment.workers import Lost, Pool, Workers, usable_cpus
+from toolkit.experiment.workers import LostUnit, Pool, Workers, usable_cpus
 from toolkit.progress import Progress, ProgressFor, silent
 from toolkit.sequence import Sequence as Recorded
 from toolkit.settings import DEFAULTS, Noise, Settings, SettingsError
@@ -156,8 +156,8 @@ def _prepare(recording: Recording, progress: Progress) -> Prepared:
     return prepare(recording, progress)
 
 
-def _unless_lost(result: Prepared | Lost, recording: Recording) -> Prepared:
-    if isinstance(result, Lost):
+def _unless_lost(result: Prepared | LostUnit, recording: Recording) -> Prepared:
+    if isinstance(result, LostUnit):
         raise DataError(f"{_name(recording.source)}: while it was loaded {result.why}; is there memory enough?")
     return result
 
@@ -262,7 +262,7 @@ def _located(source: str | Recorded) -> str | Recorded:
     return str(Path(source).expanduser().absolute())
 
 
-def _outcome(result: Outcome | Lost, unit: Unit, store: Store) -> Outcome:
+def _outcome(result: Outcome | LostUnit, unit: Unit, store: Store) -> Outcome:
     if isinstance(result, Outcome):
         return store.keep(unit, result)
     return Outcome(unit.seed, unit.estimator, "failed", log=(result.why,))

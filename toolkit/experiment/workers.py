@@ -137,7 +137,7 @@ def _refusals_shown() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Lost:
+class LostUnit:
     """The result of a unit whose process died twice: how the process ended, in words."""
 
     why: str
@@ -155,7 +155,7 @@ def nothing_kept(_unit: object) -> Hashable:
 
 def results_of(
     units: Sequence[T], workers: int, work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-) -> Generator[tuple[int, R | Lost], None, None]:
+) -> Generator[tuple[int, R | LostUnit], None, None]:
     """Yield the place and the result of every unit as each is there, from so many processes; see :class:`Workers`."""
     with Workers(workers) as pool:
         yield from pool.results(units, work, progress, needs)
@@ -174,7 +174,7 @@ class Pool(Protocol):
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there; an error of the work is raised."""
 
 
@@ -207,7 +207,7 @@ class Workers:
 
     def results(
         self, units: Sequence[T], work: Work[T, R], progress: Progress, needs: Needs[T] = nothing_kept
-    ) -> Generator[tuple[int, R | Lost], None, None]:
+    ) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of every unit as each is there.
 
         An error that the work raises ends everything and is raised here.
@@ -278,7 +278,7 @@ class _HandingOut(Generic[R]):
         self._stopped.set()
         self._thread.join()
 
-    def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | Lost], None, None]:
+    def results(self, meanwhile: Callable[[], None]) -> Generator[tuple[int, R | LostUnit], None, None]:
         """Yield the place and the result of each task as it is there, and call ``meanwhile`` while there is none."""
         died = []
         for _ in self._tasks:
@@ -290,7 +290,7 @@ class _HandingOut(Generic[R]):
             else:
                 yield place, result
         for place in died:
-            yield place, self._alone(place, meanwhile)
+            yield place, self._retry_alone(place, meanwhile)
 
     def _next_answer(self, meanwhile: Callable[[], None]) -> tuple[int, "Future[R]"]:
         while True:
@@ -303,7 +303,7 @@ class _HandingOut(Generic[R]):
                 raise answer
             return answer
 
-    def _alone(self, place: int, meanwhile: Callable[[], None]) -> R | Lost:
+    def _retry_alone(self, place: int, meanwhile: Callable[[], None]) -> R | LostUnit:
         """Try a task once more, in a process of its own."""
         process = WorkerProcess()
         try:
@@ -312,7 +312,7 @@ class _HandingOut(Generic[R]):
                 meanwhile()
             return future.result()
         except BrokenProcessPool as error:
-            return Lost(f"its process {how_it_ended(error)} before it answered")
+            return LostUnit(f"its process {how_it_ended(error)} before it answered")
         finally:
             process.end()
 

@@ -112,7 +112,7 @@ def judge_speeds(found: Sequence[TimedPairs], version: str, rate: float) -> Iter
         finding: Finding = "regressed" if p <= rate else "better" if p_faster <= rate else "same"
         ratio, (was, is_) = float(np.exp(np.median(timed.differences))), np.median(timed.cpu_s, axis=0).tolist()
         message = f"{ratio:.2f} times the processor time of {version}, in {len(timed.cpu_s)} runs in turn"
-        seen = 100.0 * float(np.expm1(_seen(timed.differences, rate / len(found))))
+        seen = 100.0 * float(np.expm1(_detectable(timed.differences, rate / len(found))))
         yield Verdict(
             timed.case, timed.estimator, "", SPEED, finding, "" if finding == "same" else message, was, is_,
             100.0 * (ratio - 1.0), 100.0 * MARGIN, p_faster if finding == "better" else p, seen,
@@ -132,7 +132,7 @@ def _scale(differences: Array) -> float:
     return float(np.ptp(np.percentile(differences, _TAILS_PERCENT))) / (2.0 * _TAILS_OF_NORMAL)
 
 
-def _seen(differences: Array, rate: float) -> float:
+def _detectable(differences: Array, rate: float) -> float:
     """Return the change that one test at ``rate`` finds with 95 % power; its efficiency is 3/pi of the t-test's."""
     error = _scale(differences) * np.sqrt(np.pi / 3.0 / differences.size)
     return float(np.log1p(MARGIN) + (ndtri(POWER) - ndtri(rate)) * error)

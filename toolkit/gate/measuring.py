@@ -32,7 +32,7 @@ from toolkit.experiment.units import (
     recording_to_prepare,
     run_estimator,
 )
-from toolkit.experiment.workers import Lost, results_of
+from toolkit.experiment.workers import LostUnit, results_of
 from toolkit.gate.baseline import COVERAGE, Bounds, Case, Measured, Series, Values
 from toolkit.geometry import Array
 from toolkit.progress import Progress
@@ -155,9 +155,9 @@ def _why_absent(name: str) -> str:
     return ""
 
 
-def _timed(result: TimedOutcome | Lost, unit: Unit) -> TimedOutcome:
+def _timed(result: TimedOutcome | LostUnit, unit: Unit) -> TimedOutcome:
     """Return the result of a unit; of one whose process died only the status."""
-    if isinstance(result, Lost):
+    if isinstance(result, LostUnit):
         return TimedOutcome(Outcome(unit.seed, unit.estimator, "failed", log=(result.why,)))
     return result
 

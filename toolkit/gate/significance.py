@@ -125,7 +125,7 @@ def judge_pairs(tests: list[Pairs], rate: float, *, accept_better: bool = False)
         if finding == "moved" and accept_better:
             finding = "better" if _is_nearer(pairs) else "worse"
         margin = pairs.criterion.margin if accept_better else ROUNDING
-        seen = smallest_seen(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
+        seen = smallest_detectable(pairs.differences, rate / len(tests) / 2.0, POWER) + margin
         verdicts.append(_verdict(pairs, finding, p_worse if finding == "regressed" else p, seen))
     return verdicts
 
@@ -197,7 +197,7 @@ def holm(p_values: Array) -> Array:
     return adjusted
 
 
-def smallest_seen(differences: Array, rate: float, power: float) -> float:
+def smallest_detectable(differences: Array, rate: float, power: float) -> float:
     """Return the excess of the mean over the margin that one test at ``rate`` sees with ``power``.
 
     From the spread of the differences (n,) themselves: (t(1 - rate) + t(power)) standard errors, the usual
@@ -234,6 +234,6 @@ class MeanChange:
             return 0.0 if excess > 0.0 else 1.0
         return float(stdtr(self.dof, -excess / self.error))
 
-    def seen(self, margin: float, rate: float) -> float:
+    def detectable(self, margin: float, rate: float) -> float:
         """Return the change that one test at ``rate`` sees with 95 % power."""
         return margin + float(stdtrit(self.dof, 1.0 - rate) + stdtrit(self.dof, POWER)) * self.error

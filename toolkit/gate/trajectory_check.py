@@ -210,5 +210,5 @@ def _tested(
         where.sequence, where.estimator, where.output, where.metric, finding, message,
         before=geometric_mean(one.before), after=geometric_mean(one.after),
         change_percent=change, allowed_percent=one.criterion.percent, p=p,
-        seen_percent=100.0 * float(np.expm1(spread.seen(one.criterion.margin, each))),
+        seen_percent=100.0 * float(np.expm1(spread.detectable(one.criterion.margin, each))),
     )  # fmt: skip

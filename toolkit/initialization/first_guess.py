@@ -53,7 +53,7 @@ class _SeenMotion(NamedTuple):
 
 def guess_from_vision(sequence: Sequence) -> FirstGuess:
     """Return the states that the tracks alone show; the world is the first IMU frame."""
-    poses = np.array(list(accumulate(_seen(sequence).T_before_after, np.matmul, initial=np.eye(4))))
+    poses = np.array(list(accumulate(_vision_motion(sequence).T_before_after, np.matmul, initial=np.eye(4))))
     t_s = sequence.frames_s
     return FirstGuess(poses, np.gradient(poses[:, :3, 3], t_s, axis=0), np.zeros(6))
 
@@ -64,10 +64,10 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
     Which way is up is the direction of gravity where vision determines it, else of the mean specific force.
     """
     assert isinstance(sequence.noise, ImuNoise)
-    seen, params = _seen(sequence), preintegration_params(sequence.noise, sequence.gravity_world)
+    seen, params = _vision_motion(sequence), preintegration_params(sequence.noise, sequence.gravity_world)
     bias = np.zeros(6)
     for _ in range(_BIAS_STEPS):
-        bias[3:] += _gyro_bias_left([preintegrate(motion, bias, params) for motion in motions], seen)
+        bias[3:] += _gyro_bias_residual([preintegrate(motion, bias, params) for motion in motions], seen)
     path = _Path.of([preintegrate(motion, bias, params) for motion in motions])
     fallen = float(np.linalg.norm(sequence.gravity_world))
     gravity, contradiction = _gravity(path, seen, fallen)
@@ -77,7 +77,7 @@ def guess_with_imu(sequence: Sequence, motions: list[ImuMotion]) -> FirstGuess:
     return FirstGuess(poses, path.velocities(v_first, gravity) @ level[:3, :3].T, bias, contradiction)
 
 
-def _seen(sequence: Sequence) -> _SeenMotion:
+def _vision_motion(sequence: Sequence) -> _SeenMotion:
     moved = camera_motion(sequence)
     dt_s = np.diff(sequence.frames_t_ns)[:, None] / NS_PER_S
     T_imu_cam = sequence.rig.T_imu_cam
@@ -85,7 +85,7 @@ def _seen(sequence: Sequence) -> _SeenMotion:
     return _SeenMotion(np.asarray(T_imu_cam @ T_before_after @ se3_inverse(T_imu_cam)), moved.known)
 
 
-def _gyro_bias_left(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
+def _gyro_bias_residual(pieces: list[Preintegration], seen: _SeenMotion) -> Array:
     """Return the rate (3,) rad/s by which the gyro turns faster than the tracks show, over all known intervals.
 
     A bias b over dt turns by exp(-b dt) on the right, to first order.
@@ -132,7 +132,7 @@ class _Path:
         """Return the velocities (N + 1, 3) m/s from the first velocity and gravity (3,)."""
         return np.asarray(self.gained_mps + v_first + self.t_s[:, None] * gravity)
 
-    def left(self, seen: _SeenMotion) -> Array:
+    def translation_residuals(self, seen: _SeenMotion) -> Array:
         """Return the known translations of the camera (M, 3) m less those that the specific force explains."""
         seen_m = (self.attitudes[:-1] @ seen.T_before_after[:, :3, 3:])[..., 0]
         return np.asarray((seen_m - np.diff(self.gained_m, axis=0))[seen.known])
@@ -143,7 +143,7 @@ class _Path:
             return np.zeros(3)
         per_gravity = 0.5 * np.diff(self.t_s**2)[seen.known]
         per_velocity = np.diff(self.t_s)[seen.known, None, None] * np.eye(3)
-        return _robust(per_velocity, self.left(seen) - per_gravity[:, None] * gravity)[0]
+        return _robust(per_velocity, self.translation_residuals(seen) - per_gravity[:, None] * gravity)[0]
 
 
 def _gravity(path: _Path, seen: _SeenMotion, length: float) -> tuple[Array, str | None]:
@@ -153,7 +153,7 @@ def _gravity(path: _Path, seen: _SeenMotion, length: float) -> tuple[Array, str 
     if seen.known.sum() >= _FEWEST_INTERVALS:
         per_velocity, per_gravity = (np.diff(t)[seen.known] for t in (path.t_s, 0.5 * path.t_s**2))
         design = np.concatenate([per_velocity[:, None, None] * np.eye(3), per_gravity[:, None, None] * np.eye(3)], 2)
-        found, cov = _robust(design, path.left(seen))
+        found, cov = _robust(design, path.translation_residuals(seen))
         uncertain = _GRAVITY_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(cov[3:, 3:])[-1]))
         share = _GRAVITY_SHARE * length
         if uncertain < share:

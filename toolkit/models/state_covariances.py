@@ -77,7 +77,7 @@ def covs_beside(
         covs = _of_groups(linear, states, beside, has_velocity)
     except RuntimeError:
         kept = {key for group in (*states, beside) for key in group}
-        covs = _of_groups(_others_as_measured(linear, kept), states, beside, has_velocity)
+        covs = _of_groups(_with_orthonormal_landmarks(linear, kept), states, beside, has_velocity)
     of_states = [motion.estimate_cov(cov, T[:3, :3]) for cov, T in zip(covs, poses, strict=False)]
     return np.stack(of_states), covs[-1] if beside else np.empty((0, 0))
 
@@ -87,7 +87,7 @@ def _of_groups(
 ) -> list[Array]:
     """Return the joint covariance of the variables of each state, and of those beside them if there are any."""
     together: Sequence[Sequence[int]] = [*states, beside] if beside else states
-    tied = _tied(linear, together)
+    tied = _with_groups_connected(linear, together)
     some = sorted({0, len(states) // 3, 2 * len(states) // 3})
     failure: RuntimeError = RoundingError("they were lost to rounding")
     spans = _spans(tied, together)
@@ -105,7 +105,7 @@ def _of_groups(
     raise failure
 
 
-def _others_as_measured(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
+def _with_orthonormal_landmarks(linear: gtsam.GaussianFactorGraph, kept: Collection[int]) -> gtsam.GaussianFactorGraph:
     """Return the graph with all variables but those kept in coordinates whose Jacobians are orthonormal.
 
     A variable keeps the directions that the graph determines, and is left out if there are none.
@@ -116,7 +116,7 @@ def _others_as_measured(linear: gtsam.GaussianFactorGraph, kept: Collection[int]
         for key, block in _terms(factor, sizes):
             if key not in kept:
                 blocks[key].append(block)
-    directions = {key: _measured(np.vstack(rows)) for key, rows in blocks.items()}
+    directions = {key: _determined_directions(np.vstack(rows)) for key, rows in blocks.items()}
     graph = gtsam.GaussianFactorGraph()
     for factor in factors:
         terms = [(key, block @ directions[key] if key in directions else block) for key, block in _terms(factor, sizes)]
@@ -132,7 +132,7 @@ def _terms(factor: gtsam.GaussianFactor, sizes: gtsam.VectorValues) -> list[tupl
     return list(zip(keys, np.split(factor.jacobian()[0], ends[:-1], axis=1), strict=True))
 
 
-def _measured(jacobian: Array) -> Array:
+def _determined_directions(jacobian: Array) -> Array:
     """Return the directions (d, r) that a Jacobian (m, d) determines, each scaled to its standard deviation."""
     _, per_unit, directions = np.linalg.svd(jacobian, full_matrices=False)
     determined = per_unit > _LEAST_DETERMINED * per_unit[0]
@@ -154,7 +154,9 @@ def _variances(linear: gtsam.GaussianFactorGraph, states: Sequence[list[int]]) -
     return np.split(np.diag(np.linalg.inv(information)), ends[:-1])
 
 
-def _tied(linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]) -> gtsam.GaussianFactorGraph:
+def _with_groups_connected(
+    linear: gtsam.GaussianFactorGraph, together: Iterable[Sequence[int]]
+) -> gtsam.GaussianFactorGraph:
     """Return the graph with added factors of zero information that connect the variables of each group."""
     graph, sizes = gtsam.GaussianFactorGraph(), linear.gradientAtZero()
     graph.push_back(linear)
@@ -325,7 +327,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
         groups[clique_of[min(group, key=place.__getitem__)]].append(group)
     joints, waiting, covs = dict[int, _Joint](), Counter(next_of), dict[int, Array]()
     for i in reversed(range(len(cliques))):
-        joint = _given(cliques[i], next_of[i], joints, waiting)
+        joint = _room_for(cliques[i], next_of[i], joints, waiting)
         joint.add(cliques[i])
         covs |= {group[0]: joint.of(group) for group in groups[i]}
         if waiting[i]:
@@ -333,7 +335,7 @@ def _recovered(conditionals: list[gtsam.GaussianConditional], together: Sequence
     return [covs[group[0]] for group in together]
 
 
-def _given(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
+def _room_for(clique: _Clique, after: int | None, joints: dict[int, _Joint], waiting: Counter[int | None]) -> _Joint:
     """Return a joint covariance that a clique can be added to; the last clique that waits for one takes it over."""
     if after is None:
         return _Joint({}, np.empty((0, 0)), _ROOM + len(clique.cov))

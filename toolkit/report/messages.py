@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from toolkit.audit import Finding
 from toolkit.experiment.comparison import Comparison, Row
-from toolkit.experiment.disagreement import FARTHEST, Dispute, Parted
+from toolkit.experiment.disagreement import FARTHEST, Dispute, FarthestPose
 from toolkit.experiment.statistics import Paired, paired, ratio_of_means
 from toolkit.experiment.units import OUTPUTS, Scored
 from toolkit.metrics import Metric, metrics_called, unavailable
@@ -186,8 +186,8 @@ def _harm_by_vision(comparison: Comparison) -> Iterator[str]:
 
 def dispute_lines(dispute: Dispute) -> Iterator[str]:
     """Yield a line for those who part from the measured motion, and one for who rests on a motion that is disputed."""
-    if dispute.parted:
-        listed = "; ".join(f"{_name_of(one.row)} by {_parted_text(one)}" for one in dispute.parted)
+    if dispute.too_far:
+        listed = "; ".join(f"{_name_of(one.row)} by {_distance_text(one)}" for one in dispute.too_far)
         yield (
             "vision and the measured motion alone disagree: their answers part by more than their covariances allow, "
             f"which squared is at most {_figure(FARTHEST)} times what they state: {listed}"
@@ -195,12 +195,12 @@ def dispute_lines(dispute: Dispute) -> Iterator[str]:
     if dispute.doubts_motion:
         names, count = ", ".join(dispute.disputing), f"{len(dispute.disputing)} of {len(dispute.witnesses)}"
         yield (
-            f"{', '.join(dispute.alone)}: nothing but the measured motion and the start, which {count} that correct "
-            f"it by vision dispute ({names})"
+            f"{', '.join(dispute.uncorrected)}: nothing but the measured motion and the start, which {count} that "
+            f"correct it by vision dispute ({names})"
         )
 
 
-def _parted_text(one: Parted) -> str:
+def _distance_text(one: FarthestPose) -> str:
     apart = f"{_figure(one.distance_m)} m and {_figure(one.angle_deg)} deg"
     return f"{apart} at {one.t_s:.0f} s, {_figure(one.squared)} times"
 

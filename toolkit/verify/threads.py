@@ -46,7 +46,7 @@ def digests_at(threads: int, estimators: tuple[str, ...]) -> dict[str, str]:
     return digests
 
 
-def other_bits(estimator: str) -> str:
+def differing_answers(estimator: str) -> str:
     """Say on which scenario an estimator's answers differ between one thread and two; empty where they do not."""
     one, two = (digests_at(threads, (estimator,)) for threads in (1, 2))
     differing = [key.rpartition(" on ")[2] for key, digest in one.items() if two[key] != digest]

@@ -23,7 +23,7 @@ from toolkit.simulation import DRIVE, DRIVE_IMU, FLIGHT, Scenario, faults, simul
 from toolkit.verify import promises
 from toolkit.verify.promises import Watched, gave_up, watch
 from toolkit.verify.subject import Subject
-from toolkit.verify.threads import other_bits
+from toolkit.verify.threads import differing_answers
 
 SEED = 4
 DURATION_S, MAX_TRACKS = 6.0, 40
@@ -252,7 +252,7 @@ def _consistent(name: str, build: Build) -> CheckedPromise:
 
 
 def _threads(word: str) -> CheckedPromise:
-    return _check(_THREADS, _THREADS_REMEDY, lambda: other_bits(word))
+    return _check(_THREADS, _THREADS_REMEDY, lambda: differing_answers(word))
 
 
 def _faults(name: str, build: Build) -> CheckedPromise:

@@ -39,7 +39,7 @@ class Listed:
     remarks: tuple[str, ...] = ()
     apart_ms: float | None = None
 
-    def there(self, least: float) -> "Listed":
+    def existing(self, least: float) -> "Listed":
         """Return the pairs of which both files are there, with a remark, where their share is below the least.
 
         Of a recording that has nearly all its files those that are missing stay in, to be named one by one.

@@ -46,7 +46,7 @@ class PredictedSightings(NamedTuple):
     in_front: BoolArray
 
 
-class _Seen(NamedTuple):
+class _Projections(NamedTuple):
     """Projections of a point by each view: the image (3, N) in focal lengths from the centre, 1 / z and z > 0 (N,)."""
 
     ratio: Array
@@ -72,22 +72,22 @@ class Views:
     rig: StereoRig
     sqrt_information: Array
 
-    def seen(self, points: Array) -> _Seen:
+    def project(self, points: Array) -> _Projections:
         """Project a point for each view (3, N)."""
         linear, constant = self.linear, self.constant
         x, y, depth = (linear[i, 0] * points[0] + linear[i, 1] * points[1] + linear[i, 2] * points[2] for i in range(3))
         x, y, depth = x + constant[0], y + constant[1], depth + constant[2]
         inverse_depth = 1.0 / depth
         ratio = np.stack([x, x - self.rig.baseline_m * points[2], y]) * inverse_depth
-        return _Seen(ratio, inverse_depth, depth > 0.0)
+        return _Projections(ratio, inverse_depth, depth > 0.0)
 
-    def pixels(self, seen: _Seen) -> Array:
+    def pixels(self, seen: _Projections) -> Array:
         """Return the pixels (3, N) of what is seen."""
         return np.asarray(self._focal_px * seen.ratio + self._centre_px)
 
     def predict(self, points: Array) -> PredictedSightings:
         """Predict each view's measurement from a point of its own (3, N)."""
-        seen = self.seen(points)
+        seen = self.project(points)
         return PredictedSightings(self.pixels(seen).T, seen.in_front)
 
     def shares(self, points: Array) -> Array:
@@ -95,7 +95,7 @@ class Views:
 
         The weights are Huber's.
         """
-        seen = self.seen(np.take(points, self.track, axis=1))
+        seen = self.project(np.take(points, self.track, axis=1))
         residual = self._whitened(left_only.residuals_px(self.uv_px.T, self.pixels(seen).T).T)
         length = np.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
         visible = seen.in_front & np.isfinite(length)
@@ -113,7 +113,7 @@ class Views:
         shares[_COST] = np.where(length <= _HUBER_SIGMAS, 0.5 * length**2, robust)
         return shares
 
-    def _slope(self, seen: _Seen) -> Array:
+    def _slope(self, seen: _Projections) -> Array:
         """Return the derivatives (3, 3, N) of pixels by the point."""
         slope = np.stack([self.linear[0], self.linear[0], self.linear[1]])
         slope[1, 2] -= self.rig.baseline_m
