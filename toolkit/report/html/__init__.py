@@ -38,7 +38,7 @@ SCRIPTS = (
     "case",
     "main",
 )
-# What could end the script element or open a comment inside it, and what older parsers take for the end of a line.
+# Characters that could end the script element or open a comment in it, or that older parsers take as the end of a line.
 _ESCAPES = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
 
 

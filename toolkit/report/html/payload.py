@@ -1,7 +1,7 @@
-"""Everything the page shows, as one JSON value; its numbers are those of the run directories' own documents.
+"""The content of the page as one JSON value; its numbers are those of the run directories' documents.
 
-Over seeds: means with their spread, every seed's value, NEES and its band.
-Series have fewer points than a recording, none of them made up: what a screen can show, in a file that can be mailed.
+Over seeds: means with their spread, every seed's value, NEES and its band. Series are thinned to a subset of the
+recording's points, as many as a screen can show, to keep the file small.
 """
 
 import base64
