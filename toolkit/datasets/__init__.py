@@ -1,4 +1,4 @@
-"""Read recordings. Every module here is a format or offers built-in sequences, found by being here.
+"""Reads recordings. Every module in this folder is a format or has built-in sequences, and is found by being here.
 
 A module is a :class:`RecordingFormat`, or offers :class:`BuiltIns`, or both; a format whose recordings may hold
 estimates of other systems is :class:`BringsReferences` too, one that simulates a part of them is
@@ -31,9 +31,9 @@ from toolkit.progress import SILENT, Progress
 from toolkit.sequence import Observations, Provenance, Sequence, StereoRig, check_stated, why_not_sightings
 from toolkit.settings import DEFAULTS, Frontend, Tracks
 
-# So many names of a folder are shown to somebody who asked for one that is not in it.
+# Names of a folder that are listed in the message for a name that is not in it.
 _SHOWN = 8
-# And so many are compared with what was asked for: a folder of images has a hundred thousand.
+# Names that are compared with the requested one: a folder of images may have a hundred thousand.
 _COMPARED = 1000
 
 _ADDRESS = re.compile(r"\w+://")
@@ -182,7 +182,7 @@ def load_sequence(
     path = Path(source).expanduser()
     reader = _reader_of(path, source)
     _check_topics(source, reader, frontend)
-    # Whatever values a file holds: the checks say what is wrong with them, and not NumPy.
+    # The checks report bad values of a file, so that NumPy's warnings add nothing.
     with np.errstate(all="ignore"):
         if _of_images(reader, path, frontend):
             sequence = reader.load_from_images(path, frontend, progress)
@@ -305,7 +305,7 @@ def _check_readable(path: Path, source: str) -> None:
 
 
 def _nearest_source(path: Path, source: str) -> str:
-    """Return the end of a message about a source that is not there: the nearest name in its folder, or built in."""
+    """Return the end of a message about a missing source: the nearest name in its folder, or a built-in name."""
     if _ADDRESS.match(str(source)):
         return "; it is an address: download it and name the file"
     if path.parent != Path():
@@ -326,7 +326,7 @@ def _some(names: list[str]) -> str:
 
 
 def _check_types(sequence: Sequence) -> None:
-    """Raise DataError where a part is of another type, or a table of another length, than whoever loads one returns."""
+    """Raise DataError where a part of a loaded sequence has a wrong type, or a table a wrong length."""
     whose = sequence.name if isinstance(sequence.name, str) else "a recording"
     parts = {"name": str, "rig": StereoRig, "observations": Observations, "provenance": Provenance}
     found = {part: (getattr(sequence, part), kind) for part, kind in parts.items()}
